@@ -1,7 +1,7 @@
-"""``pytest --mpsfm-plugin NAME``: contract checks of an installed plugin as pytest items.
+"""Pytest plugin for ``pytest --mpsfm-plugin NAME``, which runs contract checks.
 
-This module is outside of the package, because pytest imports it at every start in every environment
-with mpsfm-core. It therefore imports nothing until its option is used.
+This module is outside of the package mpsfm_core, because pytest imports it at every start in every
+environment with mpsfm-core. This module therefore imports nothing until the option is used.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import pytest
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the options ``--mpsfm-plugin`` and ``--mpsfm-options``."""
+    """Add the pytest options ``--mpsfm-plugin`` and ``--mpsfm-options``."""
     group = parser.getgroup("mpsfm", "contract of MP-SfM plugins")
     group.addoption(
         "--mpsfm-plugin",
@@ -29,7 +29,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Register the collection of checks if the command line names a plugin."""
+    """Register the collection of contract checks if the command line names a plugin."""
     names = config.getoption("--mpsfm-plugin")
     if names:
         from mpsfm_core.testing.pytest_items import ContractCollection
@@ -37,4 +37,4 @@ def pytest_configure(config: pytest.Config) -> None:
         collection = ContractCollection(names, config.getoption("--mpsfm-options"))
         config.pluginmanager.register(collection, "mpsfm-contract")
         if config.args_source != pytest.Config.ArgsSource.ARGS:
-            config.args = []  # no path was given: run only these checks
+            config.args = []  # No path was given on the command line, so run only these checks.

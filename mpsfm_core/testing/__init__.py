@@ -1,6 +1,6 @@
-"""Contract kit for plugin authors: checks of providers with exact synthetic examples.
+"""Contract tests for plugin authors: checks of providers on views with known ground truth.
 
-The test file of a plugin is::
+The test file of a plugin contains::
 
     from mpsfm_core.testing import contract_tests
 

@@ -1,7 +1,7 @@
-"""Comparison of an answer with the ground truth, by kind of provider.
+"""Comparison of a provider's output with the ground truth, for each kind of provider.
 
-Tolerances are several times the error of a correct provider on painted or textured views, and
-several times below the error of the mistakes that they detect. Each states both.
+Each tolerance is several times the error of a correct provider on the synthetic views, and several
+times below the error of the mistakes that it detects. Each states both.
 """
 
 from __future__ import annotations
@@ -18,34 +18,37 @@ from mpsfm_core.testing.map_errors import MapShift
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 DEPTH_TOLERANCE = 0.05
-"""Relative error of 80 % of the pixels. Painted views have 0.005 and interpolation about as much; a
-wrong unit or the length of the ray has far more."""
+"""Largest relative depth error of 80 % of the pixels. Correct providers on painted views have an
+error of 0.005. A wrong unit or the ray length instead of z has a far larger one."""
 NORMALS_TOLERANCE_DEG = 5.0
-"""Angle of 80 % of the pixels. Painted views have 0.7 degrees, planes fitted to true depth 1."""
+"""Largest angle in degrees between predicted and true normals for 80 % of the pixels. Correct
+providers on painted views have 0.7 degrees, planes fitted to true depth 1 degree."""
 MASK_TOLERANCE = 0.05
-"""Ratio of wrong pixels, among pixels at least two away from the border of the surface."""
+"""Largest ratio of wrong mask pixels, among pixels at least two away from the border of a
+surface."""
 MATCH_TOLERANCE_STD = 3.0
-"""Median distance from the true position in multiples of ``std_px``, and at least 3 pixels."""
+"""Largest median distance of a match from its true position in multiples of ``std_px``, and at
+least 3 pixels."""
 SHIFT_TOLERANCE_PX = 0.25
-"""Shift in pixels of the view, or of the map if its pixels are larger. Integer pixel centers shift
-by 0.5; correct resizing to half and a quarter stays below 0.1."""
+"""Largest shift of a map in pixels of the view, or of the map if its pixels are larger. Integer
+pixel centers shift a map by 0.5; correct resizing to half and a quarter stays below 0.1."""
 MIN_MATCHES = 8
 """Smallest number of matches for a statistic."""
 
 
 def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str:
-    """Compare an answer with the ground truth.
+    """Compare the output of a provider with the ground truth.
 
     Args:
         case: Provider under test.
-        example: Example that the answer belongs to.
+        example: Synthetic view from which the provider computed the output.
         answer: Validated answer.
 
     Returns:
-        Remark with the error, or that the truth is unknown.
+        Remark with the error, or that the ground truth is unknown.
 
     Raises:
-        CheckFailed: The error exceeds its tolerance.
+        CheckFailed: The error exceeds the tolerance of the provider's kind.
     """
     unknown = case.truth_source == "none" or case.kind in ("features", "retrieval")
     if unknown or (case.kind == "matcher" and case.truth_source == "painted"):
@@ -76,19 +79,20 @@ def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str
 def require_small_shift(
     case: ContractCase, example: Example, shift: MapShift, shape: tuple[int, int]
 ) -> str:
-    """Require that the content of a map is not shifted.
+    """Require that the content of a map is not shifted relative to the view.
 
-    For providers with ``truth_source="image"`` only the shift at the center counts. Estimates from
-    neighborhoods are biased on curved surfaces, which looks like a stretch.
+    For providers with ``truth_source="image"`` only the shift at the center of the map is checked.
+    Estimates from pixel neighborhoods are biased on curved surfaces, which looks like a stretch of
+    the map.
 
     Args:
         case: Provider under test.
-        example: Example that the map belongs to.
+        example: Synthetic view that the map belongs to.
         shift: Estimated shift.
-        shape: Rows and columns of the map.
+        shape: Height and width of the map.
 
     Returns:
-        Remark with the shift.
+        Remark with the measured shift.
 
     Raises:
         CheckFailed: The shift exceeds :data:`SHIFT_TOLERANCE_PX`.
@@ -109,7 +113,7 @@ def require_small_shift(
 
 
 def match_points(case: ContractCase, a: Example, b: Example, answer: PairMatches) -> DenseMatches:
-    """Return the matches as points: dense matches, or the keypoints of sparse matches."""
+    """Return matches as pixel coordinates: dense matches, or the keypoints of sparse matches."""
     if answer.dense is not None:
         return answer.dense
     assert answer.sparse is not None
@@ -124,9 +128,9 @@ def match_points(case: ContractCase, a: Example, b: Example, answer: PairMatches
 
 
 def match_errors_px(a: Example, b: Example, matches: DenseMatches) -> Float64:
-    """Return the distance (n,) of each match in b from its true position, in pixels.
+    """Return the distance (n,) in pixels of each match from its true position in view b.
 
-    The distance is infinite if b does not show the point.
+    The distance is infinite if view b does not show the point.
     """
     true = a.correspondences(b, matches.points_a)
     distance = np.linalg.norm(matches.points_b - true.xy_b, axis=1)

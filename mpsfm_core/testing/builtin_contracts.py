@@ -1,4 +1,4 @@
-"""Contract setups of the built-in providers."""
+"""ContractSetup functions for the built-in providers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mpsfm_core.testing.painted_views import NORMALS_STD, RELATIVE_STD
 
 
 def depth_files(folder: Path) -> ContractSetup:
-    """Return a setup that writes depth in meters with its variance to an NPZ file per view."""
+    """Return a ContractSetup that writes metric depth with variance to an NPZ file per view."""
 
     def write_truth(example: Example) -> None:
         truth = example.truth()
@@ -26,7 +26,7 @@ def depth_files(folder: Path) -> ContractSetup:
 
 
 def normal_files(folder: Path) -> ContractSetup:
-    """Return a setup that writes normals with their variance to an NPZ file per view."""
+    """Return a ContractSetup that writes normals with variance to an NPZ file per view."""
 
     def write_truth(example: Example) -> None:
         truth = example.truth()
@@ -39,7 +39,7 @@ def normal_files(folder: Path) -> ContractSetup:
 
 
 def mask_files(folder: Path) -> ContractSetup:
-    """Return a setup that writes the mask of all surfaces to an NPZ file per view."""
+    """Return a ContractSetup that writes the mask of all surfaces to an NPZ file per view."""
     return ContractSetup(
         options={"directory": folder},
         truth_source="prepared",
@@ -48,18 +48,18 @@ def mask_files(folder: Path) -> ContractSetup:
 
 
 def from_depth(folder: Path) -> ContractSetup:
-    """Return a setup without files: normals are correct where the given depth is."""
+    """Return a ContractSetup for normals from depth, which are correct if the given depth is."""
     return ContractSetup(truth_source="image")
 
 
 def depth_of_matcher(folder: Path) -> ContractSetup:
-    """Return a setup in which predicting from one view is expected to fail."""
+    """Return a ContractSetup in which prediction from one view is expected to fail."""
     reason = "one view has no matches: the extraction uses the pairs of the matcher instead"
     return ContractSetup(expected_failures={"output-rules": reason})
 
 
 def depth_of_multiview(folder: Path) -> ContractSetup:
-    """Return a setup in which predicting from one view is expected to fail."""
+    """Return a ContractSetup in which prediction from one view is expected to fail."""
     reason = "one view is no group: the extraction runs the multi-view network instead"
     return ContractSetup(expected_failures={"output-rules": reason})
 

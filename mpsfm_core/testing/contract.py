@@ -1,4 +1,4 @@
-"""Contract of a provider: schedules the checks of its kind and runs them one by one."""
+"""Contract of a provider: selects the checks of its kind and runs them one by one."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ from mpsfm_core.testing.contract_case import ContractCase, ContractSetup, load_s
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 Check = Callable[[ContractCase], str | None]
-"""A check returns nothing or a remark. It raises ``CheckFailed`` or ``CheckSkipped``."""
+"""Contract check: a function that returns nothing or a remark. A check raises ``CheckFailed`` or
+``CheckSkipped``."""
 
 Status = Literal["pass", "fail", "skip", "xfail"]
 SetupSource = ContractSetup | Callable[[Path], ContractSetup] | None
@@ -50,45 +51,46 @@ CHECKS_BY_KIND: Mapping[Kind, tuple[Check, ...]] = MappingProxyType(
         "wrapper": checks_wrapper.CHECKS,
     }
 )
-"""Checks of each kind, in addition to the common ones."""
+"""Contract checks of each provider kind, in addition to the common ones."""
 
 REQUIRED: tuple[Check, ...] = (check_specification, check_construction, check_output_rules)
-"""If one of these fails, all later checks are skipped: their results would mean nothing."""
+"""Checks without which the results of all later checks mean nothing; if one of them fails, later
+checks are skipped."""
 
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of one check of one provider."""
+    """Result of one contract check of one provider."""
 
     provider: str
-    """Kind and name, such as ``depth/files``."""
+    """Kind and name of the provider, such as ``depth/files``."""
     around: str
-    """Kind that a wrapper under test wraps, else empty."""
+    """Provider kind that a wrapper under test wraps, else empty."""
     id: str
-    """Name of the check, such as ``depth-is-z``."""
+    """Id of the check, such as ``depth-is-z``."""
     status: Status
-    """``xfail`` is a failure that the setup declares as expected."""
+    """Outcome of the check; ``xfail`` is a failure that the ContractSetup declares as expected."""
     message: str
-    """Reason of a failure or skip, or a remark."""
+    """Reason of a failure or skip, or the remark of a check that passed."""
     seconds: float
     """Run time."""
 
 
 @dataclass(frozen=True)
 class CheckTask:
-    """One scheduled check of one provider."""
+    """One contract check to run on one provider."""
 
     id: str
-    """Name of the check."""
+    """Id of the check."""
     around: str
-    """Kind that a wrapper under test wraps, else empty."""
+    """Provider kind that a wrapper under test wraps, else empty."""
 
     def __str__(self) -> str:
         return f"{self.around}-{self.id}" if self.around else self.id
 
 
 class Contract:
-    """Runner of all checks of one provider."""
+    """Runner of all contract checks of one provider."""
 
     def __init__(
         self,
@@ -100,14 +102,15 @@ class Contract:
         *,
         device: str = "cpu",
     ) -> None:
-        """Look up the provider without creating it.
+        """Prepare the contract of a provider without constructing the provider.
 
         Args:
             registry: Registry that contains the provider.
             kind: Kind of the provider.
             name: Name of the provider.
-            folder: Folder for the files of stand-ins.
-            setup: Setup or contract function; by default the one of the specification.
+            folder: Folder for the weights files of test networks.
+            setup: ContractSetup, or function that returns one; by default the function of the
+                specification.
             device: ``"cpu"`` or ``"cuda"``.
 
         Raises:
@@ -123,11 +126,11 @@ class Contract:
 
     @property
     def provider(self) -> str:
-        """Kind and name, such as ``depth/files``."""
+        """Kind and name of the provider, such as ``depth/files``."""
         return f"{self.spec.kind}/{self.spec.name}"
 
     def tasks(self) -> list[CheckTask]:
-        """Return the scheduled checks in order. Creates no provider."""
+        """Return the checks in the order to run them. Creates no provider."""
         return schedule_checks(self.spec)
 
     def run(self, task: CheckTask) -> CheckResult:
@@ -138,7 +141,7 @@ class Contract:
             case = self._case(task.around)
             reason = case.setup.expected_failures.get(task.id, "")
             status, message = self._outcome(case, task)
-        except ProviderError as error:  # the setup cannot be created
+        except ProviderError as error:  # The ContractSetup cannot be created.
             status, message = "fail", str(error)
         if reason and status == "fail":
             status, message = "xfail", f"{reason} ({message})"
@@ -159,11 +162,12 @@ class Contract:
             return "skip", str(skipped)
         except (CheckFailed, MpsfmError) as failed:
             return "fail", str(failed)
-        except Exception as error:  # raised by a provider that the check calls directly
+        # The exception was raised by a provider that the check calls directly.
+        except Exception as error:
             return "fail", f"{type(error).__name__}: {error}"
 
     def _first_failed_required(self, case: ContractCase, around: str) -> str:
-        """Return the id of the first of the :data:`REQUIRED` checks that fails, or empty."""
+        """Return the id of the first failed check of :data:`REQUIRED`, or an empty text."""
         if around not in self._failed_required:
             failed = (check_id(check) for check in REQUIRED if not _passes(check, case))
             self._failed_required[around] = next(failed, "")
@@ -202,19 +206,20 @@ def run_checks(
     device: str = "cpu",
     on_result: Callable[[CheckResult], None] | None = None,
 ) -> list[CheckResult]:
-    """Run the checks of a provider.
+    """Run the contract checks of a provider.
 
     Args:
         registry: Registry that contains the provider.
         kind: Kind of the provider.
         name: Name of the provider.
-        setup: Setup or contract function; by default the one of the specification.
+        setup: ContractSetup, or function that returns one; by default the function of the
+            specification.
         only: Ids of the checks to run; None runs all.
         device: ``"cpu"`` or ``"cuda"``.
-        on_result: Called after each check.
+        on_result: Function that is called with the result of each check.
 
     Returns:
-        Results in the order of the checks.
+        Check results in the order of the checks.
 
     Raises:
         ProviderError: The provider does not exist or is unavailable.
@@ -231,20 +236,20 @@ def run_checks(
 
 
 def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
-    """Find the providers that a name on the command line refers to.
+    """Find the providers that a name on the command line denotes.
 
     Args:
         registry: Registry to search.
-        name: Provider (``onnx``), provider of one kind (``depth/onnx``) or distribution
-            (``mpsfm-onnx``, meaning all of its providers).
+        name: Name of a provider (``onnx``), kind and name (``depth/onnx``), or distribution
+            (``mpsfm-onnx``, which denotes all of its providers).
 
     Returns:
-        Kind and name of each provider.
+        Kind and name of each provider that the name denotes.
 
     Raises:
-        InputError: Nothing has that name.
-        ProviderError: The plugin exists but has no providers or failed to load, or a provider of
-            the named distribution is unavailable.
+        InputError: The name denotes no provider, plugin or distribution.
+        ProviderError: The plugin failed to load or has no providers, or a provider of the
+            distribution is unavailable.
     """
     lines = [line for line in registry.status() if line.kind != "plugin"]
     matching = [
@@ -261,7 +266,7 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
         candidates = {n for line in registry.status() for n in (line.name, line.distribution)}
         raise InputError(f"no provider or plugin {name!r}{did_you_mean(name, candidates)}")
     for line in lines:
-        # Looking it up by kind and name would test the provider of another distribution.
+        # A look-up by kind and name would find the provider of another distribution.
         if line.distribution == name and not line.available:
             hint = f"; {line.install_hint}" if line.install_hint else ""
             raise ProviderError(f"{line.kind} provider {line.name!r} of {name} {line.reason}{hint}")
@@ -269,30 +274,31 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
 
 
 def find_plugin(registry: Registry, name: str) -> ProviderStatus | None:
-    """Find a plugin without providers, which only has hooks or failed to load.
+    """Find a plugin without usable providers: one that only has hooks or failed to load.
 
     Args:
         registry: Registry to search.
-        name: Entry point or distribution.
+        name: Name of the entry point or of the distribution.
 
     Returns:
-        Its status line, or None.
+        Status of the plugin, or None.
     """
     plugins = (line for line in registry.status() if line.kind == "plugin")
     return next((line for line in plugins if name in (line.name, line.distribution)), None)
 
 
 def parse_setup(assignments: Sequence[str]) -> ContractSetup | None:
-    """Parse provider options of the command line into a setup.
+    """Parse provider options of the command line into a ContractSetup.
 
     Args:
-        assignments: ``key=value`` or ``group.key=value`` with YAML values.
+        assignments: Texts ``key=value`` or ``group.key=value`` with YAML values.
 
     Returns:
-        Setup with these options, or None without assignments (use the plugin's own setup).
+        ContractSetup with these options, or None without assignments, which selects the plugin's
+        own ContractSetup.
 
     Raises:
-        InputError: A text is not an assignment.
+        InputError: A text is not an assignment ``key=value``.
     """
     options: dict[str, Any] = {}
     for text in assignments:
@@ -308,7 +314,7 @@ def parse_setup(assignments: Sequence[str]) -> ContractSetup | None:
 
 
 def schedule_checks(spec: ProviderSpec) -> list[CheckTask]:
-    """Return the checks that apply to a specification, in the order to run them."""
+    """Return the contract checks that apply to a provider, in the order to run them."""
     wrapped = [kind for kind in ("depth", "normals") if f"wraps-{kind}" in spec.capabilities]
     tasks = []
     for around in (wrapped or ["depth"]) if spec.kind == "wrapper" else [""]:
@@ -320,21 +326,21 @@ def schedule_checks(spec: ProviderSpec) -> list[CheckTask]:
 
 
 def list_checks() -> list[Check]:
-    """Return every check of all kinds, the common ones first."""
+    """Return the contract checks of all provider kinds, the common ones first."""
     special = dict.fromkeys(check for checks in CHECKS_BY_KIND.values() for check in checks)
     return [*STANDALONE, check_output_rules, *COMMON, *special]
 
 
 def find_check(id: str) -> Check:
-    """Return the check with an id."""
+    """Return the contract check with the given id."""
     return next(check for check in list_checks() if check_id(check) == id)
 
 
 def parse_check_ids(ids: Collection[str]) -> set[str]:
-    """Return check ids as a set.
+    """Return check ids as a set after verifying that each id exists.
 
     Raises:
-        InputError: An id is not the id of a check.
+        InputError: An id is not the id of a contract check.
     """
     known = [check_id(check) for check in list_checks()]
     for name in ids:
@@ -344,7 +350,7 @@ def parse_check_ids(ids: Collection[str]) -> set[str]:
 
 
 def check_id(check: Check) -> str:
-    """Return the id of a check: ``check_depth_is_z`` has the id ``depth-is-z``."""
+    """Return the id of a contract check: ``check_depth_is_z`` has the id ``depth-is-z``."""
     return check.__name__.removeprefix("check_").replace("_", "-")
 
 

@@ -1,4 +1,4 @@
-"""One provider under test: its setup, its instances and validated calls on examples."""
+"""Provider under test: its ContractSetup, instances, and validated calls on synthetic views."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mpsfm_core.testing.ground_truth_provider import GROUND_TRUTH_SPECS, GroundT
 from mpsfm_core.testing.outcome import CheckSkipped
 
 TruthSource = Literal["painted", "prepared", "image", "none"]
-"""Source from which a provider can derive the correct answer, see :class:`ContractSetup`."""
+"""Source from which a provider can derive the ground truth, see :class:`ContractSetup`."""
 
 _RUN: Mapping[Kind, Callable[..., Any]] = MappingProxyType(
     {
@@ -41,29 +41,33 @@ AUXILIARY_RELATIVE_STD = 0.02
 
 @dataclass(frozen=True)
 class ContractSetup:
-    """Setup of a provider for the contract: options, and the source of the correct answer.
+    """Declaration of how to test a provider: its options and the source of the ground truth.
 
-    A plugin returns it from the function that ``ProviderSpec.contract`` names:
-    ``def contract(folder: Path) -> ContractSetup``. ``folder`` is an empty temporary folder.
+    A plugin returns a ContractSetup from the function that ``ProviderSpec.contract`` names: ``def
+    contract(folder: Path) -> ContractSetup``. ``folder`` is an empty temporary folder for test
+    weights.
 
-    The values of ``truth_source``:
+    The values of ``truth_source`` are:
 
-    * ``"painted"``: a stand-in network reads depth and normals from the colors of the views, see
-      :mod:`mpsfm_core.testing.painted_views`.
-    * ``"prepared"``: ``prepare`` writes the correct answer, for providers that read files.
-    * ``"image"``: the answer follows from a textured view; with or without real weights.
-    * ``"none"``: the correct answer is unknown, and checks that need it are skipped.
+    * ``"painted"``: a tiny test network decodes depth and normals from the colors of the views, see
+      :mod:`mpsfm_core.testing.painted_views`. * ``"prepared"``: ``prepare`` writes the ground truth
+      to files, for providers that read files. * ``"image"``: the correct output follows from a
+      textured view, with or without real weights. * ``"none"``: the ground truth is unknown, and
+      checks that need it are skipped.
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the provider. They usually name the weights of a stand-in network that the
-    contract function wrote to ``folder``."""
+    """Options of the provider under test. The options usually name weights of a tiny test network
+    that the contract function wrote to ``folder``."""
     truth_source: TruthSource | None = None
-    """None means ``"image"`` for features, matchers and retrieval, and ``"none"`` otherwise."""
+    """Source of the ground truth; None means ``"image"`` for features, matchers and retrieval, and
+    ``"none"`` for other kinds."""
     prepare: Callable[[Example], None] | None = None
-    """Called with each example before the provider runs on it, for instance to write a file."""
+    """Function that is called with each synthetic view before the provider runs on the view, for
+    instance to write a file."""
     expected_failures: Mapping[str, str] = field(default_factory=dict)
-    """Reason by id of the checks that are known to fail. Such a check fails if it passes."""
+    """Reason of each known failure, by check id. A check with a reason fails if the provider passes
+    it."""
 
     def __post_init__(self) -> None:
         if self.truth_source == "prepared" and self.prepare is None:
@@ -74,11 +78,11 @@ class ContractSetup:
 
 
 class ContractCase:
-    """One provider under test, the argument of every check.
+    """Provider under test, the argument of every contract check.
 
-    ``kind`` is the kind of the answers. A wrapper is tested once for each kind that it wraps,
-    around a provider that knows the ground truth. The provider and the views are created on first
-    use and reused by later checks.
+    ``kind`` is the kind of the provider's output. A wrapper is tested once for each kind that it
+    wraps, around a provider that returns the ground truth. The provider and the synthetic views are
+    created on first use and reused by later checks.
     """
 
     def __init__(
@@ -91,14 +95,15 @@ class ContractCase:
         behaves_as: Kind | None = None,
         device: str = "cpu",
     ) -> None:
-        """Create the case without creating the provider.
+        """Create the contract case without constructing the provider.
 
         Args:
             registry: Registry that contains the provider.
             spec: Specification of the provider.
-            setup: Setup of the provider.
-            folder: Folder for stand-ins of other providers, such as a detector for a matcher.
-            behaves_as: Kind that a wrapper wraps; None for every other provider.
+            setup: ContractSetup of the provider.
+            folder: Folder for the files of helper providers, such as a detector for a matcher.
+            behaves_as: Provider kind that a wrapper wraps; None for a provider that is not a
+                wrapper.
             device: ``"cpu"`` or ``"cuda"``.
         """
         self.registry = registry
@@ -116,21 +121,21 @@ class ContractCase:
 
     @property
     def truth_source(self) -> TruthSource:
-        """Source from which the provider can derive the correct answer."""
+        """Source from which the provider under test can derive the ground truth."""
         if self._ground_truth is not None:
             return "prepared"
         from_image = self.kind in ("features", "matcher", "retrieval")
         return self.setup.truth_source or ("image" if from_image else "none")
 
     def declares(self, capability: Capability) -> bool:
-        """Return whether the specification declares a capability."""
+        """Return whether the provider's specification declares a capability."""
         return capability in self.spec.capabilities
 
     def require_truth(self, *sources: TruthSource) -> None:
-        """Skip the check unless the correct answer comes from one of these sources.
+        """Skip the check unless the ground truth comes from one of these sources.
 
         Raises:
-            CheckSkipped: The source is another one, or there is none.
+            CheckSkipped: The provider has another source of the ground truth, or none.
         """
         if self.truth_source == "none":
             raise CheckSkipped(
@@ -142,7 +147,7 @@ class ContractCase:
 
     @property
     def example(self) -> Example:
-        """Example that most checks use: 192 x 144 pixels, painted or textured."""
+        """Synthetic view that most checks use: 192 x 144 pixels, painted or textured."""
         if self._example is None:
             is_painted = self.truth_source == "painted" or self._ground_truth is not None
             appearance: Appearance = "painted" if is_painted else "textured"
@@ -151,7 +156,7 @@ class ContractCase:
         return self._example
 
     def create_provider(self, **inner_options: Any) -> Any:
-        """Create a new instance of the provider.
+        """Construct a new instance of the provider under test.
 
         Args:
             inner_options: Options of the ground-truth provider inside a wrapper, see
@@ -167,17 +172,18 @@ class ContractCase:
 
     @property
     def provider(self) -> Any:
-        """Instance that the checks share."""
+        """Instance of the provider that the checks share."""
         if self._provider is None:
             self._provider = self.create_provider()
         return self._provider
 
     def run(self, example: Example, provider: Any = None) -> Any:
-        """Run the provider on an example and validate the answer.
+        """Run the provider on a synthetic view and validate the output.
 
         Args:
-            example: The example. Matchers and multi-view providers also get ``example.partner``.
-            provider: Instance to use instead of the shared one.
+            example: The example. Matchers and multi-view providers also receive the view
+                ``example.partner``.
+            provider: Provider instance to use instead of the shared one.
         """
         uses_pair = self.kind in ("matcher", "multiview")
         self.prepare(example, *([example.partner] if uses_pair else []))
@@ -186,13 +192,13 @@ class ContractCase:
     def run_on_view(
         self, view: View, example: Example, provider: Any = None, auxiliary: Any = None
     ) -> Any:
-        """Run the provider on a modified view of an example and validate the answer.
+        """Run the provider on a modified copy of a synthetic view and validate the output.
 
         Args:
-            view: View that replaces ``example.view``.
-            example: Example that supplies everything else.
-            provider: Instance to use instead of the shared one.
-            auxiliary: Depth or features for the provider, by default
+            view: Modified view that replaces ``example.view``.
+            example: Synthetic view that supplies all other inputs.
+            provider: Provider instance to use instead of the shared one.
+            auxiliary: Depth or features for the provider, by default from
                 :meth:`make_auxiliary_input`.
         """
         provider = self.provider if provider is None else provider
@@ -219,20 +225,20 @@ class ContractCase:
         return DepthPrior.from_arrays(truth.depth, variance, truth.valid)
 
     def run_on_pair(self, a: Example, b: Example) -> Any:
-        """Match two examples and validate the answer."""
+        """Match two synthetic views and validate the matches."""
         self.prepare(a, b)
         views = (a.view, b.view)
         features = self.extract_features(*views)
         return validation.run_matcher(self._validated_spec, self.provider, views, features)
 
     def run_on_group(self, *examples: Example) -> MultiViewPrior:
-        """Run a multi-view provider on several examples and validate the answer."""
+        """Run a multi-view provider on several synthetic views and validate the group prior."""
         self.prepare(*examples)
         views = [example.view for example in examples]
         return validation.run_multiview(self._validated_spec, self.provider, views)
 
     def prepare(self, *examples: Example) -> None:
-        """Give the setup and the ground truth access to examples; each example only once."""
+        """Prepare the ground truth of each synthetic view once."""
         for example in examples:
             if example in self._prepared:
                 continue
@@ -253,7 +259,7 @@ class ContractCase:
         return [] if self._ground_truth is None else self._ground_truth.received_depth
 
     def calibration(self) -> Any:
-        """Return the uncertainty model that a run would apply to the answers."""
+        """Return the uncertainty model that a run would apply to the provider's output."""
         options = dict(self.setup.options)
         if self._ground_truth is None:
             return self.registry.calibration(
@@ -267,9 +273,10 @@ class ContractCase:
 
     @property
     def _validated_spec(self) -> ProviderSpec:
-        """Specification for the validator.
+        """Specification from which the validator reads the capabilities.
 
-        Wrappers promise no capability of the inner provider; separate checks cover these.
+        A wrapper need not have the capabilities of its inner provider in this specification;
+        separate checks cover them.
         """
         if self._ground_truth is None:
             return self.spec
@@ -313,17 +320,17 @@ class ContractCase:
 
 
 def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:
-    """Return the setup that a plugin declares for its provider, or the default setup.
+    """Return the ContractSetup that a plugin declares for its provider, or a default one.
 
     Args:
         spec: Specification of the provider.
-        folder: Folder for the files of stand-ins.
+        folder: Folder for the weights files of test networks.
 
     Returns:
         The setup.
 
     Raises:
-        ProviderError: The contract function fails or returns something else.
+        ProviderError: The contract function raises an exception or returns another type.
     """
     if spec.contract is None:
         return ContractSetup()
@@ -337,7 +344,7 @@ def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:
         text = f"{spec.kind} provider {spec.name!r}: its contract {spec.contract!r} fails"
         raise ProviderError(f"{text}: {type(error).__name__}: {error}") from error
     if isinstance(setup, Mapping):
-        # A provider of another environment sends the fields of its setup as a mapping.
+        # A provider of another environment sends the fields of its ContractSetup as a mapping.
         names = {part.name for part in fields(ContractSetup)}
         setup = ContractSetup(**setup) if names.issuperset(setup) else setup
     if not isinstance(setup, ContractSetup):
@@ -348,13 +355,13 @@ def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:
 
 
 def first_depth(answer: Any) -> DepthPrior:
-    """Return the depth prior of an answer; the one of the first view if it is a group."""
+    """Return the depth prior in a provider's output; the one of the first view for a group."""
     prior: DepthPrior = answer.depth[0] if isinstance(answer, MultiViewPrior) else answer
     return prior
 
 
 def collect_arrays(answer: object, name: str = "answer") -> dict[str, NDArray[Any]]:
-    """Collect all arrays and numbers of an answer by their path, such as ``answer.depth``."""
+    """Collect the arrays and numbers of an output by their path, such as ``answer.depth``."""
     if isinstance(answer, np.ndarray):
         return {name: answer}
     if is_dataclass(answer) and not isinstance(answer, type):
@@ -369,7 +376,7 @@ def collect_arrays(answer: object, name: str = "answer") -> dict[str, NDArray[An
 
 
 def describe_difference(first: object, second: object) -> str:
-    """Describe the first difference between two answers, or return an empty text."""
+    """Describe the first difference between two outputs, or return an empty text."""
     a, b = collect_arrays(first), collect_arrays(second)
     if a.keys() != b.keys():
         return f"one has {sorted(a)}, the other {sorted(b)}"

@@ -1,4 +1,4 @@
-"""Example views of synthetic scenes with exact ground truth, the inputs of all checks."""
+"""Synthetic views with exact ground truth, the inputs of all contract checks."""
 
 from __future__ import annotations
 
@@ -24,49 +24,50 @@ from mpsfm_core.testing.synthetic.scenes import (
 )
 
 Appearance = Literal["painted", "textured"]
-"""``painted``: colors encode depth and normals, see :mod:`mpsfm_core.testing.painted_views`.
-``textured``: a random texture with corners to detect and match."""
+"""Colors of a synthetic view. ``painted``: colors encode depth and normals, see
+:mod:`mpsfm_core.testing.painted_views`. ``textured``: a random texture with corners to detect and
+match."""
 
 _SKY = ((120, 170, 235), (200, 220, 245))
-"""RGB of the sky at the upper and lower border of a textured view."""
+"""RGB of the sky at the upper and lower border of a textured synthetic view."""
 _COS_MAX_CREASE = np.cos(np.deg2rad(20.0))
-"""Neighbors whose normals differ by more than 20 degrees are separated by an edge."""
+"""Smallest cosine of the angle between neighboring normals without an edge: 20 degrees."""
 
 
 @dataclass(frozen=True, eq=False)
 class TrueMaps:
-    """Ground truth on a grid (h, w) that covers the view."""
+    """Ground truth of a synthetic view on a grid (h, w) that covers the view."""
 
     depth: Float64
-    """Depth (h, w) in meters along z, 0 without a surface."""
+    """z-depth (h, w) in meters, 0 where there is no surface."""
     normals: Float64
-    """Unit normals (h, w, 3) in the camera frame, 0 without a surface."""
+    """Unit normals (h, w, 3) in the camera frame, 0 where there is no surface."""
     valid: Bool
-    """True (h, w) where there is a surface."""
+    """Mask (h, w), True where there is a surface."""
     smooth: Bool
-    """True (h, w) where the surface continues for two pixels in all directions at no grazing angle.
-    Interpolation causes no large error there."""
+    """Mask (h, w), True where the surface continues for two pixels in all directions and is not
+    seen at a grazing angle. Interpolation causes no large error in these pixels."""
     edge_free: Bool
-    """True (h, w) where all pixels up to two away agree in ``valid``."""
+    """Mask (h, w), True where all pixels up to two away have the same value of ``valid``."""
 
 
 @dataclass(frozen=True, eq=False)
 class Example:
-    """One view of a synthetic scene with its exact ground truth."""
+    """Synthetic view of a scene with its exact ground truth."""
 
     name: str
     scene: AnalyticScene
     camera: PinholeCamera
     pose: Float64
-    """``cam_from_world`` (3, 4), in meters."""
+    """Pose ``cam_from_world`` (3, 4) of the view, in meters."""
     look: Appearance
-    """Colors of the view."""
+    """Colors of the view, painted or textured."""
     mirrored: bool = False
     """True swaps left and right in the image and in the ground truth."""
 
     @cached_property
     def view(self) -> View:
-        """View that the provider receives."""
+        """View that the provider under test receives."""
         if self.look == "painted":
             truth = self.truth()
             return View(self.name, paint(truth.depth, truth.normals, truth.valid), self.camera)
@@ -77,7 +78,7 @@ class Example:
     def truth(
         self, shape: tuple[int, int] | None = None, offset_px: tuple[float, float] = (0.0, 0.0)
     ) -> TrueMaps:
-        """Compute the ground truth on a grid.
+        """Compute the ground truth of the synthetic view on a grid.
 
         Args:
             shape: Rows and columns of the grid; by default one sample per pixel.
@@ -104,25 +105,25 @@ class Example:
         return TrueMaps(*(np.ascontiguousarray(self._flip_if_mirrored(part)) for part in parts))
 
     def correspondences(self, other: Example, xy: Float64) -> TrueCorrespondences:
-        """Project the points seen at pixels (n, 2) of this view into another example."""
+        """Project the points seen at pixels (n, 2) of this view into another synthetic view."""
         return self.scene.correspondences(self.camera, self.pose, other.camera, other.pose, xy)
 
     @cached_property
     def partner(self) -> Example:
-        """Example of the same surfaces from 0.3 m to the side, with the same camera."""
+        """Synthetic view of the same surfaces from 0.3 m to the right, with the same camera."""
         return replace(self, name=f"beside/{self.name}", pose=_step_aside(self.pose))
 
     def mirror(self) -> Example:
-        """Return the example with left and right swapped."""
+        """Return the synthetic view with left and right swapped."""
         camera = replace(self.camera, cx=self.camera.width - self.camera.cx)
         name = f"mirrored/{self.name}"
         return replace(self, name=name, camera=camera, mirrored=not self.mirrored)
 
     def sized(self, width: int, height: int) -> Example:
-        """Return the example with another image size.
+        """Return the synthetic view with another image size.
 
-        The pose and the ratio of focal length to height stay the same, so that the view may show
-        more or less of the scene.
+        The pose and the ratio of focal length to height stay the same, so the view may show more or
+        less of the scene.
 
         Args:
             width: Width in pixels.
@@ -134,7 +135,7 @@ class Example:
 
     @property
     def _unmirrored_camera(self) -> PinholeCamera:
-        """Camera of the scene before mirroring."""
+        """Camera of the synthetic view before left and right are swapped."""
         if not self.mirrored:
             return self.camera
         return replace(self.camera, cx=self.camera.width - self.camera.cx)
@@ -144,14 +145,13 @@ class Example:
 
 
 def outdoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Example:
-    """Return a view of ground, a slanted wall and two balls below an open sky.
+    """Return a synthetic view of ground, a slanted wall and two balls below an open sky.
 
-    The camera is pitched, turned and rolled, so that no axis of the world is an axis of the camera
-    and nothing is symmetric. The field of view is wide: at the corners a ray is 1.3 times as long
-    as its z.
+    The camera is pitched, turned and rolled, so that no camera axis is parallel to a world axis and
+    nothing is symmetric. The field of view is wide: at the corners the ray length is 1.3 times z.
 
     Args:
-        look: Colors of the view.
+        look: Colors of the view, painted or textured.
         size: Width and height in pixels.
     """
     scene = AnalyticScene(
@@ -171,10 +171,10 @@ def outdoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Exa
 
 
 def indoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Example:
-    """Return a view of a furnished room with texture everywhere.
+    """Return a synthetic view of a furnished room with texture everywhere.
 
     Args:
-        look: Colors of the view.
+        look: Colors of the view, painted or textured.
         size: Width and height in pixels.
     """
     width, height = size
@@ -185,16 +185,16 @@ def indoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Exam
 
 
 def _rolled(pose: Float64, degrees: float) -> Float64:
-    """Rotate a camera about its optical axis."""
+    """Rotate a camera pose about the optical axis of the camera."""
     cos, sin = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     rolled: Float64 = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]) @ pose
     return rolled
 
 
 def _step_aside(pose: Float64) -> Float64:
-    """Move a camera to the right by 0.3 m and rotate it back by 4 degrees.
+    """Move a camera to the right by 0.3 m and rotate the camera back by 4 degrees.
 
-    Every matcher can match such a pair.
+    Every matcher can match two views with this small baseline.
     """
     cos, sin = np.cos(np.deg2rad(4.0)), np.sin(np.deg2rad(4.0))
     turn = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])

@@ -1,4 +1,4 @@
-"""Checks of executors, for the tests of a plugin that provides one."""
+"""Contract checks of executors, for the tests of a plugin that provides an executor."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _NUM_IMAGES = 4
 
 @dataclass(frozen=True)
 class _WriteMarker:
-    """Step that writes a file per item, named after the item and the process id."""
+    """Test step that writes a file per item, named after the item and the process id."""
 
     folder: Path
 
@@ -43,7 +43,7 @@ class _WriteMarker:
 
 @dataclass(frozen=True)
 class _KillFirstWorker(_WriteMarker):
-    """Step whose first worker is killed in the middle of an item."""
+    """Test step whose first worker is killed in the middle of an item."""
 
     def __call__(self, item: int) -> None:
         if item == 3:
@@ -57,17 +57,17 @@ class _KillFirstWorker(_WriteMarker):
 
 
 def _fail_on_two(item: int) -> None:
-    """Step that raises for item 2."""
+    """Test step that raises an exception for item 2."""
     if item == 2:
         raise DataError("item", "is 2")
 
 
 def check_items(executor: Executor, folder: Path) -> None:
-    """Require that several worker processes run every item exactly once.
+    """Require that several worker processes together run every item exactly once.
 
     Args:
         executor: Executor under test.
-        folder: Folder to create, visible to the workers.
+        folder: Folder to create, which the workers can access.
     """
     folder.mkdir()
     assert sum(1 for _ in executor.run(_WriteMarker(folder), range(40))) == 40
@@ -82,7 +82,7 @@ def check_lost_worker(executor: Executor, folder: Path) -> None:
 
     Args:
         executor: Executor under test.
-        folder: Folder to create, visible to the workers.
+        folder: Folder to create, which the workers can access.
     """
     folder.mkdir()
     assert sum(1 for _ in executor.run(_KillFirstWorker(folder), range(8))) == 8
@@ -104,12 +104,12 @@ def check_errors(executor: Executor) -> None:
 
 
 def check_extraction(name: str, options: dict[str, Any], folder: Path) -> None:
-    """Require the result of threads, bit for bit, and that Ctrl-C keeps finished work.
+    """Require bitwise the same result as with threads, and that Ctrl-C keeps finished steps.
 
     Args:
         name: Value of ``runtime.executor``.
         options: Value of ``runtime.executor_options``.
-        folder: Folder to create, visible to the workers.
+        folder: Folder to create, which the workers can access.
     """
     _write_images(folder)
     local = _extract(folder, RuntimeOptions(cache_dir=folder / "local", workers=2))
@@ -137,12 +137,12 @@ def check_failing_provider(name: str, options: dict[str, Any], folder: Path) -> 
     """Require that a provider that raises or hangs is called once per image, by a worker.
 
     As with threads, the run either stops and names the provider, or continues without the image and
-    lists it.
+    lists the image as failed.
 
     Args:
         name: Value of ``runtime.executor``.
         options: Value of ``runtime.executor_options``.
-        folder: Folder to create, visible to the workers.
+        folder: Folder to create, which the workers can access.
     """
     _write_images(folder)
     with _install_failing_plugin(folder):
@@ -161,7 +161,7 @@ def check_failing_provider(name: str, options: dict[str, Any], folder: Path) -> 
         for mark in folder.glob("called-*"):
             mark.unlink()
         shutil.rmtree(folder / "cache" / "extraction" / "depth", ignore_errors=True)
-        (folder / "hang").touch()  # everything that takes long is in the cache now
+        (folder / "hang").touch()  # All slow steps are in the cache now.
         skipping = runtime.model_copy(update={"on_error": "skip", "timeout_s": _TIMEOUT_S})
         found = _extract(folder, skipping, depth="failing")
     reasons = found.report["failed"]
@@ -202,7 +202,7 @@ def mpsfm_providers():
 
 @contextmanager
 def _install_failing_plugin(folder: Path) -> Iterator[None]:
-    """Install a failing plugin for this process and for processes that it starts."""
+    """Install a failing plugin for this process and for the processes that it starts."""
     site, name = folder / "site", "mpsfm_failing"
     about = site / f"{name}-1.0.dist-info"
     about.mkdir(parents=True)
@@ -224,7 +224,7 @@ def _install_failing_plugin(folder: Path) -> Iterator[None]:
 
 
 class _ProgressEvents(NullExtractionEvents):
-    """Events that verify the progress of each stage."""
+    """Plugin that records and verifies the progress of each pipeline stage."""
 
     def __init__(self) -> None:
         self.done: dict[str, int] = {}
@@ -245,7 +245,7 @@ def _enable_keyboard_interrupt() -> Iterator[None]:
 
 
 class _InterruptEvents(NullExtractionEvents):
-    """Events that raise SIGINT as soon as matching has started."""
+    """Plugin that raises SIGINT as soon as matching has started."""
 
     def stage_progress(self, stage: str, done: int, total: int) -> None:
         if stage == "matching":
@@ -253,7 +253,7 @@ class _InterruptEvents(NullExtractionEvents):
 
 
 def _write_images(folder: Path) -> None:
-    """Write rendered images and their intrinsics."""
+    """Write rendered images and their intrinsics to a folder."""
     photos = folder / "photos"
     photos.mkdir(parents=True)
     scene = room_scene()
@@ -268,7 +268,7 @@ def _extract(
     events: NullExtractionEvents | None = None,
     depth: str = "flat",
 ) -> Extraction:
-    """Extract features, matches and priors of the rendered images."""
+    """Extract features, matches and priors of the rendered images with an executor."""
     config = Config(
         features=ProviderConfig(use="sift"),
         matcher=ProviderConfig(use="mutual-nearest"),
@@ -281,7 +281,7 @@ def _extract(
 
 
 def _read_cache(cache: Path) -> dict[str, bytes]:
-    """Read the cached arrays, without the records of runs."""
+    """Read the cached arrays of an extraction, without the records of runs."""
     root = cache / "extraction"
     kinds = ("features", "matcher", "normals", "depth")
     return {

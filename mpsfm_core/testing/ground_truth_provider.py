@@ -15,30 +15,31 @@ from mpsfm_core.testing.painted_views import NORMALS_STD, RELATIVE_STD, read_dep
 
 
 class GroundTruthOptions(Options):
-    """Properties of the ground-truth provider inside a wrapper."""
+    """Options of the ground-truth provider that a wrapper under test wraps."""
 
     variance: bool = True
-    """Whether the prior has a variance."""
+    """True if the returned depth and normals have a variance."""
     metric: bool = True
-    """Whether the depth is declared metric."""
+    """True if the returned depth is declared metric."""
     scale: float = 1.0
-    """Factor applied to the depth."""
+    """Factor by which the true depth is multiplied."""
 
 
 class GroundTruth:
-    """Ground truth of examples and of painted views.
+    """Ground truth of synthetic views and of all painted views.
 
-    Known examples and their mirror images are recognized by their pixels. For any other view, for
-    instance a crop that a wrapper made, the painted colors are decoded.
+    Known synthetic views and their mirror images are recognized by their pixels. For any other
+    view, for instance a crop made by a wrapper, depth and normals are decoded from the painted
+    colors.
     """
 
     def __init__(self) -> None:
         self.received_depth: list[DepthPrior | None] = []
-        """Depth prior that came with each call of the normals provider."""
+        """Depth prior that each call of the normals provider received."""
         self._examples: list[Example] = []
 
     def add_example(self, example: Example) -> None:
-        """Add an example whose view will be recognized."""
+        """Add a synthetic view, which is recognized by its pixels from then on."""
         self._examples.append(example)
 
     def factory(self, kind: Kind) -> Callable[[GroundTruthOptions, ProviderContext], object]:
@@ -67,7 +68,7 @@ class GroundTruth:
 
 
 class GroundTruthDepth:
-    """Depth provider that returns the ground truth on the view's grid."""
+    """Depth provider that returns the ground truth on the pixel grid of the view."""
 
     def __init__(self, ground_truth: GroundTruth, options: GroundTruthOptions) -> None:
         self._ground_truth = ground_truth
@@ -82,14 +83,14 @@ class GroundTruthDepth:
 
 
 class GroundTruthNormals:
-    """Normals provider that returns the ground truth on the view's grid."""
+    """Normals provider that returns the ground truth on the pixel grid of the view."""
 
     def __init__(self, ground_truth: GroundTruth, options: GroundTruthOptions) -> None:
         self._ground_truth = ground_truth
         self._options = options
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """Return the true normals of a view and record the depth prior."""
+        """Return the true normals of a view and record the received depth prior."""
         self._ground_truth.received_depth.append(depth)
         _, normals, valid = self._ground_truth.predict(view)
         variance = np.full(valid.shape, NORMALS_STD**2) if self._options.variance else None
@@ -107,4 +108,4 @@ GROUND_TRUTH_SPECS: Mapping[Kind, ProviderSpec] = MappingProxyType(
         "normals": _make_spec("normals", GroundTruthNormals),
     }
 )
-"""Specifications by kind. The contract replaces the factory by :meth:`GroundTruth.factory`."""
+"""Specifications by kind. The contract tests replace the factory by :meth:`GroundTruth.factory`."""

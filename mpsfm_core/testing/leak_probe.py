@@ -1,4 +1,4 @@
-"""Resource usage of this process after repeated calls, to detect leaks."""
+"""Memory and objects of this process after repeated calls, to detect leaks."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ import psutil
 
 
 class ProcessUsage(NamedTuple):
-    """Resources that a process uses after garbage collection."""
+    """Resources that this process uses after garbage collection."""
 
     memory_mb: float
-    """Resident memory in MB (1e6 bytes); on Linux without freed memory."""
+    """Resident memory of the process in MB (1e6 bytes); on Linux without freed memory."""
     objects: int
-    """Objects that Python's garbage collector tracks."""
+    """Number of objects that Python's garbage collector tracks."""
     files: int
     """Open file descriptors."""
     threads: int
@@ -25,20 +25,21 @@ class ProcessUsage(NamedTuple):
 
 
 def measure_usage(run: Callable[[], object], count: int) -> Iterator[ProcessUsage]:
-    """Call a function repeatedly and measure this process after each call. POSIX only.
+    """Call a function repeatedly and measure this process after each call (POSIX only).
 
     Args:
         run: Function without arguments.
         count: Number of calls.
 
     Yields:
-        Resource usage after each call.
+        Resources of the process after each call.
     """
     process = psutil.Process()
     for _ in range(count):
         run()
         gc.collect()
-        if sys.platform == "linux":  # glibc keeps freed memory, which would count as resident
+        # The C library glibc retains freed memory, which would count as resident.
+        if sys.platform == "linux":
             ctypes.CDLL(None).malloc_trim(0)
         memory = process.memory_info().rss / 1e6
         yield ProcessUsage(memory, len(gc.get_objects()), process.num_fds(), process.num_threads())

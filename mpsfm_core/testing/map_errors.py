@@ -1,4 +1,4 @@
-"""Errors of depth and normal maps: deviation from the truth, ray exponent, pixel shift."""
+"""Errors of depth and normal maps: angle, ray length instead of z, pixel shift."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpsfm_core.testing.examples import Example, TrueMaps
 from mpsfm_core.testing.outcome import CheckFailed
 
 _MIN_PIXELS = 40
-"""Smallest number of pixels for a statistic."""
+"""Smallest number of valid pixels for an error statistic."""
 _OUTLIER_MADS = 5.0
 _HALF_STEP_PX = 0.5
 
@@ -20,43 +20,43 @@ _HALF_STEP_PX = 0.5
 def error_quantile(errors: Float64) -> float:
     """Return the 80 % quantile of absolute errors (n,).
 
-    The quantile detects a fault that affects a fifth of the map.
+    The 80 % quantile detects a fault that affects a fifth of the map.
     """
     return float(np.quantile(np.abs(errors), 0.8))
 
 
 class MapShift(NamedTuple):
-    """Shift of the content of a map relative to its true position, in pixels of the view."""
+    """Shift of a map's content relative to its true position, in pixels of the view."""
 
     x: float
-    """Shift at the center, to the right."""
+    """Shift to the right at the center of the map."""
     y: float
-    """Shift at the center, down."""
+    """Downward shift at the center of the map."""
     stretch_x: float
-    """Additional shift at the left and right border, outwards."""
+    """Additional outward shift at the left and right border of the map."""
     stretch_y: float
-    """Additional shift at the upper and lower border, outwards."""
+    """Additional outward shift at the upper and lower border of the map."""
     std: float
-    """Standard deviation of the least certain of the four values."""
+    """Standard deviation in pixels of the least certain of the four shift values."""
 
     @property
     def largest(self) -> float:
-        """Largest shift in x or y, at the border of the view."""
+        """Largest shift in x or y, reached at the border of the view."""
         return max(abs(self.x) + abs(self.stretch_x), abs(self.y) + abs(self.stretch_y))
 
 
 def select_comparable(valid: Bool, truth: TrueMaps) -> Bool:
-    """Select pixels that can be compared with the ground truth.
+    """Select the pixels of a map that can be compared with the ground truth.
 
     Args:
-        valid: Validity (h, w) of an answer.
-        truth: Ground truth on the same grid.
+        valid: Validity (h, w) of a provider's map.
+        truth: Ground truth on the grid of the map.
 
     Returns:
         Mask (h, w) of the valid pixels away from edges.
 
     Raises:
-        CheckFailed: Too few pixels are valid.
+        CheckFailed: The map has too few valid pixels for a comparison.
     """
     both = valid & truth.smooth
     if both.sum() < min(_MIN_PIXELS, truth.smooth.sum() / 2):
@@ -67,11 +67,11 @@ def select_comparable(valid: Bool, truth: TrueMaps) -> Bool:
 
 
 def log_errors(prior: DepthPrior, example: Example, *, any_scale: bool) -> Float64:
-    """Return ``log(depth / z)`` (n,) of the comparable pixels.
+    """Return ``log(depth / z)`` (n,) of the pixels that can be compared with the ground truth.
 
     Args:
         prior: Predicted depth.
-        example: Example that the depth belongs to.
+        example: Synthetic view that the depth belongs to.
         any_scale: True subtracts the median, which removes a common factor.
     """
     truth = example.truth(prior.shape)
@@ -88,9 +88,9 @@ def angle_errors_deg(normals: NormalPrior, example: Example) -> Float64:
 
 
 def estimate_ray_exponent(prior: DepthPrior, example: Example) -> float:
-    """Estimate p of ``depth = z * (ray length / z) ** p`` by least squares.
+    """Estimate p in ``depth = z * (ray length / z) ** p`` by least squares.
 
-    The exponent is 0 for depth along the axis and 1 for the length of the ray.
+    The exponent p is 0 for z-depth and 1 for the distance along the ray.
     """
     truth = example.truth(prior.shape)
     where = select_comparable(prior.valid, truth)
@@ -110,7 +110,7 @@ def estimate_depth_shift(prior: DepthPrior, example: Example) -> MapShift:
         [example.truth(prior.shape, (s * x, s * y)).depth for s in (1, -1)]
         for x, y in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX))
     ]
-    # On a grid finer than the view, half a pixel can cross the border of a surface.
+    # On a grid finer than the view, half a pixel of the view can cross the border of a surface.
     where = select_comparable(prior.valid, truth) & (np.min(moved, axis=(0, 1)) > 0)
     error = np.log(prior.depth[where].astype(np.float64) / truth.depth[where])
     slopes = [np.log(after[where] / before[where])[:, None] for after, before in moved]
@@ -130,19 +130,19 @@ def estimate_normals_shift(prior: NormalPrior, example: Example) -> MapShift:
 
 
 def _normalized_positions(shape: tuple[int, int]) -> Float64:
-    """Return the positions (h, w, 2) of pixels in x and y, from -1 to 1."""
+    """Return the positions (h, w, 2) of pixels in x and y, scaled to [-1, 1]."""
     return pixel_centers(shape[1], shape[0]) / (shape[1] / 2, shape[0] / 2) - 1
 
 
 def _solve_shift(error: Float64, slopes: list[Float64], positions: Float64) -> MapShift:
     """Solve ``error = -slope . (shift + stretch * position) + constant``.
 
-    Least squares with a second pass that excludes outliers.
+    The least-squares fit has a second pass that excludes outliers.
 
     Args:
-        error: Errors (n, k) of k channels.
-        slopes: Change of the truth per pixel in x and in y, (n, k) each.
-        positions: Positions (n, 2) from -1 to 1.
+        error: Errors (n, k) in the k channels of a map.
+        slopes: Change of the true map per pixel in x and in y, (n, k) each.
+        positions: Pixel positions (n, 2), scaled to [-1, 1].
     """
     columns = [
         *(-slope for slope in slopes),

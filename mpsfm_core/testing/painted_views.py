@@ -1,18 +1,19 @@
-"""Views whose colors encode their depth and normals.
+"""Synthetic views whose colors encode their depth and normals.
 
-Mistakes of a plugin are mostly in the code around its network: swapped channels, a shift by half a
-pixel, an ignored focal length, a std instead of a variance. Detecting them requires the correct
-answer. The contract kit therefore paints the answer into the view. A stand-in for the network only
-decodes colors, with one affine map of the three channels or a 1 x 1 convolution. All other code of
-the plugin stays unchanged.
+Most mistakes of a plugin are in the code around its network: swapped channels, a half-pixel shift,
+an ignored focal length, a std instead of a variance. Detecting such mistakes requires the ground
+truth. The contract kit therefore encodes the ground truth in the colors of the view. A tiny test
+network replaces the real one and only decodes colors, with an affine map of the three channels or a
+1 x 1 convolution. The contract tests use all other code of the plugin unchanged.
 
-The encoding, for values from 0 to 255:
+The colors from 0 to 255 encode:
 
 * Red is depth from 0 to :data:`MAX_DEPTH` meters; 0 means no surface.
 * Green and blue are the slopes ``p = n_x / -n_z`` and ``q = n_y / -n_z`` of the normal, from
   ``-MAX_SLOPE`` to ``MAX_SLOPE``: the normal is ``(p, q, -1)``, normalized.
 
-A stand-in with an uncertainty reports :data:`RELATIVE_STD` and :data:`NORMALS_STD` everywhere.
+A test network with an uncertainty reports :data:`RELATIVE_STD` and :data:`NORMALS_STD` at every
+pixel.
 """
 
 from __future__ import annotations
@@ -25,28 +26,29 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Bool, Float64, UInt8
 
 MAX_DEPTH = 10.0
-"""Largest depth in meters; one of 255 steps is 4 cm."""
+"""Largest painted depth in meters; one of 255 color steps is 4 cm."""
 MAX_SLOPE = 4.0
-"""Largest slope, of a surface seen at 76 degrees from its normal; one step is at most 1.8
-degrees."""
+"""Largest painted slope, of a surface seen at 76 degrees from its normal; one color step is at most
+1.8 degrees."""
 RELATIVE_STD = 0.05
-"""Relative std of depth that stand-ins and prepared providers report."""
+"""Relative std of depth that test networks and prepared files report."""
 NORMALS_STD = 0.1
-"""Std of normals in rad that stand-ins and prepared providers report."""
+"""Std of normals in rad that test networks and prepared files report."""
 
 _HALF = 127.5
 
 
 def paint(depth: NDArray[Any], normals: NDArray[Any], valid: Bool) -> UInt8:
-    """Encode depth and normals as colors.
+    """Encode depth and normals as the colors of a painted view.
 
     Args:
-        depth: Depth (h, w) in meters, clipped at :data:`MAX_DEPTH`.
-        normals: Normals (h, w, 3) that face the camera; slopes are clipped at :data:`MAX_SLOPE`.
-        valid: True (h, w) where there is a surface.
+        depth: z-depth (h, w) in meters, clipped at :data:`MAX_DEPTH`.
+        normals: Unit normals (h, w, 3) that face the camera; slopes are clipped at
+            :data:`MAX_SLOPE`.
+        valid: Mask (h, w), True where there is a surface.
 
     Returns:
-        RGB (h, w, 3).
+        Painted image RGB (h, w, 3).
     """
     toward = np.where(valid, np.maximum(-normals[..., 2], 1e-6), 1.0)
     slopes = np.where(valid[..., None], normals[..., :2], 0.0) / toward[..., None]
@@ -60,8 +62,8 @@ def decoder() -> tuple[Float64, Float64]:
     """Return weights and bias of the affine layer that decodes a painted pixel.
 
     Returns:
-        Weights (4, 3) and bias (4,). ``weights @ rgb + bias`` for RGB from 0 to 255 is
-        ``(depth, p, q, -1)``: depth in meters and a normal that is not yet normalized.
+        Weights (4, 3) and bias (4,). The product ``weights @ rgb + bias`` for RGB from 0 to 255 is
+        ``(depth, p, q, -1)``: depth in meters and a normal that is not normalized.
     """
     step = MAX_SLOPE / _HALF
     weights = np.zeros((4, 3))

@@ -17,18 +17,19 @@ from mpsfm_core.testing.pytest_tests import report
 
 
 class ContractCollection:
-    """Pytest plugin that collects one item per check of each named provider."""
+    """Pytest plugin that collects one item per contract check of each named provider."""
 
     def __init__(self, names: Sequence[str], options: Sequence[str]) -> None:
         self._names = names
         self._options = options
         self._folder = Path(tempfile.mkdtemp(prefix="mpsfm-contract-"))
 
-    @pytest.hookimpl(tryfirst=True)  # so that -k and -m also select among these items
+    # Run before pytest's own filters, so that -k and -m also select among these items.
+    @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(
         self, session: pytest.Session, items: list[pytest.Item]
     ) -> None:
-        """Add the checks to the collected items. Creates no provider."""
+        """Add the contract checks to the collected pytest items. Creates no provider."""
         try:
             setup = parse_setup(self._options)
             registry = Registry.discover()
@@ -49,20 +50,20 @@ class ContractCollection:
                 items.append(item)
 
     def pytest_unconfigure(self) -> None:
-        """Remove the files of stand-ins."""
+        """Remove the folder with the weights files of test networks."""
         shutil.rmtree(self._folder, ignore_errors=True)
 
 
 class _Provider(pytest.Collector):
-    """Collector node that is the parent of the checks of one provider."""
+    """Pytest collector that is the parent of the contract checks of one provider."""
 
     def collect(self) -> list[pytest.Item | pytest.Collector]:
-        """Return nothing: the items are created together with this node."""
+        """Return nothing, because the items are created together with this collector."""
         return []
 
 
 class ContractItem(pytest.Item):
-    """Pytest item of one check."""
+    """Pytest item of one contract check."""
 
     def __init__(self, *, contract: Contract, task: CheckTask, **rest: Any) -> None:
         super().__init__(**rest)
@@ -70,9 +71,9 @@ class ContractItem(pytest.Item):
         self._task = task
 
     def runtest(self) -> None:
-        """Run the check and report its result."""
+        """Run the contract check and report its result to pytest."""
         report(self._contract.run(self._task))
 
     def reportinfo(self) -> tuple[Path, None, str]:
-        """Return the name of the check for reports."""
+        """Return the name of the contract check for pytest's reports."""
         return self.path, None, f"{self._contract.provider} {self._task}"

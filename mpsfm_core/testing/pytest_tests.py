@@ -1,4 +1,4 @@
-"""Contract checks as tests in a plugin's own test file."""
+"""Contract checks as pytest functions in a plugin's own test file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mpsfm_core.testing.contract import (
 def contract_tests(
     kind: Kind, name: str, setup: SetupSource = None, *, registry: Registry | None = None
 ) -> Callable[..., None]:
-    """Create a parametrized pytest function with one test per check of a provider.
+    """Create a parametrized pytest function with one test per contract check of a provider.
 
     Example::
 
@@ -27,11 +27,12 @@ def contract_tests(
     Args:
         kind: Kind of the provider.
         name: Name of the provider.
-        setup: Setup or contract function; by default the one of the specification.
+        setup: ContractSetup, or function that returns one; by default the function of the
+            specification.
         registry: Registry that contains the provider; by default all installed plugins.
 
     Returns:
-        Test function for a test module.
+        Parametrized function for a test module.
 
     Raises:
         ProviderError: The provider does not exist or is unavailable.
@@ -54,7 +55,7 @@ def contract_tests(
 
 
 def report(result: CheckResult) -> None:
-    """End a pytest test with the status of a check."""
+    """End a pytest test with the status of a contract check."""
     import pytest
 
     __tracebackhide__ = True

@@ -1,4 +1,4 @@
-"""``mpsfm plugins new``: write a plugin package from templates."""
+"""Scaffold of a plugin package from templates, for ``mpsfm plugins new``."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ _KINDS_WITH_OPENCV = ("features", "retrieval")
 
 
 def write_plugin(name: str, kind: Kind, folder: Path) -> list[Path]:
-    """Write the package of a new plugin with one provider that passes its contract.
+    """Write a new plugin package with one provider that passes the contract checks.
 
     Args:
-        name: Name of package, distribution and provider.
+        name: Name of the Python package, the distribution and the provider.
         kind: Kind of the provider.
-        folder: Parent folder of the package.
+        folder: Parent folder of the plugin package.
 
     Returns:
         Paths of the written files.
 
     Raises:
-        InputError: The name is invalid or taken, or the package folder exists.
+        InputError: The name is invalid or in use, or the package folder exists.
     """
     module = name.replace("-", "_")
     if not _NAME.fullmatch(name) or keyword.iskeyword(module):
@@ -62,5 +62,5 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> list[Path]:
 
 
 def _fill_template(template: Path, placeholders: dict[str, str]) -> str:
-    """Substitute the placeholders of a template file."""
+    """Substitute the placeholders in the text of a template file."""
     return Template(template.read_text(encoding="utf-8")).substitute(placeholders)

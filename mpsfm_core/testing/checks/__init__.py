@@ -1,1 +1,1 @@
-"""The checks of the contract, one module for each provider kind."""
+"""Contract checks, one module for each provider kind."""

@@ -1,12 +1,12 @@
-"""Checks that apply to every kind of provider.
+"""Contract checks that apply to every kind of provider.
 
-A check is a function of a :class:`~mpsfm_core.testing.contract_case.ContractCase`. It returns
-nothing or a remark, and raises ``CheckFailed`` or ``CheckSkipped`` with the reason. Its id is its
-name without ``check_`` and with dashes. The first line of its docstring states the rule, the rest
-gives the reason or the limits of the check.
+A contract check is a function of a :class:`~mpsfm_core.testing.contract_case.ContractCase`. A check
+returns nothing or a remark, and raises ``CheckFailed`` or ``CheckSkipped`` with the reason. The id
+of a check is the function name without ``check_`` and with dashes. The first line of a check's
+docstring states the rule, the rest gives the reason or the limits of the check.
 
-Most checks use one view of 192 x 144 pixels, so that a check takes a fraction of a second with a
-small network. Answers are compared bit for bit, because the cache of a run has no tolerance either.
+Most checks use one view of 192 x 144 pixels, so that a small network needs only a fraction of a
+second. Outputs are compared bit for bit, because the cache of a run has no tolerance either.
 """
 
 from __future__ import annotations
@@ -41,19 +41,19 @@ HEAVY_MODULES = (
     *("torch", "torchvision", "onnxruntime", "tensorflow", "jax", "kornia", "transformers"),
     *("cv2", "scipy", "pycolmap", "pandas", "sklearn", "skimage", "matplotlib", "numba"),
 )
-"""Libraries that a plugin module must not import: together they cost seconds at every start."""
+"""Libraries that a plugin module must not import, because each costs seconds at every start."""
 MAX_IMPORT_S = 2.0
-"""Largest time to import a plugin module and list its providers. Light modules take milliseconds;
-the limit leaves time for a busy machine."""
+"""Time limit in seconds to import a plugin module and list its providers. Modules without heavy
+imports take milliseconds; the limit allows for a busy machine."""
 
 _NUM_MEMORY_CALLS = 4
 _MAX_RETAINED_BYTES = 20_000
-"""Python and numpy memory that a call may retain. A view has at least 83 kB; caches of the
-interpreter grow by less than 4 kB."""
+"""Bytes of Python and numpy memory that a call of a provider may retain. A view has at least 83 kB,
+so a retained view is detected; caches of the interpreter grow by less than 4 kB."""
 
 
 def check_specification(case: ContractCase) -> str:
-    """Require that the registry accepts the specification and the setup's options."""
+    """Require that the registry accepts the specification and the options of the ContractSetup."""
     fault, hint = find_spec_fault(case.spec)
     if fault:
         raise CheckFailed(f"the specification {fault}; {hint}")
@@ -69,7 +69,7 @@ def check_specification(case: ContractCase) -> str:
 
 
 def check_construction(case: ContractCase) -> None:
-    """Require that the factory constructs the provider with the setup's options."""
+    """Require that the factory constructs the provider with the options of the ContractSetup."""
     assert case.provider is not None
 
 
@@ -86,7 +86,7 @@ def check_light_import(case: ContractCase) -> str:
     if process.returncode:
         last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
         raise CheckFailed(f"importing it fails: {last_line}")
-    # Only the last line is ours: native code of a plugin may print too.
+    # The last line is the result; native code of a plugin may print other lines.
     seconds, heavy = json.loads(process.stdout.splitlines()[-1])
     if heavy:
         raise CheckFailed(f"importing {modules[0]!r} imports {' '.join(heavy)}")
@@ -111,18 +111,18 @@ print(json.dumps([seconds, sorted(set(heavy) & (set(sys.modules) - before))]))
 
 
 def check_output_rules(case: ContractCase) -> None:
-    """Require that the answer passes the validator.
+    """Require that the provider's output passes the validator.
 
-    The validator checks type, dtype, shape and values, and what the capabilities promise. If this
-    check fails, all checks that call the provider are skipped.
+    The validator checks type, dtype, shape and values, and the fields of the declared capabilities.
+    If ``output-rules`` fails, all checks that call the provider are skipped.
     """
     case.run(case.example)
 
 
 def check_deterministic(case: ContractCase) -> None:
-    """Require bitwise equal answers from repeated calls and from two instances.
+    """Require bitwise equal output from repeated calls and from two instances.
 
-    Answers are cached, and a run with a seed must be repeatable.
+    Outputs are cached, and a run with a fixed seed must be repeatable.
     """
     first = case.run(case.example)
     _require_same(first, case.run(case.example), "in a second call")
@@ -130,9 +130,9 @@ def check_deterministic(case: ContractCase) -> None:
 
 
 def check_no_state(case: ContractCase) -> None:
-    """Require that an answer does not depend on the views of earlier calls.
+    """Require that the output does not depend on the views of earlier calls.
 
-    A run calls providers in any order.
+    A run calls providers for the images in any order.
     """
     others = [case.example.sized(104, 120), case.example.partner]
     alone = case.run(case.example, case.create_provider())
@@ -142,7 +142,7 @@ def check_no_state(case: ContractCase) -> None:
 
 
 def check_inputs_unchanged(case: ContractCase) -> None:
-    """Require that the provider does not modify the view or its depth and features.
+    """Require that the provider does not modify the view, depth or features that it receives.
 
     Other providers use the same arrays.
     """
@@ -161,9 +161,10 @@ def check_inputs_unchanged(case: ContractCase) -> None:
 
 
 def check_name_does_not_matter(case: ContractCase) -> None:
-    """Require that the answer does not depend on the name of the view.
+    """Require that the output does not depend on the name of the view.
 
-    The cache is keyed by pixels. Providers that read files declare the capability ``uncached``.
+    The cache uses the pixels of an image as key, not its name. Providers that read files declare
+    the capability ``uncached``.
     """
     if case.declares("uncached"):
         raise CheckSkipped("declares 'uncached'")
@@ -175,9 +176,9 @@ def check_name_does_not_matter(case: ContractCase) -> None:
 
 
 def check_intrinsics_declared(case: ContractCase) -> None:
-    """Require ``intrinsics-aware`` if the answer depends on the focal length.
+    """Require ``intrinsics-aware`` if the output depends on the focal length.
 
-    Otherwise the cache would return the answer for another camera.
+    Without this capability the cache would return the output for another camera.
     """
     if case.declares("intrinsics-aware"):
         raise CheckSkipped("declares 'intrinsics-aware'")
@@ -187,7 +188,8 @@ def check_intrinsics_declared(case: ContractCase) -> None:
     camera = case.example.camera
     longer = replace(camera, fx=1.3 * camera.fx, fy=1.3 * camera.fy)
     answer = case.run_on_view(replace(case.example.view, camera=longer), case.example)
-    if isinstance(expected, NormalPrior):  # only the set of normals that face the camera may change
+    # Only the subset of normals that face the camera may change with the focal length.
+    if isinstance(expected, NormalPrior):
         expected, answer = _select_valid_in_both(expected, answer)
     difference = describe_difference(expected, answer)
     if difference:
@@ -195,7 +197,7 @@ def check_intrinsics_declared(case: ContractCase) -> None:
 
 
 def check_threads(case: ContractCase) -> None:
-    """Require that two instances in two threads give the answers that each gives alone.
+    """Require that two instances in two threads give the same output as each instance alone.
 
     A run uses one instance per thread.
     """
@@ -228,9 +230,9 @@ def check_threads(case: ContractCase) -> None:
 
 
 def check_pickles(case: ContractCase) -> None:
-    """Require that factory, options and answers can be pickled.
+    """Require that factory, options and output of the provider can be pickled.
 
-    Process pools and other executors send them to workers.
+    Process pools and other executors send factory, options and output between processes.
     """
     options = case.registry.validate_options(case.spec.kind, case.spec.name, case.setup.options)
     answer = case.run(case.example)
@@ -248,7 +250,7 @@ def check_offline(case: ContractCase) -> None:
 
     The check detects Python sockets, not those of native libraries.
     """
-    case.provider  # noqa: B018 - downloads the weights if necessary
+    case.provider  # noqa: B018 - the attribute access downloads the weights if necessary
     with _forbid_sockets() as attempts:
         try:
             case.run(case.example, case.create_provider())
@@ -289,7 +291,7 @@ def check_memory_released(case: ContractCase) -> str:
 
 
 def check_speed(case: ContractCase) -> str:
-    """Report the time of construction and of two calls; never fails."""
+    """Report the time of construction and of two calls; this check never fails."""
     started = time.perf_counter()
     provider = case.create_provider()
     constructed = time.perf_counter()
@@ -307,7 +309,7 @@ def check_speed(case: ContractCase) -> str:
 def check_odd_size(case: ContractCase) -> str:
     """Require the usual accuracy for a view of 149 x 107 pixels.
 
-    Both sides are prime, so that no network stride divides them.
+    Both 149 and 107 are prime, so that no network stride divides the image size.
     """
     return _run_and_compare(case, case.example.sized(149, 107))
 
@@ -319,28 +321,28 @@ def check_portrait(case: ContractCase) -> str:
 
 
 def check_one_pixel(case: ContractCase) -> None:
-    """Require a valid answer for a view of one pixel."""
+    """Require valid output for a view of one pixel."""
     case.run(case.example.sized(1, 1))
 
 
 def check_thin_view(case: ContractCase) -> None:
-    """Require a valid answer for a view of 5 x 120 pixels."""
+    """Require valid output for a view of 5 x 120 pixels."""
     case.run(case.example.sized(5, 120))
 
 
 def check_grayscale(case: ContractCase) -> None:
-    """Require a valid answer for a grayscale image, given as three equal channels."""
+    """Require valid output for a grayscale image, given as three equal channels."""
     gray = np.asarray(case.example.view.image).mean(axis=-1, keepdims=True)
     shape = case.example.view.image.shape
     _run_on_image(case, np.broadcast_to(gray.astype(np.uint8), shape))
 
 
 def check_sixteen_bit(case: ContractCase) -> None:
-    """Require a valid answer for a 16-bit grayscale image.
+    """Require valid output for a 16-bit grayscale image.
 
-    The core converts the image to 8 bit and three channels.
+    The core converts the image to 8 bit and three channels before the call.
     """
-    import cv2  # local, because pytest loads this module when it collects tests
+    import cv2  # The import is local, because pytest loads this module when it collects tests.
 
     from mpsfm_core.inputs.image_decoding import decode_rgb
     from mpsfm_core.inputs.image_header import ImageHeader
@@ -351,13 +353,13 @@ def check_sixteen_bit(case: ContractCase) -> None:
 
 
 def check_flat(case: ContractCase) -> None:
-    """Require a valid answer for black, gray and white views without texture."""
+    """Require valid output for black, gray and white views without texture."""
     for value in (0, 128, 255):
         _run_on_image(case, np.full(case.example.view.image.shape, value, np.uint8))
 
 
 def check_masked(case: ContractCase) -> None:
-    """Require a valid answer for a view whose mask is partly or completely False."""
+    """Require valid output for a view whose mask is partly or completely False."""
     for num_visible_columns in (case.example.camera.width // 2, 0):
         mask = np.zeros(case.example.view.image.shape[:2], np.bool_)
         mask[:, :num_visible_columns] = True
@@ -366,7 +368,7 @@ def check_masked(case: ContractCase) -> None:
 
 
 STANDALONE = (check_specification, check_construction, check_light_import)
-"""Checks that do not call the provider."""
+"""Contract checks that do not call the provider."""
 
 COMMON = (
     check_deterministic,
@@ -388,7 +390,7 @@ COMMON = (
     check_flat,
     check_masked,
 )
-"""Checks that call the provider, in the order to run them."""
+"""Contract checks that call the provider, in the order to run them."""
 
 
 def _require_same(expected: object, answer: object, when: str) -> None:
@@ -398,7 +400,7 @@ def _require_same(expected: object, answer: object, when: str) -> None:
 
 
 def _select_valid_in_both(first: NormalPrior, second: NormalPrior) -> tuple[object, object]:
-    """Return the normals and variances of the pixels that are valid in both priors."""
+    """Return the normals and variances of the pixels that are valid in both normal priors."""
     if first.shape != second.shape:
         return first, second
     where = first.valid & second.valid
@@ -419,13 +421,13 @@ def _run_on_image(case: ContractCase, image: UInt8) -> None:
 
 def _rename_example(example: Example, name: str) -> Example:
     renamed = replace(example, name=name)
-    # Reuse the rendered images, which the name does not change.
+    # Reuse the rendered images, because they do not depend on the name.
     renamed.__dict__.update(view=replace(example.view, name=name), partner=example.partner)
     return renamed
 
 
 def _find_plugin_modules(case: ContractCase) -> list[str]:
-    """Return the entry-point modules of the provider's distribution."""
+    """Return the entry-point modules of the distribution that contains the provider."""
     distribution = case.registry.version(case.spec.kind, case.spec.name).partition(" ")[0]
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
     return [e.module for e in entries if e.dist is not None and e.dist.name == distribution]
@@ -433,7 +435,7 @@ def _find_plugin_modules(case: ContractCase) -> list[str]:
 
 @contextmanager
 def _forbid_sockets() -> Iterator[list[str]]:
-    """Refuse connections and name look-ups; yields the list of the addresses that were tried."""
+    """Refuse network connections and name look-ups; yield the list of requested addresses."""
     attempts: list[str] = []
 
     def refuse(*arguments: Any, **_: Any) -> Any:

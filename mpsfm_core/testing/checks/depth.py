@@ -1,4 +1,4 @@
-"""Checks of depth providers, of wrappers around them, and of all other depth maps."""
+"""Contract checks of depth providers, of wrappers around them, and of all other depth maps."""
 
 from __future__ import annotations
 
@@ -25,15 +25,17 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.painted_views import RELATIVE_STD, read_depth
 
 RAY_TOLERANCE = 0.25
-"""Exponent of ``ray length / z``. Painted views have 0.002, the length of the ray 1."""
+"""Largest exponent p in ``depth = z * (ray length / z) ** p``: 0 for z-depth, 1 for ray length.
+Correct providers on painted views have 0.002."""
 FLIP_TOLERANCE = 0.3
-"""Relative difference if the truth is unknown. Trained networks are not exactly symmetric; rotated
-or cropped maps differ by more."""
+"""Largest relative depth difference of mirrored or enlarged views if the ground truth is unknown.
+Trained networks are not exactly symmetric; rotated or cropped maps have larger differences."""
 FOCAL_FACTOR = 1.5
 """Focal length of the second camera relative to the first in ``check_depth_intrinsics``."""
 _FOCAL_RANGE = (1.2, 1.9)
-"""Depth ratio for 1.5 times the focal length. A canonical camera model gives exactly 1.5.
-A ratio of 1 means that the focal length is ignored, 0.67 that its effect is inverted."""
+"""Range of depth ratios that is accepted for a focal length ratio of 1.5. A network with a
+canonical camera model has exactly 1.5. A ratio of 1 means that the network ignores the focal
+length, 0.67 that the effect is inverted."""
 
 _ORIENTATIONS: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
     {
@@ -48,7 +50,7 @@ _ORIENTATIONS: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
 def check_depth_is_z(case: ContractCase) -> str:
     """Require z-depth along the optical axis, not the length of the viewing ray.
 
-    The view has a wide angle: at the corners a ray is 1.3 times as long as its z.
+    The test view has a wide angle: in its corners the ray length is 1.3 times z.
     """
     case.require_truth("painted", "prepared", "image")
     power = map_errors.estimate_ray_exponent(_run(case), case.example)
@@ -86,7 +88,7 @@ def check_depth_channel_order(case: ContractCase) -> None:
 def check_depth_pixel_convention(case: ContractCase) -> str:
     """Require that the value at [row, col] belongs to the point (col + 0.5, row + 0.5).
 
-    The check detects half-pixel shifts, corner-aligned resizing, cropped or padded borders, and
+    This check detects half-pixel shifts, corner-aligned resizing, cropped or padded borders, and
     maps that do not cover the whole view.
     """
     case.require_truth("painted", "prepared", "image")
@@ -98,7 +100,7 @@ def check_depth_pixel_convention(case: ContractCase) -> str:
 def check_depth_orientation(case: ContractCase) -> None:
     """Require rows that go down and columns that go right.
 
-    The check detects transposed, mirrored and rotated maps.
+    This check detects transposed, mirrored and rotated maps.
     """
     case.require_truth("painted", "prepared", "image")
     prior = _run(case)
@@ -138,7 +140,7 @@ def check_depth_flip(case: ContractCase) -> str:
 def check_depth_same_in_larger_view(case: ContractCase) -> str:
     """Require the same depth for twice the pixels and twice the focal length.
 
-    A provider that resizes the image has to scale the intrinsics too.
+    A provider that resizes the image has to scale the intrinsics by the same factor.
     """
     case.require_truth("painted", "prepared", "image")
     width, height = case.example.camera.size
@@ -157,7 +159,7 @@ def check_depth_same_in_larger_view(case: ContractCase) -> str:
 def check_depth_intrinsics(case: ContractCase) -> str:
     """Require that ``intrinsics-aware`` depth grows with the focal length.
 
-    An object with the same image through a longer lens is farther away.
+    An object with the same image size through a longer lens is farther away.
     """
     if not case.declares("intrinsics-aware"):
         raise CheckSkipped("does not declare 'intrinsics-aware'")
@@ -177,7 +179,7 @@ def check_depth_intrinsics(case: ContractCase) -> str:
 
 
 def check_depth_variance(case: ContractCase) -> str:
-    """Require a variance: the square of the std that the stand-in reports, in m^2."""
+    """Require a variance in m^2: the square of the std that the test network reports."""
     case.require_truth("painted", "prepared")
     if case.spec.kind == "wrapper":
         raise CheckSkipped("a wrapper may change the variance")
@@ -191,9 +193,9 @@ def check_depth_variance(case: ContractCase) -> str:
 
 
 def check_depth_calibration(case: ContractCase) -> None:
-    """Require a positive variance of every valid pixel after calibration.
+    """Require a positive calibrated variance at every valid pixel.
 
-    The variance has to grow with ``std_scale`` and with the variance of the network.
+    The calibrated variance has to grow with ``std_scale`` and with the variance of the network.
     """
     require_monotonic_calibration(case, _run(case))
 
@@ -211,9 +213,9 @@ def check_depth_joint(case: ContractCase) -> str:
 
 
 def check_depth_focal(case: ContractCase) -> str:
-    """Require a focal length in pixels of the view from ``estimate_focal``.
+    """Require that ``estimate_focal`` returns a focal length in pixels of the view.
 
-    For a view of twice the size it has to be about twice as long.
+    If the view is enlarged twice, the estimated focal length has to be about twice as long.
     """
     if not case.declares("estimates-focal"):
         raise CheckSkipped("does not declare 'estimates-focal'")
@@ -244,18 +246,18 @@ MAP_CHECKS = (
     check_depth_variance,
     check_depth_calibration,
 )
-"""Checks of any depth map; multi-view providers have to pass them too."""
+"""Contract checks of any depth map, which multi-view providers have to pass too."""
 
 CHECKS = (*MAP_CHECKS, check_depth_joint, check_depth_focal)
 
 
 def _run(case: ContractCase) -> DepthPrior:
-    """Return the validated depth of the example."""
+    """Return the validated depth prior of a synthetic view."""
     return first_depth(case.run(case.example))
 
 
 def _compare_joint_normals(case: ContractCase, normals: NormalPrior) -> str:
-    """Require true normals if the truth is known."""
+    """Require that normals agree with the ground truth, if the ground truth is known."""
     if case.truth_source == "none":
         return "the true normals are unknown"
     angle = map_errors.error_quantile(map_errors.angle_errors_deg(normals, case.example))
@@ -265,7 +267,7 @@ def _compare_joint_normals(case: ContractCase, normals: NormalPrior) -> str:
 
 
 def _median_deviation(prior: DepthPrior, expected: Any, where: Any) -> float:
-    """Return the median relative deviation from an expected map, up to one factor."""
+    """Return the median relative deviation of depth from an expected map, up to a common factor."""
     both = prior.valid & where
     if not both.any():
         return np.inf
@@ -274,6 +276,6 @@ def _median_deviation(prior: DepthPrior, expected: Any, where: Any) -> float:
 
 
 def _median_deviation_from_truth(prior: DepthPrior, example: Example) -> float:
-    """Return the median relative deviation from the true depth, up to one factor."""
+    """Return the median relative deviation from the true depth, up to a common factor."""
     truth = example.truth(prior.shape)
     return _median_deviation(prior, truth.depth, truth.valid)

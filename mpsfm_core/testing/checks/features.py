@@ -1,4 +1,4 @@
-"""Checks of features providers."""
+"""Contract checks of features providers."""
 
 from __future__ import annotations
 
@@ -11,25 +11,27 @@ from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 PIXEL_TOLERANCE = 0.25
-"""Shift in pixels, or in multiples of ``std_px`` if larger than one. Integer pixel centers
-shift by 0.5; SIFT has 0.00 and XFeat at most 0.08."""
+"""Largest shift of keypoints in pixels, or in multiples of ``std_px`` if larger than one. Integer
+pixel centers shift keypoints by 0.5; SIFT has a shift of 0.00 and XFeat at most 0.08."""
 LARGE_SIZE = (4096, 3072)
-"""Width and height of a large view: 12.6 megapixels, as phones record."""
+"""Width and height of a large view in pixels: 12.6 megapixels, as phone cameras record."""
 _SAME_KEYPOINT_PX = 2.5
-"""Distance in pixels up to which keypoints of view and rotated view are the same. A half-pixel
-mistake in both directions moves them apart by 1.4."""
+"""Largest distance in pixels at which keypoints of a view and the rotated view are the same. A
+half-pixel mistake in x and y moves such keypoints apart by 1.4 pixels."""
 _MIN_REPEATED_RATIO = 0.2
-"""Ratio of keypoints that the rotated view repeats: SIFT 0.85, XFeat 0.28, DISK below 0.15."""
+"""Smallest ratio of keypoints that are found again in the rotated view: SIFT has 0.85, XFeat 0.28,
+DISK below 0.15."""
 _MIN_COUNT = 8
 _MIN_INSIDE_RATIO = 0.8
-"""Ratio of keypoints on the textured part; the others may respond to its border."""
+"""Smallest ratio of keypoints on the textured part of a view. Detectors may respond to the border
+of the texture."""
 _MIN_CORRECT_RATIO = 0.3
-"""Ratio of mutual nearest neighbors that are correct within three standard deviations. SIFT has
-0.6, shuffled descriptors have 0.01."""
+"""Smallest ratio of mutual nearest neighbors that are correct within three standard deviations.
+SIFT has a ratio of 0.6, shuffled descriptors have 0.01."""
 
 
 def check_features_axes(case: ContractCase) -> str:
-    """Require keypoints (x, y) where the view has texture.
+    """Require keypoints (x, y) in the textured part of the view.
 
     The textured part is low and wide, in the upper right corner, so that swapped axes miss it.
     """
@@ -54,9 +56,9 @@ def check_features_axes(case: ContractCase) -> str:
 def check_features_pixel_convention(case: ContractCase) -> str:
     """Require the center of the first pixel at (0.5, 0.5).
 
-    In the view rotated by 180 degrees a keypoint (x, y) has to be at (width - x, height - y). A
-    wrong convention shifts x and y alike. Some networks have a bias of their own in one of them;
-    for these the check is skipped.
+    If the view is rotated by 180 degrees, a keypoint (x, y) has to be found at (width - x, height -
+    y). A wrong pixel convention shifts x and y by the same amount. Some networks shift only x or
+    only y; for such networks the check is skipped.
     """
     case.require_truth("image")
     view = case.example.view
@@ -84,11 +86,11 @@ def check_features_pixel_convention(case: ContractCase) -> str:
 def check_features_large_view(case: ContractCase) -> str:
     """Require keypoints in pixels of a large view, even if the provider reduces the image.
 
-    The view has 12.6 megapixels. Only its lower right corner has texture, so that keypoints of a
-    reduced image that are not scaled back miss it.
+    The large view has 12.6 megapixels. Only the lower right corner of the view has texture.
+    Keypoints of a reduced image that are not scaled back are outside of this corner.
     """
     case.require_truth("image")
-    import cv2  # local, because pytest loads this module when it collects tests
+    import cv2  # The import is local, because pytest loads this module when it collects tests.
 
     width, height = LARGE_SIZE
     left, top = 3 * width // 4, 3 * height // 4
@@ -136,7 +138,7 @@ def check_features_descriptors(case: ContractCase) -> str:
 def check_features_dimension(case: ContractCase) -> str:
     """Require the same descriptor length for every view.
 
-    This includes views without any keypoint.
+    Views without any keypoint are included.
     """
     flat = replace(case.example.view, image=np.full_like(case.example.view.image, 128))
     some, none = case.run(case.example), case.run_on_view(flat, case.example)
@@ -156,13 +158,13 @@ CHECKS = (
 
 
 def _require_enough(features: Features) -> None:
-    """Require keypoints in a textured view."""
+    """Require that the detector finds keypoints in a textured view."""
     if len(features) < _MIN_COUNT:
         raise CheckFailed(f"finds only {len(features)} keypoints in a view full of texture")
 
 
 def _offsets_to_nearest(found: Float64, others: Float64, radius: float) -> Float64:
-    """Return the differences (n, 2) of mutual nearest points closer than ``radius``."""
+    """Return the differences (n, 2) of mutual nearest points that are closer than ``radius``."""
     distance = np.linalg.norm(found[:, None] - others[None], axis=2)
     nearest, back = distance.argmin(axis=1), distance.argmin(axis=0)
     rows = np.flatnonzero(back[nearest] == np.arange(len(found)))
@@ -172,7 +174,7 @@ def _offsets_to_nearest(found: Float64, others: Float64, radius: float) -> Float
 
 
 def _mutual_nearest(a: Features, b: Features) -> tuple[Int64, Int64]:
-    """Return the rows of both feature sets whose descriptors are mutual nearest neighbors."""
+    """Return the row indices of descriptors that are mutual nearest neighbors."""
     x, y = a.descriptors.astype(np.float64), b.descriptors.astype(np.float64)
     distance = (x**2).sum(1)[:, None] + (y**2).sum(1)[None] - 2 * x @ y.T
     nearest, back = distance.argmin(axis=1), distance.argmin(axis=0)

@@ -1,4 +1,4 @@
-"""Requirements that the checks of depth and normal maps share."""
+"""Requirements that the contract checks of depth and normal maps share."""
 
 from __future__ import annotations
 
@@ -16,20 +16,22 @@ from mpsfm_core.testing.examples import Example, TrueMaps
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 STD_FACTOR = 1.25
-"""Largest ratio of measured to reported std. A std of 0.25 m instead of a variance gives 2."""
+"""Largest ratio of measured std to the std that the test network reports. A std of 0.25 m that is
+returned as a variance gives a ratio of 2."""
 VALIDITY_TOLERANCE = 0.05
-"""Ratio of wrong pixels away from edges; padding and blur of a network cost some."""
+"""Largest ratio of pixels with wrong validity away from edges; padding and blur of a network cause
+some."""
 
 
 def require_reported_std(variance: Float32, expected_std: Float64) -> str:
-    """Require that a variance is the square of the reported std.
+    """Require that a variance is the square of the std that the test network reports.
 
     Args:
-        variance: Variances (n,) of an answer.
-        expected_std: Reported standard deviations (n,).
+        variance: Variances (n,) in the output of the provider.
+        expected_std: Standard deviations (n,) that the test network reports.
 
     Returns:
-        Remark with the ratio.
+        Remark with the median ratio of the standard deviations.
 
     Raises:
         CheckFailed: The median ratio of the standard deviations is outside of :data:`STD_FACTOR`.
@@ -43,17 +45,17 @@ def require_reported_std(variance: Float32, expected_std: Float64) -> str:
 
 
 def require_true_validity(valid: Bool, truth: TrueMaps) -> str:
-    """Require that pixels are valid exactly where there is a surface.
+    """Require that pixels are valid exactly where the view shows a surface.
 
     Args:
-        valid: Validity (h, w) of a map.
-        truth: Ground truth on the same grid.
+        valid: Validity (h, w) of a depth or normal map.
+        truth: Ground truth on the grid of the map.
 
     Returns:
-        Remark with both error ratios.
+        Remark with the ratios of wrongly valid and wrongly invalid pixels.
 
     Raises:
-        CheckFailed: A ratio exceeds :data:`VALIDITY_TOLERANCE`.
+        CheckFailed: One of the ratios exceeds :data:`VALIDITY_TOLERANCE`.
         CheckSkipped: The map is too coarse to separate surfaces from sky.
     """
     empty, full = truth.edge_free & ~truth.valid, truth.smooth
@@ -68,7 +70,7 @@ def require_true_validity(valid: Bool, truth: TrueMaps) -> str:
 
 
 def require_monotonic_calibration(case: ContractCase, prior: DepthPrior | NormalPrior) -> None:
-    """Require that the declared calibration keeps the variance and its order.
+    """Require that calibration defines a variance everywhere and keeps its order.
 
     Args:
         case: Provider under test.
@@ -100,5 +102,5 @@ def require_monotonic_calibration(case: ContractCase, prior: DepthPrior | Normal
 
 
 def swap_painted_channels(example: Example, shape: tuple[int, int]) -> NDArray[Any]:
-    """Return the painted image as BGR, resized to the grid of a map."""
+    """Return the painted image with its channels in BGR order, resized to the grid of a map."""
     return resize_map(example.view.image[..., ::-1], shape[1], shape[0])

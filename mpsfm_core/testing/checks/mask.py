@@ -1,6 +1,6 @@
-"""Checks of mask providers.
+"""Contract checks of mask providers.
 
-The masks of the examples exclude the sky, where there is no surface.
+The true masks of the synthetic views exclude the sky, where there is no surface.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from mpsfm_core.testing.painted_views import read_depth
 
 
 def check_mask_polarity(case: ContractCase) -> str:
-    """Require True for usable pixels and False for the others."""
+    """Require True for usable pixels and False for the sky."""
     case.require_truth("painted", "prepared", "image")
     answer, truth = case.run(case.example), case.example.truth()
     agreement = float((answer == truth.valid)[truth.edge_free].mean())
@@ -27,7 +27,7 @@ def check_mask_polarity(case: ContractCase) -> str:
 def check_mask_place(case: ContractCase) -> str:
     """Require that the mask covers the whole view without a shift.
 
-    The check detects shifted, rotated and cropped masks.
+    This check detects shifted, rotated and cropped masks.
     """
     case.require_truth("painted", "prepared", "image")
     return compare_with_truth(case, case.example, case.run(case.example))

@@ -1,4 +1,4 @@
-"""Checks of sparse and dense matchers."""
+"""Contract checks of sparse and dense matchers."""
 
 from __future__ import annotations
 
@@ -22,30 +22,32 @@ from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 SHIFT_TOLERANCE = 0.2
-"""Shift in multiples of ``std_px`` or pixels of the larger view; integer pixel centers give 0.5."""
+"""Largest shift of matches in multiples of ``std_px``, or in pixels of the larger view; integer
+pixel centers give 0.5."""
 NUM_MANY_FEATURES = 4096
 """Number of features per view that every sparse matcher has to accept."""
 _MIN_CORRECT_RATIO = 0.5
-"""Ratio of correct matches of an easy pair: SIFT nearest neighbors 0.99, LighterGlue 0.96."""
+"""Smallest ratio of correct matches for an easy image pair: SIFT nearest neighbors have 0.99,
+LighterGlue has 0.96."""
 
 
 def check_matcher_sides(case: ContractCase) -> str:
-    """Require that the first column belongs to the first view, the second to the second."""
+    """Require match columns in the order of the views."""
     case.require_truth("image", "prepared")
     return _require_correct(case, case.example, case.example.partner)
 
 
 def check_matcher_order(case: ContractCase) -> str:
-    """Require that exchanged views exchange the columns."""
+    """Require that swapped input views swap the columns of the matches."""
     case.require_truth("image", "prepared")
     return _require_correct(case, case.example.partner, case.example)
 
 
 def check_matcher_pixel_convention(case: ContractCase) -> str:
-    """Require dense matches in COLMAP pixels.
+    """Require dense matches in COLMAP's pixel convention.
 
-    Between a view and the same view at half the size, coordinates are halved exactly. Integer
-    pixel centers cause a shift.
+    If a view is matched with its copy at half the size, matched coordinates are halved exactly.
+    Integer pixel centers shift the matched coordinates.
     """
     if not case.declares("dense"):
         raise CheckSkipped("sparse: positions are the keypoints'")
@@ -67,7 +69,7 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
 
 
 def check_matcher_no_features(case: ContractCase) -> None:
-    """Require an empty answer if a view has no features."""
+    """Require empty output if a view has no features."""
     if not case.declares("sparse"):
         raise CheckSkipped("needs no features")
     a, b = case.example, case.example.partner
@@ -80,7 +82,7 @@ def check_matcher_no_features(case: ContractCase) -> None:
 
 
 def check_matcher_few_features(case: ContractCase) -> None:
-    """Require a valid answer for one or two features."""
+    """Require valid output for one or two features."""
     if not case.declares("sparse"):
         raise CheckSkipped("needs no features")
     a, b = case.example, case.example.partner
@@ -91,9 +93,10 @@ def check_matcher_few_features(case: ContractCase) -> None:
 
 
 def check_matcher_many_features(case: ContractCase) -> str:
-    """Require a valid answer for 4096 features per view.
+    """Require valid output for 4096 features per view.
 
-    Images of users have as many. A fixed buffer or a limit of the network must not end a run.
+    Real images have as many features. A fixed buffer or a size limit of the network must not end a
+    run.
     """
     if not case.declares("sparse"):
         raise CheckSkipped("needs no features")
@@ -110,7 +113,7 @@ def check_matcher_many_features(case: ContractCase) -> str:
 def check_matcher_scores(case: ContractCase) -> str:
     """Require a higher mean score of correct matches than of wrong ones.
 
-    The check compares only if both are frequent enough.
+    This check is skipped unless the matcher returns enough correct and wrong matches.
     """
     case.require_truth("image", "prepared")
     a, b = case.example, case.example.partner
@@ -157,7 +160,7 @@ CHECKS = (
 
 
 def _require_correct(case: ContractCase, a: Example, b: Example) -> str:
-    """Require that most matches of two examples are the same surface points."""
+    """Require that most matches of two synthetic views are the same surface points."""
     matches = match_points(case, a, b, case.run_on_pair(a, b))
     _require_enough(len(matches))
     limit = MATCH_TOLERANCE_STD * max(1.0, matches.std_px)
@@ -171,20 +174,20 @@ def _require_correct(case: ContractCase, a: Example, b: Example) -> str:
 
 
 def _require_enough(count: int) -> None:
-    """Require matches between views that overlap."""
+    """Require that the matcher finds matches between views that overlap."""
     if count < MIN_MATCHES:
         raise CheckFailed(f"finds only {count} matches between views that overlap by 90 %")
 
 
 def _depth_error(prior: DepthPrior, example: Example) -> float:
-    """Return the relative error of 80 % of the pixels, up to a factor if not metric."""
+    """Return the 80 % quantile of the relative depth error, up to a factor if not metric."""
     return map_errors.error_quantile(
         map_errors.log_errors(prior, example, any_scale=not prior.metric)
     )
 
 
 def _take_first(features: Features, count: int) -> Features:
-    """Return the first ``count`` features."""
+    """Return the first ``count`` features of a view."""
     return Features(
         features.keypoints[:count],
         features.descriptors[:count],

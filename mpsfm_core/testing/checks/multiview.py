@@ -1,4 +1,4 @@
-"""Checks of multi-view providers, which also have to pass the checks of depth maps."""
+"""Contract checks of multi-view providers, which also have to pass the checks of depth maps."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 ROTATION_TOLERANCE_DEG = 1.0
-"""Error of a relative rotation. The views are 4 and 8 degrees apart, so that an inverted or
-mirrored pose has an error of 8 degrees or more."""
+"""Largest error of a relative rotation in degrees. The synthetic views are 4 and 8 degrees apart,
+so an inverted or mirrored pose has an error of 8 degrees or more."""
 BASELINE_TOLERANCE = 0.1
-"""Relative error of a baseline: twice the tolerance of depth."""
+"""Largest relative error of the baseline between two views: twice the depth tolerance."""
 FOCAL_TOLERANCE = 0.1
-"""Relative error of a known focal length. A wrong pixel grid or exchanged axes give at least
-0.25."""
+"""Largest relative error of a focal length whose ground truth is known. A wrong pixel grid or
+swapped axes cause an error of at least 0.25."""
 _FOCAL_RATIO_RANGE = (1.5, 2.7)
-"""Ratio of the estimated focal lengths of a view at twice the size and at its own size."""
+"""Accepted range for the ratio of the focal lengths that are estimated at twice the size and at the
+original size."""
 
 
 def check_multiview_order(case: ContractCase) -> None:
-    """Require that the maps have the order of the views."""
+    """Require that the depth maps have the order of the input views."""
     case.require_truth("painted", "prepared", "image")
     examples = _make_group(case)[::-1]
     group = case.run_on_group(*examples)
@@ -63,9 +64,9 @@ def check_multiview_own_axis(case: ContractCase) -> str:
 
 
 def check_multiview_one_unit(case: ContractCase) -> str:
-    """Require one unit for all maps of a group.
+    """Require one common unit for all depth maps of a group.
 
-    The mapper estimates one scale per group.
+    The mapper estimates one scale for the whole group.
     """
     case.require_truth("painted", "prepared", "image")
     examples = _make_group(case)
@@ -98,7 +99,7 @@ def check_multiview_poses(case: ContractCase) -> str:
 
 
 def check_multiview_pose_unit(case: ContractCase) -> str:
-    """Require translations in the unit of depth."""
+    """Require translations of ``cam_from_group`` in the unit of depth."""
     poses, examples = _predict_poses(case)
     unit = float(np.exp(np.median(_log_factors(case.run_on_group(*examples), examples))))
     true = _relative(_true_poses(examples), len(examples) - 1)[1]
@@ -114,14 +115,14 @@ def check_multiview_pose_unit(case: ContractCase) -> str:
 def check_multiview_intrinsics(case: ContractCase) -> str:
     """Require intrinsics in pixels of each view.
 
-    The check detects pixels of the network's grid or of another view.
+    This check detects intrinsics in pixels of the network's grid or of another view.
     """
     if not case.declares("proposes-intrinsics"):
         raise CheckSkipped("does not declare 'proposes-intrinsics'")
     width, height = case.example.camera.size
     examples = (case.example, case.example.sized(2 * width, 2 * height))
     found = case.run_on_group(*examples).intrinsics
-    assert found is not None  # guaranteed by the validator
+    assert found is not None  # The validator guarantees that the field is present.
     if case.truth_source == "none":
         ratio = float(found[1, 0] / found[0, 0])
         if not _FOCAL_RATIO_RANGE[0] < ratio < _FOCAL_RATIO_RANGE[1]:
@@ -136,15 +137,15 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
 
 
 def check_multiview_alone(case: ContractCase) -> None:
-    """Require a valid answer for a single view.
+    """Require valid output for a group of one view.
 
-    A run passes an image without overlapping images alone.
+    A run passes an image that overlaps no other image as a group of one view.
     """
     case.run_on_group(case.example)
 
 
 def check_multiview_sizes(case: ContractCase) -> str:
-    """Require accurate answers for a group of landscape and portrait views."""
+    """Require the usual accuracy for a group of landscape and portrait views."""
     width, height = case.example.camera.size
     examples = (
         case.example,
@@ -181,31 +182,31 @@ CHECKS = (
 
 
 def _make_group(case: ContractCase) -> tuple[Example, ...]:
-    """Return three examples with overlapping views."""
+    """Return three synthetic views that overlap."""
     return case.example, case.example.partner, case.example.partner.partner
 
 
 def _pairs(
     group: MultiViewPrior, examples: tuple[Example, ...]
 ) -> list[tuple[DepthPrior, Example]]:
-    """Pair each depth prior with its example."""
+    """Pair each depth prior with the synthetic view of its image."""
     return list(zip(group.depth, examples, strict=True))
 
 
 def _scale_free_error(prior: DepthPrior, example: Example) -> float:
-    """Return the relative error of 80 % of the pixels, up to one factor."""
+    """Return the 80 % quantile of the relative depth error, up to a common factor."""
     return map_errors.error_quantile(map_errors.log_errors(prior, example, any_scale=True))
 
 
 def _median_free_error(prior: DepthPrior, example: Example, expected: Float64) -> float:
-    """Return the relative error of 80 % of the pixels for an expected depth (h, w)."""
+    """Return the 80 % quantile of the relative error for an expected depth map (h, w)."""
     where = map_errors.select_comparable(prior.valid, example.truth(prior.shape)) & (expected > 0)
     error = np.log(prior.depth[where] / expected[where])
     return map_errors.error_quantile(error - np.median(error))
 
 
 def _depth_from_first_view(example: Example, first: Example, shape: tuple[int, int]) -> Float64:
-    """Return the depth (h, w) in the first view of the points that a view sees."""
+    """Return the depth (h, w) in the first view of the points that another view sees."""
     rows, columns = shape
     grid = rays(example.camera.resized(columns, rows), pixel_centers(columns, rows))
     points = grid * example.truth(shape).depth[..., None]
@@ -215,19 +216,19 @@ def _depth_from_first_view(example: Example, first: Example, shape: tuple[int, i
 
 
 def _log_factors(group: MultiViewPrior, examples: tuple[Example, ...]) -> list[float]:
-    """Return the logarithm of the unit of each map in meters."""
+    """Return the logarithm of the unit of each depth map in meters."""
     errors = [map_errors.log_errors(p, e, any_scale=False) for p, e in _pairs(group, examples)]
     return [float(np.median(error)) for error in errors]
 
 
 def _predict_poses(case: ContractCase) -> tuple[Float64, tuple[Example, ...]]:
-    """Return the predicted poses (n, 3, 4) of a group and its examples."""
+    """Return the predicted poses (n, 3, 4) of a group and its synthetic views."""
     if not case.declares("proposes-poses"):
         raise CheckSkipped("does not declare 'proposes-poses'")
     case.require_truth("prepared", "image")
     examples = _make_group(case)
     poses = case.run_on_group(*examples).poses
-    assert poses is not None  # guaranteed by the validator
+    assert poses is not None  # The validator guarantees that the field is present.
     return poses, examples
 
 
@@ -244,10 +245,10 @@ def _inverse(pose: Float64) -> Float64:
 
 
 def _relative(poses: Float64, index: int) -> tuple[Float64, Float64]:
-    """Return the pose of a view relative to the first view."""
+    """Return the true pose of a view relative to the first view."""
     return compose(_split(poses[index]), invert(*_split(poses[0])))
 
 
 def _rotation_error_deg(a: tuple[Float64, Float64], b: tuple[Float64, Float64]) -> float:
-    """Return the angle in degrees between two rotations."""
+    """Return the angle in degrees between two rotation matrices."""
     return float(rotation_angle_deg(a[0].T @ b[0]))

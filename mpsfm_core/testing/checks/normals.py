@@ -1,4 +1,4 @@
-"""Checks of normals providers and of wrappers around them."""
+"""Contract checks of normals providers and of wrappers around them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.painted_views import NORMALS_STD, read_normals
 
 FLIP_TOLERANCE_DEG = 15.0
-"""Angle if the truth is unknown: trained networks are not exactly symmetric."""
+"""Largest angle in degrees if the ground truth is unknown, because trained networks are not exactly
+symmetric."""
 
 _AXES: Mapping[str, tuple[int, int, int]] = MappingProxyType(
     {
@@ -39,7 +40,8 @@ _AXES: Mapping[str, tuple[int, int, int]] = MappingProxyType(
 def check_normals_frame(case: ContractCase) -> str:
     """Require normals in the camera frame: x right, y down, z forward.
 
-    The check names the mistake if a sign change or the rotation to the world frame explains it.
+    If a sign change or the rotation to the world frame explains the error, the check names this
+    mistake.
     """
     case.require_truth("painted", "prepared", "image")
     prior = _run(case)
@@ -74,7 +76,8 @@ def check_normals_pixel_convention(case: ContractCase) -> str:
 def check_normals_validity(case: ContractCase) -> str:
     """Require that pixels with a surface are valid and pixels of the sky are not.
 
-    Painted views encode a normal everywhere, so that the check needs a prepared truth.
+    Painted views encode a normal at every pixel, so this check needs a provider whose true output
+    is prepared.
     """
     case.require_truth("prepared")
     prior = _run(case)
@@ -82,7 +85,7 @@ def check_normals_validity(case: ContractCase) -> str:
 
 
 def check_normals_flip(case: ContractCase) -> str:
-    """Require the mirrored normals for the mirrored view, with x negated.
+    """Require mirrored normals with negated x for the mirrored view.
 
     This check also applies if the truth is unknown, with a larger tolerance.
     """
@@ -112,7 +115,7 @@ def check_normals_same_in_larger_view(case: ContractCase) -> str:
 
 
 def check_normals_variance(case: ContractCase) -> str:
-    """Require a variance: the square of the angular std of the stand-in, in rad^2."""
+    """Require a variance in rad^2: the square of the angular std that the test network reports."""
     case.require_truth("painted", "prepared")
     if case.spec.kind == "wrapper":
         raise CheckSkipped("a wrapper may change the variance")
@@ -124,9 +127,9 @@ def check_normals_variance(case: ContractCase) -> str:
 
 
 def check_normals_calibration(case: ContractCase) -> None:
-    """Require a positive variance of every valid pixel after calibration.
+    """Require a positive calibrated variance at every valid pixel.
 
-    The variance has to grow with ``std_scale`` and with the variance of the network.
+    The calibrated variance has to grow with ``std_scale`` and with the variance of the network.
     """
     require_monotonic_calibration(case, _run(case))
 
@@ -149,7 +152,7 @@ def _run(case: ContractCase) -> NormalPrior:
 
 
 def _angle_error_deg(found: Any, expected: Any) -> float:
-    """Return the angle in degrees that 80 % of the normals stay below."""
+    """Return the 80 % quantile of the angle in degrees between predicted and true normals."""
     if not len(found):
         raise CheckFailed("has no valid normals where the truth is known")
     return map_errors.error_quantile(angle_between_deg(found.astype(np.float64), expected))

@@ -1,4 +1,4 @@
-"""Checks of image retrieval providers."""
+"""Contract checks of image retrieval providers."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ def check_retrieval_dimension(case: ContractCase) -> str:
 def check_retrieval_self_similarity(case: ContractCase) -> str:
     """Require that no view is more similar to another view than to itself.
 
-    Unit vectors satisfy this. Otherwise bright or detailed views would be similar to all views.
+    Descriptors of unit length satisfy this rule. If descriptors have different lengths, bright or
+    detailed views can be similar to all views.
     """
     flat = replace(case.example.view, image=np.full_like(case.example.view.image, 200))
     descriptors = np.stack(
@@ -46,7 +47,7 @@ def check_retrieval_self_similarity(case: ContractCase) -> str:
 def check_retrieval_overlap(case: ContractCase) -> str:
     """Require a higher similarity to neighboring views than to another scene.
 
-    The neighbors show the scene from one and two steps to the side.
+    The neighboring views are one and two steps to the side in the same scene.
     """
     case.require_truth("image", "prepared")
     example, other = case.example, outdoor_example("textured", case.example.camera.size)

@@ -1,7 +1,7 @@
 """Checks of wrappers.
 
-The wrapper is put around a provider that knows the ground truth. It has to pass these checks and
-all checks of the kind that it wraps.
+Contract checks of wrappers, which are put around a provider that returns the ground truth. A
+wrapper has to pass the checks of this module and all checks of the kind that it wraps.
 """
 
 from __future__ import annotations
@@ -13,21 +13,21 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 
 def check_wrapper_keeps_variance(case: ContractCase) -> None:
-    """Require a variance around a provider with a variance.
+    """Require a variance if the wrapped provider returns a variance.
 
-    The calibration of the inner provider expects it.
+    The calibration of the wrapped provider expects a variance.
     """
     if case.run(case.example).variance is None:
         raise CheckFailed("drops the variance of the provider it wraps")
 
 
 def check_wrapper_without_variance(case: ContractCase) -> None:
-    """Require a valid answer around a provider without a variance."""
+    """Require valid output if the wrapped provider returns no variance."""
     case.run(case.example, case.create_provider(variance=False))
 
 
 def check_wrapper_keeps_unit(case: ContractCase) -> None:
-    """Require that the wrapper keeps ``metric`` as the inner provider declares it."""
+    """Require that the wrapper keeps ``metric`` as the wrapped provider declares it."""
     if case.kind != "depth":
         raise CheckSkipped("applies to depth only")
     for metric in (True, False):
@@ -36,9 +36,9 @@ def check_wrapper_keeps_unit(case: ContractCase) -> None:
 
 
 def check_wrapper_uses_the_provider(case: ContractCase) -> str:
-    """Require that the answer follows the inner provider.
+    """Require that the wrapper's depth follows the depth of the wrapped provider.
 
-    Twice the depth inside has to be twice the depth outside.
+    If the wrapped provider returns twice the depth, the wrapper has to return twice the depth.
     """
     if case.kind != "depth":
         raise CheckSkipped("applies to depth only")
@@ -55,7 +55,7 @@ def check_wrapper_uses_the_provider(case: ContractCase) -> str:
 def check_wrapper_hands_on_depth(case: ContractCase) -> None:
     """Require that a wrapper of normals passes on the depth prior.
 
-    The inner provider may declare ``needs-depth``.
+    The wrapped normals provider may declare ``needs-depth``.
     """
     if case.kind != "normals":
         raise CheckSkipped("applies to normals only")

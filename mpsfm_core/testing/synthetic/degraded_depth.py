@@ -1,8 +1,8 @@
-"""Synthetic depth of a monocular network: true depth with smooth, seeded errors.
+"""Synthetic monocular depth: true depth with smooth, seeded errors.
 
-Errors of networks are not pixel noise. A whole map has a wrong scale, and the rest bends and shifts
-whole surfaces. Both are imitated here. The errors of an image depend only on its name and the seed,
-so that all tests and benchmarks use the same ones.
+The errors of depth networks are not pixel noise. The whole map has a wrong scale, and smooth errors
+bend and shift whole surfaces. This module simulates both kinds of errors. The errors of an image
+depend only on its name and the seed, so that all tests and benchmarks use the same errors.
 """
 
 from __future__ import annotations
@@ -23,26 +23,28 @@ _GRID = 120
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Relative errors of depth: ``depth * exp(scale * n + field * f(x, y))``.
+    """Model of relative depth errors: the depth is ``depth * exp(scale * n + field * f(x, y))``.
 
-    ``n`` is standard normal, ``f`` the sum of two blurred Gaussian noise fields.
+    In this formula ``n`` is standard normal, and ``f`` is the sum of two blurred Gaussian noise
+    fields.
     """
 
     scale: float = 0.05
-    """Std of the error of a whole image. :attr:`std` excludes it, because the mapper estimates a
-    scale per image (``s_i`` in the paper)."""
+    """Std of the relative error that a whole image shares. :attr:`std` excludes it, because the
+    mapper estimates a scale per image (``s_i`` in the paper)."""
     field: float = 0.05
-    """Std of the field ``f``."""
+    """Std of the noise field ``f``, which is a relative depth error."""
     lengths: tuple[float, float] = (1 / 8, 1 / 30)
-    """Std of the blur of both fields relative to the width of the map."""
+    """Std of the Gaussian blur of both noise fields relative to the width of the map."""
     weights: tuple[float, float] = (0.8, 0.6)
-    """Weights of both fields; their squares sum to one."""
+    """Weights of both noise fields; the squares of the weights sum to one."""
 
     @property
     def std(self) -> float:
-        """Relative std of a pixel after the image has received its optimal scale.
+        """Relative depth std of a pixel after the image has received its optimal scale.
 
-        The optimal scale also removes the mean of the field, so that errors are about 6 % smaller.
+        The optimal scale also removes the mean of the noise field, so the errors are about 6 %
+        smaller than this std.
         """
         return self.field
 
@@ -50,13 +52,13 @@ class DepthErrors:
 def degrade_depth(
     depth: Float32, name: str, errors: DepthErrors | None = None, seed: int = 0
 ) -> Float32:
-    """Add the errors of a monocular network to a true depth map.
+    """Add the errors of a monocular depth network to a true depth map.
 
     Args:
-        depth: True depth (h, w); zeros are invalid and stay zero.
-        name: Name of the image, which seeds its errors.
+        depth: True depth (h, w). Zeros are invalid and remain zero.
+        name: Name of the image, which seeds the errors.
         errors: Model of the errors, by default :class:`DepthErrors`.
-        seed: Seed in addition to the name.
+        seed: Seed in addition to the image name.
 
     Returns:
         Depth (h, w) with errors.
@@ -81,5 +83,6 @@ def _smooth_noise(rng: np.random.Generator, rows: int, blur: float) -> Float64:
     margin = math.ceil(3 * blur)
     noise = rng.normal(size=(rows + 2 * margin, _GRID + 2 * margin))
     blurred = cv2.GaussianBlur(noise, (0, 0), blur)[margin:-margin, margin:-margin]
-    # Std of blurred white noise. The sample std would remove errors longer than the map.
+    # This is the theoretical std of blurred white noise. Dividing by the sample std would remove
+    # errors longer than the map.
     return np.asarray(blurred * (2 * blur * math.sqrt(math.pi)))

@@ -1,7 +1,7 @@
-"""Synthetic halls with boxes: image sets of any size with many matches.
+"""Synthetic halls with boxes: mapping problems of any size with many matches.
 
-Views are on a grid and rotate slowly from one to the next, so that neighbors overlap well.
-Keypoints are noisy and some matches are wrong, as after geometric verification.
+The cameras are on a grid and rotate slowly from one to the next, so that neighboring views overlap
+well. Keypoints are noisy and some matches are wrong, as after geometric verification.
 """
 
 from __future__ import annotations
@@ -36,33 +36,34 @@ from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Box, Surface, loo
 
 CAMERA = PinholeCamera(640, 480, 420.0, 420.0, 320.0, 240.0)
 SPACING = 1.5
-"""Distance between neighboring views of the grid in meters."""
+"""Distance in meters between neighboring cameras of the grid."""
 TURN_DEG = 20.0
-"""Rotation between neighboring views of the grid."""
+"""Rotation in degrees between neighboring cameras of the grid."""
 REACH = 2.6
-"""Largest distance of two matched views in meters."""
+"""Largest distance in meters between the cameras of a matched image pair."""
 MAX_MATCH_TURN_DEG, MAX_MATCH_ZOOM = 40.0, 1.8
-"""Largest angle between the rays of a point, and largest ratio of its distances, for a match."""
+"""Limits for a match of a point: largest angle between its two rays, and largest ratio of its two
+distances."""
 MIN_MATCHES = 30
-"""Smallest number of common points of a pair."""
+"""Smallest number of common points of an image pair."""
 
 
 @dataclass(frozen=True)
 class PriorErrors:
-    """Relative errors of depth: ``depth * exp(scale * n + f(x, y) + patch)``."""
+    """Depth error model of a hall: ``depth * exp(scale * n + f(x, y) + patch)``."""
 
     scale: float = 0.0
-    """Std of the error of a whole image."""
+    """Std of the relative error that a whole image shares."""
     field: float = 0.0
     """Std of independent errors at the nodes of a grid, interpolated by cubic splines."""
     grid: tuple[int, int] = (8, 6)
-    """Columns and rows of that grid."""
+    """Columns and rows of the grid of independent errors."""
     patch: float = 0.0
-    """Relative error, of either sign, in one ellipse of the map."""
+    """Relative depth error, of either sign, in one ellipse of the map."""
     patch_area: float = 0.1
     """Area of the ellipse relative to the map."""
     declared: float = 0.01
-    """Relative std that the prior declares."""
+    """Relative std that the depth prior declares."""
 
 
 EXACT_PRIORS = PriorErrors()
@@ -82,7 +83,7 @@ class HallProblem(NamedTuple):
     truth: dict[str, Pose]
     """True ``cam_from_world`` by image name."""
     points: tuple[Int64, ...]
-    """Index of the surface point of each keypoint, (n,) per image."""
+    """Index of the surface point that each keypoint observes, (n,) per image."""
 
 
 def make_hall_problem(
@@ -95,20 +96,20 @@ def make_hall_problem(
     wrong_matches: float = 0.05,
     seed: int = 0,
 ) -> HallProblem:
-    """Create a mapping problem of a hall.
+    """Create a synthetic mapping problem of a hall with boxes.
 
     Args:
         views: Number of views.
-        errors: Errors of the depth priors.
-        points_per_view: Surface points that each view adds. The keypoints of a view are all points
-            that it sees.
+        errors: Model of the errors of the depth priors.
+        points_per_view: Number of surface points that each view adds. Every point that a view sees
+            becomes a keypoint of this view.
         map_width: Width of the prior maps in pixels.
-        keypoint_noise_px: Std of the keypoints.
-        wrong_matches: Ratio of the matches of each pair that join keypoints at random.
+        keypoint_noise_px: Std of the keypoints in pixels.
+        wrong_matches: Ratio of wrong matches of each pair, which join keypoints at random.
         seed: Seed of scene, points and errors.
 
     Returns:
-        The problem with its solution.
+        The mapping problem with its true solution.
     """
     rng = np.random.default_rng(seed)
     poses, scene = make_hall(views, rng)
@@ -140,18 +141,18 @@ def make_hall_problem(
 
 
 def make_hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], AnalyticScene]:
-    """Create views on a square grid and a hall with boxes between them.
+    """Create camera poses on a square grid and a hall with boxes between the cameras.
 
     Args:
         views: Number of views.
         rng: Random generator of the boxes and of small changes of the poses.
 
     Returns:
-        ``cam_from_world`` (3, 4) of each view, and the scene.
+        Pose ``cam_from_world`` (3, 4) of each view, and the scene.
     """
     side = int(np.ceil(np.sqrt(views)))
     row, column = np.divmod(np.arange(views), side)
-    # serpentine order, so that consecutive views are neighbors
+    # The cameras are in serpentine order, so that consecutive views are neighbors.
     column = np.where(row % 2 == 0, column, side - 1 - column)
     eyes = SPACING * np.column_stack([column, row, np.full(views, 1.5)])
     eyes += rng.uniform(-0.1, 0.1, eyes.shape)
@@ -171,7 +172,7 @@ def make_hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], Anal
 
 
 def _remove_hidden_boxes(scene: AnalyticScene, pose: Float64) -> AnalyticScene:
-    """Remove the boxes outside of the view frustum, which cannot be visible or occlude."""
+    """Remove the boxes outside of the view frustum, which the view cannot see."""
     shell, *boxes = scene.surfaces
     centers = np.array([box.center for box in boxes if isinstance(box, Box)]).reshape(-1, 3)
     radii = np.array([np.linalg.norm(box.half_size) for box in boxes if isinstance(box, Box)])
@@ -219,7 +220,7 @@ def _can_match(rays_a: Float64, rays_b: Float64) -> Bool:
 
 
 def _corrupt_matches(pair: VerifiedPair, share: float, rng: np.random.Generator) -> VerifiedPair:
-    """Permute the second keypoints of a ratio of the matches."""
+    """Permute the keypoints in the second image of a given ratio of the matches."""
     matches = pair.matches.copy()
     wrong = rng.choice(len(matches), round(share * len(matches)), replace=False)
     matches[wrong, 1] = np.roll(matches[wrong, 1], 1)
@@ -227,7 +228,7 @@ def _corrupt_matches(pair: VerifiedPair, share: float, rng: np.random.Generator)
 
 
 def _estimate_pose(pair: VerifiedPair, keypoints_a: Float64, keypoints_b: Float64) -> VerifiedPair:
-    """Replace the relative pose of a pair by the estimate from its noisy matches."""
+    """Replace the relative pose of a pair by the estimate from the noisy matches."""
     camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=CAMERA.params)
     found = pycolmap.estimate_essential_matrix(
         keypoints_a[pair.matches[:, 0]],
@@ -243,7 +244,7 @@ def _estimate_pose(pair: VerifiedPair, keypoints_a: Float64, keypoints_b: Float6
 
 
 def _add_depth_errors(depth: Float32, errors: PriorErrors, rng: np.random.Generator) -> Float32:
-    """Add the errors of a network to a depth map (h, w)."""
+    """Add the errors of a depth network to a depth map (h, w)."""
     height, width = depth.shape
     log_factor = errors.scale * rng.normal() + errors.field * _draw_error_field(
         depth.shape, errors, rng
@@ -261,7 +262,7 @@ def _add_depth_errors(depth: Float32, errors: PriorErrors, rng: np.random.Genera
 def _draw_error_field(
     shape: tuple[int, ...], errors: PriorErrors, rng: np.random.Generator
 ) -> Float64:
-    """Interpolate independent errors of std 1 from the nodes of the grid to a map (h, w)."""
+    """Interpolate independent errors of std 1 from the nodes of a grid to a map (h, w)."""
     nodes = rng.normal(size=errors.grid[::-1])
     field: Float64 = cv2.resize(nodes, shape[::-1], interpolation=cv2.INTER_CUBIC)
     return field

@@ -22,14 +22,14 @@ from mpsfm_core.testing.synthetic.scenes import AnalyticScene
 
 
 class SyntheticNoise(NamedTuple):
-    """Standard deviations of the errors of a synthetic mapping problem."""
+    """Standard deviations of the errors in a synthetic mapping problem."""
 
     keypoints_px: float = 0.0
-    """Keypoint error in pixels."""
+    """Std of the keypoints in pixels."""
     scale: float = 0.0
-    """Relative depth error of a whole image."""
+    """Std of the relative depth error that a whole image shares."""
     depth: float = 0.0
-    """Independent relative depth error of each pixel."""
+    """Std of the independent relative depth error of each pixel."""
 
 
 def make_mapping_problem(
@@ -46,20 +46,21 @@ def make_mapping_problem(
     two_view_tracks: bool = False,
     seed: int = 0,
 ) -> MappingProblem:
-    """Create a mapping problem with exact poses, priors and verified matches.
+    """Create a synthetic mapping problem with exact poses, priors and verified matches.
 
     Args:
         scene: Scene to render.
         camera: Camera of all views.
-        poses: ``cam_from_world`` (3, 4) of each view.
-        points_per_view: Surface points that each view adds. The keypoints of a view are all points
-            that it sees.
+        poses: Pose ``cam_from_world`` (3, 4) of each view.
+        points_per_view: Number of surface points that each view adds. Every point that a view sees
+            becomes a keypoint of this view.
         map_width: Width of the prior maps in pixels.
         declared_depth_std: Relative std that the depth priors declare.
         declared_normal_std_deg: Angular std that the normal priors declare.
-        noise: Errors of keypoints and depth, by default none.
-        links: Pairs to match, by default all; pairs with fewer than 15 common points are dropped.
-        two_view_tracks: True matches each point in at most one pair.
+        noise: Standard deviations of the errors of keypoints and depth, by default none.
+        links: Image pairs to match, by default all. Pairs with fewer than 15 common points are
+            dropped.
+        two_view_tracks: True matches each surface point in at most one pair.
         seed: Seed of points and noise.
 
     Returns:
@@ -120,7 +121,7 @@ def render_mapping_image(
     noise: SyntheticNoise,
     rng: np.random.Generator,
 ) -> MappingImage:
-    """Render the priors of a view and add errors.
+    """Render the depth and normal priors of a view and add errors.
 
     Args:
         name: Name of the image.
@@ -131,7 +132,7 @@ def render_mapping_image(
         map_width: Width of the prior maps in pixels.
         depth_std: Relative std that the depth prior declares.
         normal_std_deg: Angular std that the normal prior declares.
-        noise: Errors of the depth.
+        noise: Standard deviations of the depth errors.
         rng: Random generator of the errors.
     """
     grid = camera.resized(map_width, round(map_width * camera.height / camera.width))
@@ -151,13 +152,13 @@ def render_mapping_image(
 
 
 def make_verified_pair(a: int, b: int, matches: Int64, poses: Sequence[Float64]) -> VerifiedPair:
-    """Return matches (m, 2) of two views as a verified pair with its true relative pose.
+    """Return matches (m, 2) of two views as a verified pair with the true relative pose.
 
     Args:
         a: Index of the first view.
         b: Index of the second view.
-        matches: Keypoint rows (m, 2).
-        poses: ``cam_from_world`` (3, 4) of each view.
+        matches: Matches as keypoint indices (m, 2) in both images.
+        poses: Pose ``cam_from_world`` (3, 4) of each view.
     """
     rotation = poses[b][:, :3] @ poses[a][:, :3].T
     translation = poses[b][:, 3] - rotation @ poses[a][:, 3]

@@ -1,7 +1,7 @@
-"""Analytic scenes: exact depth, normals, colors and correspondences by ray casting.
+"""Analytic scenes rendered by ray casting: exact depth, normals, colors and correspondences.
 
-The world is metric with z up. Cameras follow the conventions of the package: x right, y down,
-z forward, pixel centers at half integers. A pose is a (3, 4) matrix ``cam_from_world``.
+The world frame is metric with z up. Cameras follow COLMAP: x right, y down, z forward, pixel
+centers at half integers. A camera pose is a (3, 4) matrix ``cam_from_world``.
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from mpsfm_core import geometry
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
 
 _EPSILON = 1e-9
-"""Hits closer than this to the origin of a ray, in meters, are the surface that the ray leaves."""
+"""Smallest distance in meters of a hit from the origin of a ray. Closer hits are on the surface
+that the ray leaves."""
 
 
 class Surface(Protocol):
-    """Surface that can be intersected with rays."""
+    """Surface of a scene that can be intersected with rays."""
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
         """Intersect rays ``origin + t * direction`` with the surface.
 
         Args:
             origin: Common origin (3,).
-            directions: Directions (n, 3) of any length.
+            directions: Ray directions (n, 3) of any length.
 
         Returns:
-            t (n,) of the first hit, inf without a hit, and unit normals (n, 3) that face the origin
-            of the ray; normals are arbitrary without a hit.
+            Parameters t (n,) of the first hits, inf without a hit, and unit normals (n, 3) that
+            face the origin of the ray. Normals are arbitrary without a hit.
         """
         ...
 
@@ -46,7 +47,7 @@ class Plane:
     normal: tuple[float, float, float]
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
-        """Intersect rays with the surface, see :meth:`Surface.intersect`."""
+        """Intersect rays ``origin + t * direction`` with the surface."""
         normal = np.asarray(self.normal) / np.linalg.norm(self.normal)
         t = (np.asarray(self.point) - origin) @ normal / _away_from_zero(directions @ normal)
         facing = np.where(directions @ normal > 0, -1.0, 1.0)
@@ -55,14 +56,14 @@ class Plane:
 
 @dataclass(frozen=True)
 class Box:
-    """Box rotated about the world's z axis. From inside it is a room."""
+    """Box that is rotated about the world's z axis. The inside of a box is a room."""
 
     center: tuple[float, float, float]
     half_size: tuple[float, float, float]
     yaw_deg: float = 0.0
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
-        """Intersect rays with the surface, see :meth:`Surface.intersect`."""
+        """Intersect rays ``origin + t * direction`` with the surface."""
         cos, sin = np.cos(np.deg2rad(self.yaw_deg)), np.sin(np.deg2rad(self.yaw_deg))
         world_from_box = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         start = (origin - np.asarray(self.center)) @ world_from_box
@@ -84,7 +85,7 @@ class Box:
     def _may_hit(self, start: Float64, rays: Float64) -> Bool:
         """Return which rays (n, 3) intersect the bounding sphere of the box.
 
-        ``start`` is the origin of the rays relative to the center of the box.
+        The argument ``start`` is the origin of the rays relative to the center of the box.
         """
         along, length = rays @ start, np.einsum("ni,ni->n", rays, rays)
         outside = start @ start - np.dot(self.half_size, self.half_size)
@@ -94,13 +95,13 @@ class Box:
 
 @dataclass(frozen=True)
 class Sphere:
-    """Sphere, visible from outside and inside."""
+    """Sphere that is visible from outside and inside."""
 
     center: tuple[float, float, float]
     radius: float
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
-        """Intersect rays with the surface, see :meth:`Surface.intersect`."""
+        """Intersect rays ``origin + t * direction`` with the surface."""
         start = origin - np.asarray(self.center)
         a = np.einsum("ni,ni->n", directions, directions)
         b = directions @ start
@@ -117,10 +118,10 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Texture:
-    """Random color field of space: octaves of plane waves of random direction and phase.
+    """Random color texture in 3D: octaves of plane waves with random direction and phase.
 
-    The field does not repeat in practice. ``footprint`` band-limits it to what a pixel of that size
-    in meters resolves. Renderings do not alias for that reason.
+    The texture does not repeat in practice. The argument ``footprint``, the size of a pixel on the
+    surface in meters, limits the frequencies of the texture. Renderings therefore have no aliasing.
     """
 
     longest_wave: float = 1.2  # meters
@@ -131,15 +132,15 @@ class Texture:
     seed: int = 0
 
     def colors(self, points: Float64, surface: Int64, footprint: Float64) -> UInt8:
-        """Compute the colors of surface points.
+        """Compute the colors of surface points from the texture.
 
         Args:
-            points: World points (n, 3).
-            surface: Index (n,) of the surface of each point; every surface has another texture.
+            points: Surface points (n, 3) in the world frame.
+            surface: Index (n,) of the surface of each point; every surface has its own texture.
             footprint: Size (n,) of a pixel on the surface in meters.
 
         Returns:
-            RGB (n, 3) uint8.
+            Colors RGB (n, 3) uint8.
         """
         rng = np.random.default_rng(self.seed)
         amplitudes = self.decay ** np.arange(self.octaves)
@@ -154,7 +155,7 @@ class Texture:
             phase = rng.uniform(0, 2 * np.pi, self.waves_per_octave)
             mix = rng.normal(1.0, 0.5, (self.waves_per_octave, 3))
             waves = np.sin(where @ vectors.astype(np.float32) + phase.astype(np.float32))
-            # Gaussian pixel of standard deviation half a footprint, applied exactly to each wave.
+            # A pixel is a Gaussian with a std of half a footprint, applied exactly to each wave.
             attenuated = amplitude * np.exp(-0.5 * (np.pi * frequency * footprint) ** 2)
             value += attenuated[:, None] * (waves @ mix.astype(np.float32))
         return np.round(127.5 + 127.5 * np.tanh(value)).astype(np.uint8)
@@ -162,10 +163,9 @@ class Texture:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """Rendered image of a pinhole camera; everything is zero without a surface.
+    """Rendered depth, normals and colors of a pinhole camera; zero where there is no surface.
 
-    Normals face the camera along the ray, so that n_z can be positive at grazing angles off the
-    axis.
+    Normals face the camera along the ray, so n_z can be positive at grazing angles off the axis.
     """
 
     depth: Float32  # (h, w), meters along z
@@ -174,7 +174,7 @@ class Rendering:
 
     @cached_property
     def rgb(self) -> UInt8:
-        """RGB (h, w, 3) uint8."""
+        """Colors RGB (h, w, 3) uint8."""
         return self._colors()
 
 
@@ -189,7 +189,7 @@ class SurfaceSamples(NamedTuple):
 
 
 class TrueCorrespondences(NamedTuple):
-    """Exact positions in view b of points seen in view a."""
+    """Exact positions in view b of surface points that are seen in view a."""
 
     xy_b: Float64  # (n, 2), pixels; 0 where not visible
     points: Float64  # (n, 3), world
@@ -198,16 +198,17 @@ class TrueCorrespondences(NamedTuple):
 
 @dataclass(frozen=True)
 class AnalyticScene:
-    """Opaque surfaces with a texture."""
+    """Scene of opaque surfaces with a texture."""
 
     surfaces: tuple[Surface, ...]
     texture: Texture = Texture()
 
     def first_hit(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64, Int64]:
-        """Intersect rays (n, 3) with all surfaces.
+        """Intersect rays (n, 3) with all surfaces of the scene.
 
         Returns:
-            t (n,) of the nearest hit, inf without a hit; normals (n, 3); index (n,) of the surface.
+            Parameters t (n,) of the nearest hits, inf without a hit; normals (n, 3); indices (n,)
+            of the surfaces.
         """
         t = np.full(len(directions), np.inf)
         normals = np.zeros((len(directions), 3))
@@ -233,7 +234,7 @@ class AnalyticScene:
         return SurfaceSamples(points, depth, normals @ rotation.T, surface, valid)
 
     def render(self, camera: PinholeCamera, cam_from_world: ArrayLike) -> Rendering:
-        """Render depth, normals and colors at every pixel center."""
+        """Render depth, normals and colors of the scene at every pixel center."""
         xy = geometry.pixel_centers(camera.width, camera.height)
         seen = self.sample(camera, cam_from_world, xy)
         shape = (camera.height, camera.width)
@@ -257,7 +258,7 @@ class AnalyticScene:
         b_from_world: ArrayLike,
         xy_a: ArrayLike,
     ) -> TrueCorrespondences:
-        """Project the points seen at pixels ``xy_a`` (n, 2) of view a into view b."""
+        """Project the surface points seen at pixels ``xy_a`` (n, 2) of view a into view b."""
         seen = self.sample(camera_a, a_from_world, xy_a)
         xy_b, depth_b = project(camera_b, b_from_world, seen.points)
         _, origin = _split_pose(b_from_world)
@@ -279,7 +280,7 @@ def project(
 def look_at(eye: ArrayLike, target: ArrayLike) -> Float64:
     """Return ``cam_from_world`` (3, 4) of an upright camera at ``eye`` that looks at ``target``.
 
-    The viewing direction must not be vertical.
+    The viewing direction from ``eye`` to ``target`` must not be vertical.
     """
     position = np.asarray(eye, np.float64)
     forward = np.asarray(target, np.float64) - position
@@ -314,9 +315,10 @@ def arc_poses(
     radius: float = 3.4,
     height: float = 1.6,
 ) -> list[Float64]:
-    """Return poses on an arc around ``target``, ``step_deg`` apart, all looking at it.
+    """Return camera poses on an arc around ``target``, ``step_deg`` apart, that look at it.
 
-    The defaults stay inside of :func:`room_scene` up to 60 degrees to either side of the middle.
+    With the default values the cameras stay inside :func:`room_scene` up to 60 degrees to either
+    side of the middle.
     """
     angles = np.deg2rad(180.0 + step_deg * (np.arange(count) - (count - 1) / 2))
     eyes = np.asarray(target) + radius * np.column_stack(
@@ -327,7 +329,7 @@ def arc_poses(
 
 
 def _split_pose(cam_from_world: ArrayLike) -> tuple[Float64, Float64]:
-    """Return the rotation (3, 3) and the camera center (3,) in the world."""
+    """Return the rotation (3, 3) and the camera center (3,) in the world frame."""
     pose = np.asarray(cam_from_world, np.float64)
     return pose[:3, :3], geometry.camera_center(pose[:3, :3], pose[:3, 3])
 

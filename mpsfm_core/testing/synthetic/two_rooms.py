@@ -1,8 +1,8 @@
-"""Synthetic twin rooms: two similar rooms joined by a corridor, which mislead all matchers.
+"""Synthetic mapping problem of two similar rooms and a corridor, which mislead all matchers.
 
 The rooms are next to each other with the same walls, door and furniture, except for one or two
-pieces. Each view of one room matches views of the other. Only the corridor and the differing pieces
-resolve the ambiguity.
+pieces of furniture. Each view of one room also matches views of the other room. Only the corridor
+and the differing furniture resolve the ambiguity.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ from mpsfm_core.testing.synthetic.scenes import (
 )
 
 SHIFT = np.array([5.2, 0.0, 0.0])
-"""Vector in meters from a point of the first room to its twin in the second."""
+"""Vector in meters from a point of the first room to its copy in the second room."""
 CAMERA = PinholeCamera(640, 480, 400.0, 400.0, 320.0, 240.0)
 MIN_MATCHES = 15
-"""Smallest number of verified matches of a pair [COLMAP min_num_inliers]."""
+"""Smallest number of verified matches of an image pair [COLMAP min_num_inliers]."""
 MIN_SIGHT = 0.3
-"""Largest distance in meters that a view must see at least; excludes views inside of furniture."""
+"""Smallest free distance in meters in front of a camera; excludes cameras inside of furniture."""
 
 
 class SymmetricProblem(NamedTuple):
@@ -45,11 +45,11 @@ class SymmetricProblem(NamedTuple):
 
     problem: MappingProblem
     poses: list[Float64]
-    """True ``cam_from_world`` (3, 4) of each view."""
+    """True pose ``cam_from_world`` (3, 4) of each view."""
     room: list[int]
     """Room of each view: 0, 1, or -1 in the corridor."""
     false: list[bool]
-    """Whether a pair matches one view with the twin of what the other view sees."""
+    """True for each pair whose matches join a point with its copy in the other room."""
 
 
 def make_twin_rooms() -> AnalyticScene:
@@ -78,16 +78,17 @@ def make_twin_rooms() -> AnalyticScene:
 
 
 def make_twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], list[int]]:
-    """Create views of both rooms and a walk through the corridor.
+    """Create camera poses in both rooms and along the corridor.
 
-    Positions vary with the seed. Views that would be inside of furniture move in front of it.
+    The camera positions vary with the seed. Cameras that would be inside of furniture are moved in
+    front of it.
 
     Args:
-        seed: Seed of the positions.
+        seed: Seed of the camera positions.
         per_room: Number of views per room.
 
     Returns:
-        ``cam_from_world`` (3, 4) of each view, and its room: 0, 1, or -1 in the corridor.
+        Pose ``cam_from_world`` (3, 4) of each view, and its room: 0, 1, or -1 in the corridor.
     """
     rng = np.random.default_rng(seed)
     eyes, targets, room = [], [], []
@@ -121,7 +122,7 @@ def make_twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], l
 
 
 def _move_to_free_space(scene: AnalyticScene, eye: Float64, target: Float64) -> Float64:
-    """Move a view towards its target until it sees further than MIN_SIGHT."""
+    """Move a camera towards its target until the free distance exceeds MIN_SIGHT."""
     pixels = pixel_centers(*CAMERA.size)[::80, ::80].reshape(-1, 2)
     step = 0.1 * (target - eye) / np.linalg.norm(target - eye)
     while True:
@@ -141,22 +142,22 @@ def make_twin_room_problem(
     map_width: int = 160,
     keypoint_noise_px: float = 0.5,
 ) -> SymmetricProblem:
-    """Create a mapping problem of the twin rooms.
+    """Create a synthetic mapping problem of two similar rooms.
 
-    A keypoint matches the same point in another view as well as its twin. Verification by one
-    geometry keeps the more frequent of the two.
+    A keypoint matches the same point in another view as well as the copy of the point in the other
+    room. Geometric verification keeps the more frequent of both alternatives.
 
     Args:
         seed: Seed of poses, points and errors.
-        errors: Errors of the depth priors, which declare the std of the errors. None: exact depth
-            that declares a relative std of 1 %.
+        errors: Model of the errors of the depth priors, which declare the std of the errors. With
+            None the depth is exact and declares a relative std of 1 %.
         per_room: Number of views per room.
-        points_per_view: Surface points that each view adds.
+        points_per_view: Number of surface points that each view adds.
         map_width: Width of the prior maps in pixels.
-        keypoint_noise_px: Std of the keypoints.
+        keypoint_noise_px: Std of the keypoints in pixels.
 
     Returns:
-        The problem with its solution.
+        The mapping problem with its true solution.
     """
     scene = make_twin_rooms()
     poses, room = make_twin_room_poses(seed, per_room)
@@ -175,7 +176,7 @@ def make_twin_room_problem(
         images.append(image)
     pairs, false = [], []
     for a, b in combinations(range(len(poses)), 2):
-        # What b sees may be what a sees (shift 0) or its twin, in either direction.
+        # Points seen in b may be those seen in a (shift 0) or their copies, in either direction.
         found = [
             (len(matches), abs(shift), shift, matches)
             for shift in (0, 1, -1)
@@ -193,9 +194,10 @@ def make_twin_room_problem(
 def _keypoints(
     scene: AnalyticScene, poses: Sequence[Float64], points_per_view: int, rng: np.random.Generator
 ) -> tuple[list[Int64], list[Float64]]:
-    """Return the points that each view sees, and their pixels.
+    """Return the surface points that each view sees, and their pixels.
 
-    A point has a sample number and a copy (-1, 0 or 1 rooms further).
+    A point is identified by a sample number and the number of rooms (-1, 0 or 1) by which the
+    sample is shifted.
     """
     size = np.array(CAMERA.size, dtype=np.float64)
     numbers: list[list[Int64]] = [[] for _ in poses]
@@ -215,12 +217,12 @@ def _keypoints(
 
 
 def shift_pose(pose: Float64, shift: int) -> Float64:
-    """Return the pose (3, 4) of the same view from ``shift`` rooms further back."""
+    """Return the pose (3, 4) of a camera that is moved back by ``shift`` rooms."""
     return np.column_stack([pose[:, :3], pose[:, 3] + shift * pose[:, :3] @ SHIFT])
 
 
 def _find_visible(scene: AnalyticScene, pose: Float64, points: Float64) -> tuple[Float64, Bool]:
-    """Return the pixels of world points and whether the view sees them without occlusion."""
+    """Return the pixels of world points and whether the view sees the points without occlusion."""
     xy, depth = project(CAMERA, pose, points)
     origin = camera_center(pose[:, :3], pose[:, 3])
     t, _, _ = scene.first_hit(origin, points - origin)
@@ -228,7 +230,7 @@ def _find_visible(scene: AnalyticScene, pose: Float64, points: Float64) -> tuple
 
 
 def _matches(numbers_a: Int64, numbers_b: Int64, shift: int) -> Int64:
-    """Return matches (m, 2) of equal points, or of points and their twins ``shift`` rooms on."""
+    """Return matches (m, 2) of equal points, or of points and their copies ``shift`` rooms on."""
     code_a = numbers_a[:, 0] * 8 + numbers_a[:, 1]
     code_b = numbers_b[:, 0] * 8 + numbers_b[:, 1] - shift
     _, rows_a, rows_b = np.intersect1d(code_a, code_b, return_indices=True)
@@ -236,7 +238,7 @@ def _matches(numbers_a: Int64, numbers_b: Int64, shift: int) -> Int64:
 
 
 def _block(low: tuple[float, float, float], high: tuple[float, float, float]) -> Box:
-    """Return a box given by two opposite corners."""
+    """Return an axis-aligned box between two opposite corners."""
     a, b = np.array(low), np.array(high)
     middle, half = (a + b) / 2, (b - a) / 2
     return Box((middle[0], middle[1], middle[2]), (half[0], half[1], half[2]))
