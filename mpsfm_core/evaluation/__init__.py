@@ -1,4 +1,4 @@
-"""Comparison of reconstructions with ground truth."""
+"""Evaluation of reconstructions with ground truth, and the benchmark of mappers."""
 
 from mpsfm_core.data import Pose
 from mpsfm_core.evaluation.alignment import TrajectoryErrors, trajectory_errors

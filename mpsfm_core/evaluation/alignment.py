@@ -1,4 +1,4 @@
-"""Trajectory errors after alignment by a similarity transform."""
+"""Trajectory errors of a reconstruction after similarity alignment with the true poses."""
 
 from __future__ import annotations
 
@@ -30,34 +30,34 @@ class SimilarityTransform:
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryErrors:
-    """Errors of camera centers and orientations after alignment, in the unit of the truth."""
+    """Errors of camera centers and orientations after alignment, in the unit of the true poses."""
 
     truth_from_estimate: SimilarityTransform
-    """Least-squares alignment of the camera centers."""
+    """Similarity transform that aligns the camera centers in the least-squares sense."""
     centers: Float64
-    """(n,) distances of aligned and true camera centers."""
+    """(n,) distances between aligned and true camera centers."""
     rotations_deg: Float64
-    """(n,) errors of the orientations after their best common rotation.
+    """(n,) orientation errors after the best common rotation.
 
-    The rotation comes from the orientations alone, so collinear centers cause no error."""
+    The orientations alone determine this rotation, so collinear camera centers cause no error."""
     steps: Float64
-    """(n - 1,) translation errors of the motion to the next image, in the order of the truth."""
+    """(n - 1,) translation errors of the relative poses of successive images."""
     step_turns_deg: Float64
-    """(n - 1,) rotation errors of the motion to the next image."""
+    """(n - 1,) rotation errors of the relative poses of successive images."""
 
     @property
     def ate_rmse(self) -> float:
-        """Absolute trajectory error: RMSE of the camera centers."""
+        """Absolute trajectory error: RMSE of the aligned camera centers."""
         return _rms(self.centers)
 
     @property
     def rpe_rmse(self) -> float:
-        """Relative pose error: RMSE of the translations between successive images."""
+        """Relative pose error: RMSE of the relative translations between successive images."""
         return _rms(self.steps)
 
     @property
     def rpe_rmse_deg(self) -> float:
-        """Relative pose error: RMSE of the rotations between successive images."""
+        """Relative pose error: RMSE of the relative rotations between successive images."""
         return _rms(self.step_turns_deg)
 
 
@@ -69,7 +69,7 @@ def umeyama(a: Float64, b: Float64) -> SimilarityTransform:
         b: (n, 3) points in frame b.
 
     Raises:
-        ValueError: All points of a set coincide, so the scale is undefined.
+        ValueError: All points in one of the frames coincide, so the scale is undefined.
     """
     mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
     spread_a, spread_b = a - mean_a, b - mean_b
@@ -85,10 +85,10 @@ def umeyama(a: Float64, b: Float64) -> SimilarityTransform:
 def trajectory_errors(
     estimated: Mapping[str, Pose], truth: Mapping[str, Pose]
 ) -> TrajectoryErrors | None:
-    """Compute the trajectory errors of the common images, in the order of `truth`.
+    """Compute the trajectory errors of the images with estimated and true pose.
 
     Returns:
-        The errors, or None with fewer than three common images or coinciding centers.
+        The errors, or None with fewer than three common images or coinciding camera centers.
     """
     names = [name for name in truth if name in estimated]
     if len(names) < 3:
@@ -100,7 +100,8 @@ def trajectory_errors(
     except ValueError:
         return None
     offsets = np.linalg.norm(similarity.apply(centers) - true_centers, axis=1)
-    # R_est = R_true @ G for a common G; the chordal mean of G is the projection of the sum.
+    # The model is R_est = R_true @ G with a common rotation G; projecting the sum of R_true.T @
+    # R_est to SO(3) gives the chordal mean of G.
     turns = np.stack([truth[name][0].T @ estimated[name][0] for name in names])
     u, _, vt = np.linalg.svd(turns.sum(axis=0))
     common = (u * [1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt

@@ -1,8 +1,8 @@
 """Benchmark of configurations and other mappers on the same verified matches.
 
-Priors, features and matches are computed once per scene and configuration and cached; only pairs
-inside a set are matched. Each finished run writes a file (:mod:`mpsfm_core.evaluation.records`),
-and a run with a matching file is not repeated.
+Priors, features and matches are computed once per scene and configuration and cached. Only image
+pairs within a test set are matched. Each finished run writes a record
+(:mod:`mpsfm_core.evaluation.records`), and a run with a valid record is not repeated.
 """
 
 from __future__ import annotations
@@ -42,32 +42,32 @@ from mpsfm_core.providers.registry import Registry, core_version
 from mpsfm_core.support.files import write_file
 
 RecordCallback = Callable[[BenchmarkRecord, bool], None]
-"""Called with each record, and True if the record was read from an earlier benchmark."""
+"""Callback that receives a record, and True if the record is from an earlier benchmark."""
 
 
 @dataclass(frozen=True)
 class BenchmarkPlan:
-    """Scenes, configurations and methods of a benchmark."""
+    """Plan of a benchmark: scenes, configurations, prior qualities and mappers."""
 
     scenes: tuple[Path, ...]
     """Scene folders."""
     configs: tuple[str, ...] = ("benchmark",)
-    """Names or files of configurations."""
+    """Names or file paths of the compared configurations."""
     buckets: tuple[str, ...] | None = None
     """Buckets of test sets; None for all."""
     priors: tuple[str, ...] = ("config",)
-    """Prior qualities of :mod:`~mpsfm_core.evaluation.prior_quality`; mpsfm runs with each."""
+    """Prior qualities (:mod:`~mpsfm_core.evaluation.prior_quality`) with which mpsfm runs."""
     peers: tuple[str, ...] = PEER_METHODS
     """Names of :data:`~mpsfm_core.evaluation.methods.PEER_METHODS`."""
     overrides: tuple[str, ...] = ()
-    """Settings ``KEY=VALUE`` of all configurations."""
+    """Settings ``KEY=VALUE`` that override the values of all configurations."""
     workers: int = 1
-    """Number of sets that are mapped in parallel."""
+    """Number of test sets that are reconstructed in parallel."""
     results: Mapping[str, Path] = field(default_factory=dict)
     """Label -> folder of models of another program
     (:mod:`~mpsfm_core.evaluation.external_results`)."""
     distances: tuple[float, ...] = TOLERANCES
-    """Distance thresholds of the clouds in meters, for dense configurations and true depth."""
+    """Distance thresholds in meters for the accuracy of dense point clouds."""
 
 
 def run_benchmark(
@@ -76,19 +76,19 @@ def run_benchmark(
     registry: Registry | None = None,
     on_record: RecordCallback | None = None,
 ) -> list[BenchmarkRecord]:
-    """Run a plan and return the records of all runs, cached and new.
+    """Run a benchmark and return the records of all runs, cached and new.
 
-    The error of a method is part of its record.
+    If a mapper fails, its record contains the error.
 
     Args:
         plan: What to run.
-        output: Folder of the records.
+        output: Output folder of the benchmark records.
         registry: Registry of plugins.
-        on_record: Called with each record.
+        on_record: Callback for each record, cached or new.
 
     Raises:
-        InputError: The plan or a scene is wrong.
-        MpsfmError: The extraction fails.
+        InputError: The plan is wrong, or a scene folder is invalid.
+        MpsfmError: The extraction of priors or matches fails.
     """
     registry = registry or Registry.discover()
     _check_names("prior", [p for p in plan.priors if parse_error_seed(p) is None], QUALITIES)
@@ -120,35 +120,35 @@ def run_benchmark(
 
 
 class SetPairFilter:
-    """Plugin that restricts matching to pairs of images in a common set."""
+    """Plugin that restricts matching to image pairs within a test set."""
 
     def __init__(self) -> None:
         self._allowed: set[tuple[str, str]] = set()
 
     def allow(self, sets: Sequence[EvaluationSet]) -> None:
-        """Replace the allowed pairs by those of the given sets."""
+        """Replace the allowed image pairs by the pairs within some test sets."""
         self._allowed = {pair for item in sets for pair in combinations(sorted(item.images), 2)}
 
     @hookimpl
     def mpsfm_filter_pairs(self, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-        """Return the pairs inside a set."""
+        """Return the image pairs that are within a test set."""
         return [(a, b) for a, b in pairs if (min(a, b), max(a, b)) in self._allowed]
 
 
 class PreparedSets(NamedTuple):
-    """Extraction results of all images of some sets."""
+    """Extraction results of all images of some test sets."""
 
     problem: MappingProblem
     """Priors and verified matches, before keypoint adjustment."""
     images: ImageSet
-    """Images of all sets."""
+    """Images of all test sets."""
     config: Config
     """Configuration with resolved providers."""
     registry: Registry
     """Registry of plugins."""
 
     def build_problem(self, image_set: EvaluationSet) -> MappingProblem:
-        """Build the problem of one set; only its own pairs adjust its keypoints."""
+        """Build the mapping problem of a test set; only pairs within the set adjust keypoints."""
         names, images = set(image_set.images), self.problem.images
         inside = [
             pair
@@ -169,7 +169,7 @@ def prepare_sets(
     work: Path,
     registry: Registry,
 ) -> PreparedSets:
-    """Extract priors and verified matches of all images of some sets.
+    """Extract priors and verified matches of all images of some test sets.
 
     Args:
         scene: Scene folder.
@@ -177,7 +177,7 @@ def prepare_sets(
         prior: Quality of :mod:`~mpsfm_core.evaluation.prior_quality`.
         config: Name or file of the configuration.
         overrides: Settings ``KEY=VALUE``.
-        work: Folder for degraded depth maps.
+        work: Folder to which degraded depth maps are written.
         registry: Registry of plugins.
     """
     names = sorted({name for item in sets for name in item.images})
@@ -187,7 +187,7 @@ def prepare_sets(
     loaded = resolve_providers(loaded, registry, stages).config
     image_list = work / "images.txt"
     write_file(image_list, "\n".join(names) + "\n")
-    inputs = loaded.inputs.model_copy(update={"strict": True})  # sets must be complete
+    inputs = loaded.inputs.model_copy(update={"strict": True})  # Each image must load.
     images = load_images(scene.images, scene.intrinsics, image_list, inputs)
     no_adjustment = loaded.adjustment.model_copy(update={"enabled": False})
     unadjusted = loaded.model_copy(update={"adjustment": no_adjustment})
@@ -196,7 +196,7 @@ def prepare_sets(
 
 
 class _SceneRuns:
-    """Runs of one scene with one configuration."""
+    """All benchmark runs of one scene with one configuration."""
 
     def __init__(
         self,
@@ -216,7 +216,7 @@ class _SceneRuns:
         self._registry = registry
 
     def __call__(self) -> Iterator[tuple[BenchmarkRecord, bool]]:
-        """Yield records, and True for records of an earlier benchmark."""
+        """Yield each record, and True if the record is from an earlier benchmark."""
         for number, prior in enumerate(self._plan.priors):
             prepared = prepare_sets(
                 self._scene,
@@ -253,7 +253,7 @@ class _SceneRuns:
                 yield record, False
 
     def _dense_evaluation(self, prepared: PreparedSets) -> DenseEvaluation | None:
-        """Return the dense evaluation if the configuration is dense and has true depth."""
+        """Return the dense evaluation if densification is enabled and the scene has true depth."""
         config = prepared.config
         if not config.dense.enabled or self._scene.depth is None:
             return None
@@ -263,7 +263,7 @@ class _SceneRuns:
     def _read_cached(
         self, image_set: EvaluationSet, label: str, key: str
     ) -> BenchmarkRecord | None:
-        """Read a successful record with the same key; None without one."""
+        """Read the record of an earlier successful run with the same key, or return None."""
         file = record_file(self._scene.name, self._config_name, image_set.name, label)
         path = self._output / file
         try:
@@ -271,7 +271,7 @@ class _SceneRuns:
         except InputError:
             return None
         if record is None or record.key != key or record.error:
-            return None  # failures may be due to missing memory, so they are repeated
+            return None  # Failed runs are repeated, because memory may have been short.
         return record
 
     def _build_record(
@@ -298,7 +298,7 @@ class _SceneRuns:
 def _sort_key(
     sets: Sequence[EvaluationSet], plan: BenchmarkPlan
 ) -> Callable[[BenchmarkRecord], tuple[int, int]]:
-    """Return a sort key by set, then method; parallel runs finish in any order."""
+    """Return a key that sorts records by test set, then method."""
     positions = {image_set.name: number for number, image_set in enumerate(sets)}
     labels = [_label(m, prior) for m in (OURS, *plan.peers) for prior in plan.priors]
     return lambda record: (positions[record.set_name], labels.index(record.label))

@@ -1,4 +1,4 @@
-"""Building of test sets from the true depth or the COLMAP model of a scene folder."""
+"""Sampling of test sets for a scene folder from its true depth or its COLMAP model."""
 
 from __future__ import annotations
 
@@ -24,20 +24,21 @@ def build_test_sets(
     *,
     replace: bool = False,
 ) -> dict[str, int]:
-    """Write ``testsets.yaml`` of a scene folder.
+    """Sample test sets and write ``testsets.yaml`` of a scene folder.
 
     Args:
         folder: Scene folder.
-        source: Source of overlap: ``depth`` (``gt_depth/``), ``model`` (points of ``gt/``) or
-            ``auto`` (depth if available).
+        source: Source of overlap: Source of overlap: ``depth`` (``gt_depth/``), ``model`` (points
+            of ``gt/``) or ``auto`` (depth if available).
         options: Options of the sampling.
-        replace: Replace an existing file.
+        replace: True to replace an existing ``testsets.yaml``.
 
     Returns:
-        Number of sets by bucket.
+        Number of test sets by bucket.
 
     Raises:
-        InputError: The file exists and `replace` is False, or the source is missing.
+        InputError: ``testsets.yaml`` exists and `replace` is False, or the source of overlap is
+            missing.
     """
     if source not in SOURCES:
         raise InputError(f"no source {source!r} of overlap; there are {', '.join(SOURCES)}")
@@ -60,7 +61,7 @@ def build_test_sets(
 
 
 def _from_depth(scene: SceneFolder) -> Overlap:
-    """Compute overlap from true depth; images without a depth map are left out."""
+    """Compute the overlap of images from true depth; images without depth map are omitted."""
     if scene.depth is None:
         raise InputError(f"{scene.path}: there is no gt_depth/ to measure overlap with")
     folder = scene.depth
@@ -72,7 +73,7 @@ def _from_depth(scene: SceneFolder) -> Overlap:
 
 
 def _from_model(scene: SceneFolder) -> Overlap:
-    """Compute overlap from the points of the true model."""
+    """Compute the overlap of images from the points of the true COLMAP model."""
     model = read_model(scene.path / "gt")
     if not model.num_points3D():
         raise InputError(f"{scene.path / 'gt'}: the model has no points to measure overlap with")

@@ -1,8 +1,8 @@
 """Baseline without a mapper: pairwise PnP, chained along a spanning tree.
 
-PnP runs twice per verified pair, with the depth of either image, and the pose with more inliers
-wins. A maximum spanning tree by inliers chains the poses. Depth is used without a scale, so that
-metric depth gives consistent lengths.
+PnP estimates two poses per verified pair, with the depth of either image, and selects the pose with
+more inliers. The relative poses are chained along the maximum spanning tree by number of inliers.
+Depth priors are not rescaled, so that metric depth gives consistent lengths.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mpsfm_core.mapping.scene.scene import Scene
 
 
 class _RelativePose(NamedTuple):
-    """Relative pose of a pair."""
+    """Relative pose of an image pair from PnP."""
 
     pose: Pose
     """``cam_b_from_cam_a``."""
@@ -33,10 +33,10 @@ def estimate_chained_poses(problem: MappingProblem, seed: int = 0) -> list[dict[
     """Estimate the poses of each connected component of images.
 
     Returns:
-        ``cam_from_world`` by image name of each component, the largest first.
+        Poses ``cam_from_world`` by image name of each component, the largest first.
     """
     options = RegistrationOptions()
-    scene = Scene(problem)  # without poses, lifted points are in the camera frame
+    scene = Scene(problem)  # Without poses, the 3D points are in the camera frame.
     for depth_map in scene.maps:
         depth_map.set_scale(1.0)
     links: dict[tuple[int, int], _RelativePose] = {}
@@ -95,7 +95,7 @@ def _estimate_pnp(
     options: RegistrationOptions,
     seed: int,
 ) -> _RelativePose | None:
-    """Estimate the pose of an image from lifted keypoints of another image."""
+    """Estimate the pose of an image from keypoints of another image unprojected with depth."""
     points, valid = scene.lift(source)
     xy = scene.keypoints[target[valid]]
     estimate = estimate_absolute_pose(scene.camera(image), xy, points[valid], options, seed)

@@ -12,9 +12,9 @@ from mpsfm_core.data import Float64, Int64
 from mpsfm_core.data.errors import InputError
 
 TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
-"""Distance thresholds in the unit of the scan [ETH3D, meters]."""
+"""Default distance thresholds in meters [ETH3D]."""
 _MEDIAN_SAMPLES = 1000
-"""Samples that estimate a median beyond all tolerances."""
+"""Number of sampled points that estimate a median distance beyond all thresholds."""
 
 
 def cloud_accuracy(
@@ -22,21 +22,22 @@ def cloud_accuracy(
 ) -> dict[str, Any]:
     """Compare a point cloud with a scan in the same frame.
 
-    Both clouds are reduced to one point per cube of half the smallest tolerance, so that dense
-    regions do not dominate. Points outside the scanned region count as wrong; crop the cloud first
-    if the scan is partial.
+    Both clouds are subsampled to one point per cube with half the smallest tolerance as side, so
+    that all regions have equal weight. Points outside the scanned region count as errors; crop the
+    cloud first if the scan is partial.
 
     Args:
         points: (n, 3) points.
-        scan: (m, 3) points of the scan.
+        scan: (m, 3) points of the scan, which is the ground truth.
         tolerances: Distance thresholds.
 
     Returns:
-        Plain data for JSON. ``accuracy`` maps a tolerance to the ratio of points near the scan,
-        ``completeness`` to the ratio of the scan near points, ``f1`` to their harmonic mean.
+        Plain data for JSON. ``accuracy`` maps a tolerance to the ratio of cloud points near the
+        scan, ``completeness`` to the ratio of scan points near the cloud, ``f1`` to the harmonic
+        mean of accuracy and completeness.
 
     Raises:
-        InputError: A cloud is empty.
+        InputError: The point cloud or the scan is empty.
     """
     if not len(points) or not len(scan):
         raise InputError("cannot compare point clouds: one of them is empty")
@@ -57,10 +58,10 @@ def cloud_accuracy(
 
 
 def _distances(points: Float64, others: Float64, limit: float) -> tuple[Float64, float]:
-    """Compute nearest-neighbor distances (n,), infinite beyond the limit, and their median.
+    """Compute nearest-neighbor distances (n,), infinite beyond a limit, and the median.
 
-    A median beyond the limit is estimated from a sample, because unbounded queries are slow for
-    points far from all others.
+    A median beyond the limit is estimated from a subsample, because unbounded nearest-neighbor
+    queries are slow for distant points.
     """
     tree = cKDTree(others)
     distances: Float64 = tree.query(points, distance_upper_bound=np.nextafter(limit, np.inf))[0]
@@ -73,7 +74,7 @@ def _distances(points: Float64, others: Float64, limit: float) -> tuple[Float64,
 
 
 def thin_points(points: Float64, size: float) -> Float64:
-    """Keep the first point of each cube of a grid."""
+    """Subsample a cloud to the first point in each cube of a grid."""
     cells: Int64 = np.floor(points / size).astype(np.int64)
     order = np.lexsort(cells.T)
     ordered = cells[order]

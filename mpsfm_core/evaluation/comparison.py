@@ -1,9 +1,10 @@
 """Statistical comparison of two benchmarks by differences of pose AUC.
 
-Both sides are compared on their common sets. Confidence intervals come from a paired bootstrap over
-sets. P-values come from a randomization test that swaps the sides of each set, which is exact even
-for few sets. If a bucket has too few sets, image pairs are resampled instead, in both orders.
-Pairs of a set share images, so these intervals are too narrow; the table names the resampled unit.
+Two benchmarks are compared on their common test sets. Confidence intervals come from a paired
+bootstrap over test sets. P-values come from a randomization test that swaps the two benchmarks in
+each test set. If a bucket has too few test sets, image pairs are resampled instead of sets. Image
+pairs of a set share images, so pair resampling gives too narrow intervals; the table names the
+resampled unit.
 """
 
 from __future__ import annotations
@@ -26,18 +27,18 @@ from mpsfm_core.evaluation.pose_auc import (
 from mpsfm_core.evaluation.records import BenchmarkRecord, read_records
 
 MIN_SETS = 6
-"""Minimum number of sets for a bootstrap over sets; fewer have too few distinct resamples
+"""Minimum number of test sets for a bootstrap over sets; fewer sets have too few distinct resamples
 [ours]."""
 RESAMPLES = 2000
-"""Resamples of the bootstrap and of the randomization test."""
+"""Number of resamples of the bootstrap and of the randomization test."""
 _CONFIDENCE = 0.95
 _ROUNDING = 1e-9
-"""Tolerance for rounding in comparisons of AUC differences."""
+"""Tolerance of AUC comparisons for floating-point rounding."""
 
 
 @dataclass(frozen=True)
 class AucDifference:
-    """Difference of pose AUC, second side minus first, in percentage points."""
+    """Difference of pose AUC in percentage points, second benchmark minus first."""
 
     scene: str
     """Name of the scene."""
@@ -48,25 +49,26 @@ class AucDifference:
     method: str
     """Label of the method."""
     sets: int
-    """Number of common sets."""
+    """Number of common test sets."""
     unit: str
     """Resampled unit: ``sets`` or ``pairs``."""
     auc: Mapping[int, tuple[float, float]]
-    """Threshold in degrees -> AUC in percent of the first and the second side."""
+    """Threshold in degrees -> pose AUC in percent of the first and the second benchmark."""
     interval: Mapping[int, tuple[float, float]]
-    """Threshold in degrees -> 95 % confidence interval of the difference."""
+    """Threshold in degrees -> 95 % confidence interval of the AUC difference."""
     p_value: Mapping[int, float]
-    """Threshold in degrees -> two-sided p-value."""
+    """Threshold in degrees -> two-sided p-value of the AUC difference."""
 
 
 def read_benchmark(place: str) -> dict[str, list[BenchmarkRecord]]:
     """Read the records of a benchmark by method.
 
     Args:
-        place: ``DIR``, or ``DIR:METHOD`` for one method, whose key in the result is ``*``.
+        place: ``DIR`` for all methods of a benchmark, or ``DIR:METHOD`` for one method, with key
+            ``*`` in the result.
 
     Raises:
-        InputError: There are no records, or the method does not exist.
+        InputError: The folder has no benchmark records, or the method does not exist.
     """
     folder, colon, method = place.rpartition(":")
     if not colon or Path(place).is_dir():
@@ -92,14 +94,14 @@ def compare_benchmarks(
     """Compute the differences of each common scene, configuration, bucket and method.
 
     Args:
-        first: Records of the first side by method.
-        second: Records of the second side by method.
+        first: Records of the first benchmark by method.
+        second: Records of the second benchmark by method.
         convention: Convention of the pose AUC.
         resamples: Number of resamples.
         seed: Seed of the resampling.
 
     Raises:
-        InputError: The benchmarks have no set and method in common.
+        InputError: The benchmarks have no test set and method in common.
     """
     rng = np.random.default_rng(seed)
     differences = []
@@ -119,7 +121,7 @@ def compare_benchmarks(
 def format_differences(
     differences: Sequence[AucDifference], convention: PoseConvention = CONVENTIONS["paper"]
 ) -> str:
-    """Format a Markdown table of differences, with the convention above."""
+    """Format a Markdown table of AUC differences below the name of the AUC convention."""
     head = ["scene", "bucket", "method", "sets", "drawn"]
     head += [f"AUC@{t}°" for t in THRESHOLDS_DEG]
     lines = [head, ["---"] * len(head)]
@@ -138,15 +140,15 @@ def format_differences(
 
 
 _Group = tuple[str, str, str, str]
-"""Scene, configuration, bucket and method."""
+"""Key of a group of records: scene, configuration, bucket and method."""
 _SetErrors = tuple[Float64, ...]
-"""Errors (pairs, orders) of both sides on one set."""
+"""Errors (pairs, orders) in degrees of both benchmarks on one test set."""
 
 
 def _match_records(
     first: Iterable[BenchmarkRecord], second: Iterable[BenchmarkRecord]
 ) -> dict[tuple[str, str, str], list[tuple[BenchmarkRecord, BenchmarkRecord]]]:
-    """Match records of equal image sets, by scene, configuration and bucket."""
+    """Match the records of two benchmarks by scene, configuration, bucket and image names."""
     others = {record.name[:3]: record for record in second}
     matched: dict[tuple[str, str, str], list[tuple[BenchmarkRecord, BenchmarkRecord]]] = {}
     for record in first:
@@ -162,7 +164,7 @@ def _method_name(method: str, pair: tuple[BenchmarkRecord, BenchmarkRecord]) -> 
 
 
 def _unordered_errors(record: BenchmarkRecord, convention: PoseConvention) -> Float64:
-    """Return errors (pairs, orders), with both orders of a pair in one row."""
+    """Return pose errors (pairs, orders) in degrees, with both orders of a pair in one row."""
     errors = record.errors_deg(convention)
     count = len(record.truth)
     if not convention.ordered:
@@ -179,7 +181,7 @@ def _compute_difference(
     resamples: int,
     rng: np.random.Generator,
 ) -> AucDifference:
-    """Compute difference, bootstrap interval and p-value of a group."""
+    """Compute AUC difference, bootstrap interval and p-value of a group of records."""
     units = list(errors) if len(errors) >= MIN_SETS else _split_pairs(errors)
     resampled = _auc_differences((_resample(units, rng) for _ in range(resamples)), convention)
     swapped = _auc_differences((_swap_sides(units, rng) for _ in range(resamples)), convention)
@@ -199,19 +201,19 @@ def _compute_difference(
 
 
 def _split_pairs(errors: Sequence[_SetErrors]) -> list[_SetErrors]:
-    """Split all sets into single pairs."""
+    """Split the errors of all test sets into single image pairs."""
     return [
         (a[None], b[None]) for first, second in errors for a, b in zip(first, second, strict=True)
     ]
 
 
 def _resample(units: Sequence[_SetErrors], rng: np.random.Generator) -> list[_SetErrors]:
-    """Draw the same number of units with replacement."""
+    """Draw a bootstrap sample of test sets or image pairs with replacement."""
     return [units[k] for k in rng.integers(len(units), size=len(units))]
 
 
 def _swap_sides(units: Sequence[_SetErrors], rng: np.random.Generator) -> list[_SetErrors]:
-    """Swap the sides of each unit with probability 1/2."""
+    """Swap the two benchmarks in each resampled unit with probability 1/2."""
     flips = rng.integers(2, size=len(units))
     return [unit[::-1] if flip else unit for unit, flip in zip(units, flips, strict=True)]
 
@@ -219,7 +221,7 @@ def _swap_sides(units: Sequence[_SetErrors], rng: np.random.Generator) -> list[_
 def _auc_differences(
     samples: Iterable[Sequence[_SetErrors]], convention: PoseConvention
 ) -> Float64:
-    """Compute second side minus first, (samples, thresholds), in percentage points."""
+    """Compute AUC differences (samples, thresholds), second minus first, in percentage points."""
     both = [
         [_compute_aucs([unit[k] for unit in sample], convention) for k in (0, 1)]
         for sample in samples
@@ -230,6 +232,6 @@ def _auc_differences(
 
 
 def _compute_aucs(errors: Sequence[Float64], convention: PoseConvention) -> Float64:
-    """Compute the AUC in percent of pooled errors at all thresholds."""
+    """Compute the pose AUC in percent of pooled errors at all thresholds."""
     pooled = np.concatenate([values.ravel() for values in errors])
     return 100 * np.array(list(pose_auc(pooled, convention).values()))

@@ -1,4 +1,4 @@
-"""Evaluation of densification: depth maps and cloud of a reconstructed set with true depth."""
+"""Evaluation of densification: compare dense depth maps and point cloud with true depth."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ from mpsfm_core.results.original_images import OriginalImages
 
 @dataclass(frozen=True, eq=False)
 class DenseEvaluation:
-    """Densification and evaluation of a reconstructed set."""
+    """Settings to densify and evaluate the reconstruction of a test set."""
 
     images: ImageSet
-    """Images that include those of the set."""
+    """Images that contain the images of the test set."""
     dense: DenseOptions
     """Options of densification."""
     results: ResultOptions
     """Options of the fused cloud."""
     scene: SceneFolder
-    """Scene with true depth."""
+    """Scene folder with true depth maps."""
     distances: tuple[float, ...]
-    """Distance thresholds of the cloud in meters."""
+    """Distance thresholds in meters for the accuracy of the point cloud."""
 
     def evaluate(self, model: Reconstruction, problem: MappingProblem) -> dict[str, Any] | None:
-        """Densify a reconstruction of the problem and run :func:`evaluate_dense_geometry`."""
+        """Densify a reconstruction and compare the result with true depth."""
         photos = OriginalImages(self.images, problem)
         dense, _ = densify(model, photos.view, self.dense)
         cloud = fuse_depth_maps(dense, photos.view, self.results).points
@@ -55,23 +55,24 @@ def evaluate_dense_geometry(
 ) -> dict[str, Any] | None:
     """Compare depth maps and cloud of a reconstruction with the true depth of a scene.
 
-    The camera centers align the reconstruction. The true depth maps of its images form the scan.
+    A similarity transform of the camera centers aligns the reconstruction. The true depth maps of
+    the reconstructed images form the scan.
 
     Args:
         model: Reconstruction with depth maps.
         cloud: (n, 3) points, world frame of the reconstruction.
         scene: Scene folder.
-        cameras: Cameras of the true depth maps by image name.
-        distances: Distance thresholds in meters.
+        cameras: Undistorted cameras of the true depth maps by image name.
+        distances: Distance thresholds of the point cloud in meters.
 
     Returns:
         Plain data: ``depth``, the mean of
         :func:`~mpsfm_core.evaluation.depth_accuracy.depth_accuracy` over the maps, and ``cloud``,
-        see :func:`~mpsfm_core.evaluation.cloud_accuracy.cloud_accuracy`. None without true depth or
-        with fewer than three cameras.
+        see :func:`~mpsfm_core.evaluation.cloud_accuracy.cloud_accuracy`. The result is None without
+        true depth or with fewer than three cameras.
 
     Raises:
-        InputError: The cloud is empty, or a true depth map is damaged.
+        InputError: The point cloud is empty, or a true depth map is damaged.
     """
     errors = trajectory_errors(model.poses, scene.truth)
     if errors is None or scene.depth is None:

@@ -11,17 +11,17 @@ from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.geometry import pixel_centers, sample_bilinear, scale_pixels
 
 _DELTA = 1.25
-"""Base of the ratio thresholds delta1, delta2 and delta3."""
+"""Base of the depth ratio thresholds delta1, delta2 and delta3."""
 
 
 @dataclass(frozen=True)
 class DepthAccuracy:
-    """Errors over the pixels where prediction d and truth t are known."""
+    """Depth errors over the pixels where predicted depth d and true depth t are known."""
 
     abs_rel: float
-    """Mean of ``|d - t| / t``."""
+    """Mean absolute relative error ``|d - t| / t`` of depth."""
     rmse_log: float
-    """RMSE of ``log d - log t``."""
+    """RMSE of the log depth error ``log d - log t``."""
     delta1: float
     """Ratio of pixels with ``max(d / t, t / d) < 1.25``."""
     delta2: float
@@ -29,23 +29,23 @@ class DepthAccuracy:
     delta3: float
     """Ratio of pixels with ``max(d / t, t / d) < 1.25^3``."""
     pixels: int
-    """Number of compared pixels."""
+    """Number of pixels with predicted and true depth."""
     coverage: float
-    """Ratio of the pixels with known truth that were compared."""
+    """Ratio of the pixels with true depth that also have predicted depth."""
     scale: float
-    """Factor of the prediction."""
+    """Factor by which the predicted depth was multiplied."""
 
 
 def depth_accuracy(
     depth: Float32, valid: Bool, truth: Float32, *, scale: float | None
 ) -> DepthAccuracy | None:
-    """Compare a depth map with true depth at the pixels of the truth.
+    """Compare a depth map with a true depth map at the pixels of the true map.
 
     Args:
         depth: (h, w) predicted depth.
-        valid: (h, w) mask of the prediction.
+        valid: (h, w) mask of valid predicted depth.
         truth: (H, W) true depth, 0 where unknown.
-        scale: Factor of the prediction; None for the median of ``truth / depth``.
+        scale: Factor that multiplies the predicted depth; None for the median of ``truth / depth``.
 
     Returns:
         The accuracy, or None if no pixel can be compared.
@@ -72,7 +72,7 @@ def depth_accuracy(
 def sample_depth_at_truth(
     depth: Float32, valid: Bool, truth: Float32
 ) -> tuple[Float64, Float64, Float64]:
-    """Sample a depth map at the pixels with true depth.
+    """Sample a predicted depth map at the pixels with true depth.
 
     Args:
         depth: (h, w) depth.
@@ -80,7 +80,8 @@ def sample_depth_at_truth(
         truth: (H, W) true depth, 0 where unknown.
 
     Returns:
-        Pixels of the map (n, 2), sampled depth (n,) and true depth (n,) where both are known.
+        Pixels (n, 2) of the true map, predicted depth (n,) and true depth (n,) where both depths
+        are known.
     """
     known = truth > 0
     height, width = truth.shape
@@ -91,7 +92,7 @@ def sample_depth_at_truth(
 
 
 def mean_accuracy(images: Sequence[DepthAccuracy]) -> dict[str, float]:
-    """Average each value over images (``pixels``: the sum), as plain data for JSON."""
+    """Average the depth accuracy over images and sum ``pixels``, as plain data for JSON."""
     rows = [asdict(image) for image in images]
     means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     return {**means, "pixels": sum(row["pixels"] for row in rows), "images": len(rows)}

@@ -1,7 +1,7 @@
-"""Models of other programs as benchmark records.
+"""Import of models from other programs as benchmark records.
 
-Supported are COLMAP models (also written by MASt3R-SfM, VGGSfM, VGGT and GLOMAP) and
-``transforms.json`` of nerfstudio and others.
+The supported formats are COLMAP models (also of MASt3R-SfM, VGGSfM, VGGT and GLOMAP) and
+``transforms.json`` of nerfstudio.
 """
 
 from __future__ import annotations
@@ -21,20 +21,21 @@ TRANSFORMS = "transforms.json"
 def read_external_records(
     label: str, folder: Path, scene: SceneFolder, sets: Sequence[EvaluationSet], config: str
 ) -> list[BenchmarkRecord]:
-    """Read a record for each set; without a model, all images of a set are unregistered.
+    """Convert the models of another program to one benchmark record for each test set.
 
-    Times are unknown and recorded as 0.
+    Without a model, all images of a test set are unregistered. The records have the times 0,
+    because the run times are unknown.
 
     Args:
-        label: Label of the records.
-        folder: Folder with ``SCENE/SET/`` or ``SET/``; for a single set also ``SCENE/`` or the
-            model itself.
+        label: Method label of the records.
+        folder: Folder with the models in ``SCENE/SET/`` or ``SET/``; for a single test set also
+            ``SCENE/`` or the folder of the model.
         scene: Scene folder.
         sets: Sets of images.
-        config: Name of the configuration for the records.
+        config: Name of the configuration in the records.
 
     Raises:
-        InputError: No set has a model, or a model cannot be read.
+        InputError: No test set has a model, or a model cannot be read.
     """
     folders = {
         item.name: _find_folder(folder, scene.name, item.name, len(sets) == 1) for item in sets
@@ -75,7 +76,7 @@ def _build_record(
 
 
 def _find_folder(root: Path, scene: str, name: str, single_set: bool) -> Path | None:
-    """Find the first folder with models of a set."""
+    """Find the first folder that contains models of a test set."""
     folders = [root / scene / name, root / name]
     if single_set:
         folders += [root / scene, root]
@@ -83,7 +84,7 @@ def _find_folder(root: Path, scene: str, name: str, single_set: bool) -> Path | 
 
 
 def _find_models(root: Path) -> Iterator[Path]:
-    """Yield a single model, or the numbered models of a mapper."""
+    """Yield the model in a folder, or the numbered models in its subfolders."""
     if (root / TRANSFORMS).is_file():
         yield root / TRANSFORMS
         return

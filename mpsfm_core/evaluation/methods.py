@@ -1,6 +1,6 @@
 """Methods of the benchmark: mpsfm and other mappers, each run in a subprocess.
 
-A crash of a mapper ends its subprocess, not the benchmark.
+If a mapper crashes, only its subprocess ends and the benchmark continues.
 """
 
 from __future__ import annotations
@@ -30,53 +30,53 @@ from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 OURS = "ours"
 CHAINED_PNP = "chained-pnp"
-"""Baseline without a mapper (:mod:`~mpsfm_core.evaluation.chained_pnp`)."""
+"""Name of the baseline without a mapper (:mod:`~mpsfm_core.evaluation.chained_pnp`)."""
 PRIOR_METHODS = (OURS, CHAINED_PNP)
-"""Methods that run with each prior quality."""
+"""Methods that use depth priors and therefore run with each prior quality."""
 PEER_METHODS = (CHAINED_PNP, *PEERS)
-"""Methods to compare mpsfm with."""
+"""Methods with which the benchmark compares mpsfm."""
 
 
 @dataclass(frozen=True, eq=False)
 class MethodResult:
-    """Result of a method on a set of images."""
+    """Result of a benchmark method on a test set of images."""
 
     models: Sequence[dict[str, Pose]] = ()
-    """``cam_from_world`` by image name of each model, the largest first."""
+    """Estimated poses ``cam_from_world`` by image name of each model, the largest first."""
     seconds: float = 0.0
-    """Wall time without dense evaluation."""
+    """Wall time of the reconstruction in seconds, without dense evaluation."""
     cpu_seconds: float = 0.0
-    """CPU time of the process without dense evaluation; independent of other jobs."""
+    """CPU time of the reconstruction in seconds, without dense evaluation."""
     peak_mib: float = 0.0
-    """Peak memory of the process, including earlier runs; 0 if unknown."""
+    """Peak memory of the subprocess, including its earlier runs; 0 if unknown."""
     error: str = ""
-    """Reason of a failure; empty on success."""
+    """Error message of a failed run; empty on success."""
     dense: dict[str, Any] | None = None
-    """:meth:`DenseEvaluation.evaluate` of the largest model."""
+    """Result of :meth:`DenseEvaluation.evaluate` on the largest model."""
 
 
 @dataclass(frozen=True, eq=False)
 class MethodRun:
-    """Run of a method on a set of images."""
+    """Inputs of a benchmark run: a method and a test set of images."""
 
     label: str
-    """Label of the record."""
+    """Method label of the benchmark record."""
     method: str
-    """:data:`OURS` or one of :data:`PEER_METHODS`."""
+    """Name of the method: :data:`OURS` or one of :data:`PEER_METHODS`."""
     problem: MappingProblem
-    """Problem of the set."""
+    """Mapping problem of the test set."""
     options: MapperOptions
     """Options of mpsfm."""
     dense: DenseEvaluation | None = None
-    """Dense evaluation of mpsfm; None for none."""
+    """Dense evaluation after mpsfm, or None to skip the evaluation."""
     threads: int = 1
-    """Maximum number of threads. With several, results of COLMAP depend on the schedule."""
+    """Maximum number of threads; COLMAP is not deterministic with several threads."""
 
 
 def run_methods(
     runs: Sequence[MethodRun], workers: int
 ) -> Iterator[tuple[MethodRun, MethodResult]]:
-    """Run methods in `workers` subprocesses and yield each result when done."""
+    """Run methods in `workers` subprocesses and yield each result when the run is done."""
     processes = _WorkerProcesses()
     pool = ThreadPoolExecutor(max(1, workers), thread_name_prefix="mpsfm-benchmark")
     try:
@@ -91,7 +91,7 @@ def run_methods(
 
 
 def run_method(run: MethodRun) -> MethodResult:
-    """Run a method in this process; an exception becomes the error of the result."""
+    """Run a method in the current process; an exception becomes the error of the result."""
     started, cpu_started = time.perf_counter(), time.process_time()
     models: list[dict[str, Pose]] = []
     reconstructions: Sequence[Reconstruction] = ()
@@ -105,20 +105,20 @@ def run_method(run: MethodRun) -> MethodResult:
             else:
                 reconstructions = mapper.reconstruct(run.problem, run.options).reconstructions
                 models = [model.poses for model in reconstructions]
-    except Exception as raised:  # failures are results
+    except Exception as raised:  # A failed run is a result of the benchmark.
         error = f"{type(raised).__name__}: {raised}"
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
     if run.dense is not None and reconstructions:
         try:
             with limit_threads(run.threads):
                 dense = run.dense.evaluate(reconstructions[0], run.problem)
-        except Exception as raised:  # the poses stay valid
+        except Exception as raised:  # The poses stay valid if dense evaluation fails.
             error = f"dense: {type(raised).__name__}: {raised}"
     return MethodResult(models, seconds, cpu_seconds, peak_memory_mb() or 0.0, error, dense)
 
 
 class _WorkerProcesses:
-    """Pool with one subprocess per calling thread, restarted after a crash."""
+    """Process pool with one subprocess per calling thread, restarted after a crash."""
 
     def __init__(self) -> None:
         self._local = threading.local()
@@ -140,7 +140,8 @@ class _WorkerProcesses:
             process.shutdown(wait=True, cancel_futures=True)
 
     def _start_process(self) -> ProcessPoolExecutor:
-        # Forked processes would inherit locks of threads that they do not have.
+        # Subprocesses are not forked, because a fork copies locked locks but not the threads that
+        # release them.
         context = multiprocessing.get_context("spawn")
         process = ProcessPoolExecutor(1, mp_context=context, initializer=_initialize_process)
         self._local.process = process
@@ -150,7 +151,7 @@ class _WorkerProcesses:
 
 
 def _initialize_process() -> None:
-    """Silence COLMAP and load compiled kernels, which would add to the time of the first set."""
+    """Silence COLMAP and load compiled kernels, so that the first run time excludes loading."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     camera = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
     problem = make_mapping_problem(room_scene(), camera, arc_poses(3, 8.0))

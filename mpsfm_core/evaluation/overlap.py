@@ -1,10 +1,10 @@
 """Two-view and three-view overlap from true depth or from a COLMAP model [paper, appendix].
 
-* Two-view overlap: ratio of one view's units that the other view sees, minimum of both directions.
-* Three-view overlap: ratio of one view's units that both other views see, maximum over the views.
+* Two-view overlap: ratio of a view's units that the second view sees, minimum of both directions.
+* Three-view overlap: ratio of a view's units that both remaining views see, maximum over the views.
 
-A unit is a pixel with true depth, or an observed point of the COLMAP model. Another view sees a
-pixel if the pixel projects into it with a consistent depth.
+A unit is a pixel with true depth, or an observed point of the COLMAP model. A second view sees a
+pixel if the pixel projects into the second view with a consistent depth.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mpsfm_core.geometry import (
 DEPTH_TOLERANCE = 0.05
 """Maximum relative difference of consistent depths."""
 _GRID_COLUMNS = 96
-"""Columns of the grid on which pixels are compared."""
+"""Number of columns of the pixel grid on which depth maps are compared."""
 _ONES: UInt8 = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(
     axis=1, dtype=np.uint8
 )
@@ -37,14 +37,15 @@ _ONES: UInt8 = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).su
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Overlap of n views."""
+    """Two-view and three-view overlap of n views."""
 
     names: tuple[str, ...]
-    """Names of the views."""
+    """Names of the n views."""
     seen: tuple[UInt8, ...]
-    """Per view i, (n, bytes) uint8: row j has the packed bits of i's units that view j sees."""
+    """Packed visibility of each view's units, (n, bytes) uint8; row j contains the bits of the
+    units that view j sees."""
     counts: Float64
-    """(n,) number of units of each view."""
+    """(n,) number of units (pixels or points) of each view."""
     two_view: Float64
     """(n, n) two-view overlap in [0, 1], symmetric, 1 on the diagonal."""
 
@@ -56,7 +57,7 @@ class Overlap:
         return max(self._ratio(a, b, c), self._ratio(b, a, c), self._ratio(c, a, b))
 
     def _ratio(self, view: int, first: int, second: int) -> float:
-        """Return the ratio of a view's units that both other views see."""
+        """Compute the ratio of a view's units that two more views see."""
         both = self.seen[view][first] & self.seen[view][second]
         return float(_ONES[both].sum(dtype=np.int64)) / max(float(self.counts[view]), 1.0)
 
@@ -70,10 +71,11 @@ def overlap_from_depth(
     """Compute the overlap of views with true depth.
 
     Args:
-        names: Names of the views.
+        names: Names of the n views.
         poses: ``cam_from_world`` by name.
         cameras: Intrinsics by name.
-        depth_of: Returns the depth (h, w) of a name in the unit of the poses, 0 where unknown.
+        depth_of: Function that returns the depth (h, w) of an image name in the unit of the poses,
+            0 where unknown.
     """
     views = [_downsample(cameras[name], depth_of(name)) for name in names]
     seen, counts = [], np.array([float((depth > 0).sum()) for _, depth in views])
@@ -103,7 +105,7 @@ def overlap_from_model(model: pycolmap.Reconstruction, names: Sequence[str]) -> 
 
 
 def _build_overlap(names: Sequence[str], seen: Sequence[UInt8], counts: Float64) -> Overlap:
-    """Compute two-view overlap from packed visibility."""
+    """Compute the two-view overlap matrix from packed visibility bits."""
     shared = np.stack([_ONES[bits].sum(axis=1, dtype=np.int64) for bits in seen])
     one_way = shared / np.maximum(counts, 1.0)[:, None]
     two_view = np.minimum(one_way, one_way.T)
@@ -112,13 +114,13 @@ def _build_overlap(names: Sequence[str], seen: Sequence[UInt8], counts: Float64)
 
 
 def _downsample(camera: PinholeCamera, depth: Float32) -> tuple[PinholeCamera, Float32]:
-    """Resize camera and depth to the grid, without interpolation across depth edges."""
+    """Resize camera and depth map to the comparison grid with nearest-neighbor sampling."""
     rows = max(1, round(_GRID_COLUMNS * camera.height / camera.width))
     return camera.resized(_GRID_COLUMNS, rows), resize_map(depth, _GRID_COLUMNS, rows, linear=False)
 
 
 def _sees(camera: PinholeCamera, depth: Float32, pose: Pose, world: Float64) -> Bool:
-    """Return the mask (n,) of world points (n, 3) that a view sees."""
+    """Return the mask (n,) of world points (n, 3) that a view sees at consistent depth."""
     local = transform(*pose, world)
     xy = project(camera, local)
     within = inside(xy, camera.size)

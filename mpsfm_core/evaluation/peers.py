@@ -1,8 +1,8 @@
-"""COLMAP mappers on the same verified matches, the peers of the benchmark.
+"""COLMAP mappers that the benchmark runs on the verified matches of mpsfm.
 
-All use the same keypoints, verified matches and fixed intrinsics, and a fixed seed. Models of two
-images are kept, as in mpsfm. With several threads the models of COLMAP depend on the schedule, so
-accuracy tables use one thread.
+All COLMAP mappers use the keypoints, verified matches and fixed intrinsics of mpsfm, and a fixed
+seed. Models with two images are results, as in mpsfm. COLMAP is not deterministic with several
+threads, so accuracy tables use one thread.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path],
     """Configure COLMAP's incremental mapper.
 
     Args:
-        tuned: Use the angles of the paper's tuned baselines.
-        structure_less: Allow the fallback to 2D-2D registration, the default of pycolmap 4.2.
+        tuned: True to use the minimum triangulation angles of the paper's tuned baselines.
+        structure_less: True to allow registration from 2D-2D matches as fallback, the default of
+            pycolmap 4.2.
     """
 
     def run(database: Path, output: Path) -> Models:
@@ -78,11 +79,12 @@ PEERS: Mapping[str, Callable[[Path, Path], Models]] = MappingProxyType(
         "colmap-global": _global,
     }
 )
-"""Name -> ``run(database, output)``. ``colmap-structureless`` is pycolmap 4.2's default."""
+"""Mapper name -> function ``run(database, output)``. The mapper ``colmap-structureless`` has the
+defaults of pycolmap 4.2."""
 
 
 def run_peer(name: str, problem: MappingProblem) -> list[dict[str, Pose]]:
-    """Run a peer on a problem; returns ``cam_from_world`` by name per model, largest first."""
+    """Run a COLMAP mapper and return ``cam_from_world`` by image name of each model."""
     with tempfile.TemporaryDirectory(prefix="mpsfm-peer-") as folder:
         output = Path(folder)
         database = output / "database.db"
@@ -94,7 +96,8 @@ def run_peer(name: str, problem: MappingProblem) -> list[dict[str, Pose]]:
 def write_database(problem: MappingProblem, path: Path) -> None:
     """Write keypoints, verified matches and two-view geometries as a COLMAP database.
 
-    Image ids are indices in the problem plus one. Each image has its own camera.
+    A COLMAP image id is the image index in the mapping problem plus one. Each image has its own
+    camera.
     """
     with pycolmap.Database.open(path) as database:
         for number, image in enumerate(problem.images, start=1):
@@ -118,7 +121,7 @@ def write_database(problem: MappingProblem, path: Path) -> None:
 
 
 def _geometry(problem: MappingProblem, pair: VerifiedPair) -> pycolmap.TwoViewGeometry:
-    """Build COLMAP's two-view geometry: essential matrix, or homography without a baseline."""
+    """Build COLMAP's two-view geometry: essential matrix, or homography for zero baseline."""
     geometry = pycolmap.TwoViewGeometry()
     geometry.inlier_matches = pair.matches.astype(np.uint32)
     pose = np.column_stack([pair.rotation, pair.translation])
@@ -135,5 +138,5 @@ def _geometry(problem: MappingProblem, pair: VerifiedPair) -> pycolmap.TwoViewGe
 
 
 def _cross(t: Float64) -> Float64:
-    """Return the cross product matrix of a vector."""
+    """Return the skew-symmetric cross product matrix of a vector."""
     return np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])

@@ -1,8 +1,8 @@
 """Pose AUC: area under the recall curve of relative pose errors.
 
 Papers differ in three choices that change the result by several points: the pairs, the sign of the
-translation, and the integration of the recall curve. A :class:`PoseConvention` is a set of choices;
-:data:`CONVENTIONS` lists the common ones.
+translation, and the integration of the recall curve. A :class:`PoseConvention` specifies these
+choices, and :data:`CONVENTIONS` lists common conventions.
 """
 
 from __future__ import annotations
@@ -17,38 +17,38 @@ from mpsfm_core.data import Float64, Pose
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
 
 THRESHOLDS_DEG = (1, 5, 20)
-"""Thresholds in degrees [paper, tables]."""
+"""Thresholds of the pose AUC in degrees [paper, tables]."""
 UNREGISTERED_DEG = 180.0
-"""Error of a pair with an unregistered image."""
+"""Pose error in degrees of an image pair with an unregistered image."""
 
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """Convention of the pose AUC."""
+    """Convention of the pose AUC: pairs, sign of the translation, and integration."""
 
     name: str
-    """Name for the command line."""
+    """Name of the convention on the command line."""
     description: str
     """Description for reports."""
     ordered: bool
-    """Count (a, b) and (b, a); their translation errors differ."""
+    """Count both orders (a, b) and (b, a) of a pair, whose translation errors differ."""
     folded: bool
     """Ignore the sign of the translation, so that its error is at most 90 degrees."""
     area: Callable[[Float64, int], float]
     """``area(errors, threshold)``: normalized area under the recall curve, in [0, 1]."""
     every_model: bool = False
-    """Count pairs within any model; else only pairs within the largest model."""
+    """Evaluate image pairs within each model; if False, only pairs within the largest model."""
 
 
 def exact_area(errors: Float64, threshold: int) -> float:
-    """Integrate the empirical recall curve (a step function): mean of ``max(0, 1 - e / t)``."""
+    """Integrate the empirical recall curve exactly: mean of ``max(0, 1 - error / threshold)``."""
     return float(np.maximum(0.0, 1.0 - errors / threshold).mean())
 
 
 def interpolated_area(errors: Float64, threshold: int) -> float:
     """Integrate the linearly interpolated recall curve, as SuperGlue and COLMAP's benchmark do.
 
-    The result is never below :func:`exact_area`.
+    The interpolated area is never below :func:`exact_area`.
     """
     ordered = np.sort(errors)
     below = ordered[ordered <= threshold]
@@ -116,12 +116,14 @@ def pose_errors_deg(
     The translation error of a pair with coinciding true centers is 0.
 
     Args:
-        estimated: ``cam_from_world`` by image name; missing images are unregistered.
-        truth: True ``cam_from_world`` by image name, at least two.
+        estimated: Estimated poses ``cam_from_world`` by image name; missing images are
+            unregistered.
+        truth: True poses ``cam_from_world`` by image name, at least two.
         convention: Convention, see :data:`CONVENTIONS`.
 
     Returns:
-        (pairs,) float64 errors in [0, 180] degrees, in the order of `truth`, first image slowest.
+        (pairs,) float64 pose errors in [0, 180] degrees, sorted by first, then second image in
+        `truth`.
     """
     names = list(truth)
     count = len(names)
@@ -153,15 +155,16 @@ def pose_auc(
     """Compute the pose AUC at each threshold.
 
     Args:
-        errors_deg: (pairs,) errors; concatenate the errors of several scenes to pool them.
+        errors_deg: (pairs,) pose errors in degrees; concatenate the errors of several scenes to
+            pool scenes.
         convention: Convention of the integration.
         thresholds: Thresholds in degrees.
 
     Returns:
-        Threshold -> area in [0, 1].
+        Threshold in degrees -> pose AUC in [0, 1].
 
     Raises:
-        ValueError: There are no errors.
+        ValueError: There are no pose errors.
     """
     if len(errors_deg) == 0:
         raise ValueError("no pairs to evaluate")
@@ -169,7 +172,7 @@ def pose_auc(
 
 
 def _relative_poses(poses: Sequence[Pose], first: Float64, second: Float64) -> Pose:
-    """Compute ``second_from_first`` of pairs: rotations (n, 3, 3) and translations (n, 3)."""
+    """Compute relative poses ``second_from_first``: rotations (n, 3, 3), translations (n, 3)."""
     rotations = np.stack([rotation for rotation, _ in poses])
     translations = np.stack([translation for _, translation in poses])
     relative = rotations[second] @ rotations[first].transpose(0, 2, 1)

@@ -28,16 +28,17 @@ def evaluate(
     """Compare estimated poses with true poses.
 
     Args:
-        estimated: ``cam_from_world`` by image name.
-        truth: True ``cam_from_world`` by image name.
-        images: Names to evaluate, extension optional; all of `truth` by default.
+        estimated: Estimated poses ``cam_from_world`` by image name.
+        truth: True poses ``cam_from_world`` by image name.
+        images: Names of the images to evaluate, extension optional; all images of `truth` by
+            default.
         convention: Convention of the pose AUC.
 
     Returns:
-        Report as plain data for JSON.
+        Report of pose AUC and trajectory errors as plain data for JSON.
 
     Raises:
-        InputError: An image is not in the truth, or fewer than two images remain.
+        InputError: An image has no true pose, or fewer than two images remain.
     """
     names = list(truth) if images is None else _match_images(images, truth)
     if len(names) < 2:
@@ -70,7 +71,7 @@ def _match_images(images: Sequence[str], truth: Mapping[str, Pose]) -> list[str]
 
 
 def _summarize_trajectory(errors: TrajectoryErrors | None) -> dict[str, float] | None:
-    """Return the statistics of trajectory errors for the report."""
+    """Compute mean, median and RMSE of trajectory errors for the report."""
     if errors is None:
         return None
     return {

@@ -1,11 +1,11 @@
 """Depth priors of known quality, made from the true depth of a scene.
 
-* ``sensor``: true depth with a declared relative std of 1 %, an upper bound.
-* ``degraded``: true depth with the errors of :mod:`mpsfm_core.testing.synthetic.degraded_depth`,
-which
-  represents a good monocular network. The declared std is the std of the errors after the best
-  scale per image. ``degraded-N`` uses seed N instead of 0.
-* ``config``: the provider of the configuration.
+* ``sensor``: true depth with a declared relative std of 1 %, an upper bound of prior quality.
+* ``degraded``: true depth with the errors of a good monocular network
+  (:mod:`mpsfm_core.testing.synthetic.degraded_depth`). The declared std of degraded depth is the
+  std of its errors after the best scale per image. ``degraded-N`` uses the random seed N instead
+  of 0.
+* ``config``: depth from the provider of the configuration.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors, degrade_dep
 QUALITIES = ("sensor", "degraded", "config")
 """Names of the prior qualities."""
 SENSOR_STD = 0.01
-"""Declared relative std of the true depth."""
+"""Relative std that is declared for true depth."""
 _MILLIMETER = 0.001
-"""One millimeter in meters, the unit of depth files."""
+"""Length of one millimeter, the unit of depth files, in meters."""
 
 
 def parse_error_seed(quality: str) -> int | None:
-    """Parse the seed of a degraded quality; None for other qualities."""
+    """Parse the error seed of a quality ``degraded-N``; None for other qualities."""
     match = re.fullmatch(r"degraded(?:-(\d+))?", quality)
     return int(match[1] or 0) if match else None
 
@@ -43,7 +43,7 @@ def parse_error_seed(quality: str) -> int | None:
 def prior_overrides(
     quality: str, scene: SceneFolder, images: Iterable[str], work: Path
 ) -> tuple[str, ...]:
-    """Return the overrides ``KEY=VALUE`` for a configuration with depth of a quality.
+    """Return the settings ``KEY=VALUE`` that select depth priors of a quality.
 
     Args:
         quality: Prior quality.
@@ -78,7 +78,7 @@ def read_depth(path: Path) -> Float32:
         (h, w) float32 depth in meters, 0 where unknown.
 
     Raises:
-        InputError: The file is missing or no 16-bit image.
+        InputError: The file is missing or not a 16-bit image.
     """
     stored = None
     if path.is_file():
@@ -99,14 +99,14 @@ def write_depth(path: Path, depth: Float32) -> None:
 
 
 def _depth_file_settings(folder: Path, std: float) -> tuple[str, ...]:
-    """Return overrides that read depth from files with a relative std."""
+    """Return the settings ``KEY=VALUE`` that read depth from files with a relative std."""
     return (
         "depth.use=files",
         f"depth.options.directory={json.dumps(str(folder.resolve()))}",
         "depth.options.suffix=.png",
         f"depth.options.scale={_MILLIMETER}",
         f"depth.options.relative_std={std}",
-        # The declared std is already the total std.
+        # The declared std already contains all errors of the depth files.
         "depth.calibration={std_scale: 1, relative_std: 0, std_floor: 0}",
         "normals.use=from-depth",
     )

@@ -1,6 +1,6 @@
-"""Results of a benchmark on disk: one JSON file per set and method.
+"""Benchmark records on disk: one JSON file per test set and method.
 
-Records contain poses instead of metrics, so that any convention can be applied later.
+Records contain poses instead of metrics, so that any AUC convention can be applied later.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from mpsfm_core.support.files import write_file
 from mpsfm_core.support.format_versions import VERSION, check_version
 
 FORMAT = 1
-"""Format version of the records."""
+"""Format version of the record files."""
 RUNS = "runs"
 """Folder of the records below a benchmark's output folder."""
 
 
 @dataclass(frozen=True, eq=False)
 class BenchmarkRecord:
-    """Result of a method on a set of images."""
+    """Result of a benchmark method on a test set of images."""
 
     scene: str
     """Name of the scene folder."""
@@ -38,28 +38,28 @@ class BenchmarkRecord:
     set_name: str
     """Name of the set."""
     label: str
-    """Method; for methods with priors also the prior quality."""
+    """Name of the method, with the prior quality for methods that use priors."""
     key: str
-    """Hash of everything that the result depends on."""
+    """Hash of all inputs that determine the result of the run."""
     estimated: Mapping[str, Pose]
-    """``cam_from_world`` by image name of the largest model."""
+    """Estimated poses ``cam_from_world`` of the largest model by image name."""
     truth: Mapping[str, Pose]
-    """True ``cam_from_world`` of all images of the set."""
+    """True poses ``cam_from_world`` of all images of the test set by image name."""
     pairs: int
-    """Number of verified pairs."""
+    """Number of verified image pairs."""
     seconds: float
-    """Wall time."""
+    """Wall time of the reconstruction in seconds."""
     cpu_seconds: float
-    """CPU time of the process."""
+    """CPU time of the reconstruction in seconds."""
     error: str = ""
-    """Reason of a failure; empty on success."""
+    """Error message of a failed run; empty on success."""
     others: Sequence[Mapping[str, Pose]] = ()
-    """Further models, as ``estimated``."""
+    """Poses ``cam_from_world`` by image name of each further model."""
     dense: Mapping[str, Any] | None = None
-    """:func:`~mpsfm_core.evaluation.dense_geometry.evaluate_dense_geometry`; None without."""
+    """Result of :func:`~mpsfm_core.evaluation.dense_geometry.evaluate_dense_geometry`, or None."""
 
     def errors_deg(self, convention: PoseConvention) -> Float64:
-        """Compute :func:`~mpsfm_core.evaluation.pose_auc.pose_errors_deg` of all pairs."""
+        """Compute the relative pose errors of all image pairs of the test set in degrees."""
         models = (self.estimated, *(self.others if convention.every_model else ()))
         errors = [pose_errors_deg(model, self.truth, convention) for model in models]
         best: Float64 = np.min(errors, axis=0)
@@ -67,17 +67,17 @@ class BenchmarkRecord:
 
     @property
     def file(self) -> Path:
-        """Path of the record below the output folder."""
+        """Relative path of the record below the benchmark's output folder."""
         return record_file(*self.name)
 
     @property
     def name(self) -> tuple[str, str, str, str]:
-        """Scene, configuration, set and label; equal for the same run of another benchmark."""
+        """Scene, configuration, test set and label, which identify a run across benchmarks."""
         return self.scene, self.config, self.set_name, self.label
 
 
 def record_file(scene: str, config: str, set_name: str, label: str) -> Path:
-    """Return the path of a record below the output folder."""
+    """Return the relative path of a record below the benchmark's output folder."""
     return Path(RUNS, scene, config, set_name, f"{label}.json")
 
 
@@ -95,7 +95,7 @@ def read_record(path: Path) -> BenchmarkRecord:
     """Read a record.
 
     Raises:
-        InputError: The file is damaged or has a newer format.
+        InputError: The record file is damaged or has a newer format.
     """
     try:
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
@@ -113,7 +113,7 @@ def read_records(output: Path) -> list[BenchmarkRecord]:
     """Read all records of a benchmark in the order of their file names.
 
     Raises:
-        InputError: There are no records, or one is damaged.
+        InputError: The folder has no records, or a record is damaged.
     """
     paths = sorted((output / RUNS).glob("*/*/*/*.json"))
     if not paths:

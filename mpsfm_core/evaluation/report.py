@@ -25,9 +25,9 @@ from mpsfm_core.support.format_versions import VERSION
 FORMAT = 1
 """Format version of ``report.json``."""
 ALL_SCENES = "all scenes"
-"""Scene name of the results pooled over all scenes."""
+"""Scene name in rows with results pooled over all scenes."""
 CLOUD_METRICS = ("accuracy", "completeness", "f1")
-"""Metrics of a cloud at a distance, in the order of the table."""
+"""Metrics of a point cloud at a distance threshold, in the order of the table columns."""
 _COLORS = ("#1b6ca8", "#d1495b", "#2e8b57", "#e08e0b", "#7b4fa3", "#5c5c5c", "#17a2b8", "#a0522d")
 _PLOT = (440, 260)
 _RANGE_DEG = 20
@@ -40,12 +40,12 @@ _DENSE_NOTE = (
 )
 
 GroupKey = tuple[str, str, str, str]
-"""Scene, configuration, bucket and method."""
+"""Key of a group of records: scene, configuration, bucket and method."""
 
 
 @dataclass(frozen=True)
 class BenchmarkRow:
-    """Results of a method on a bucket."""
+    """Row of the report: results of a method on a bucket of test sets."""
 
     scene: str
     """Name of the scene, or :data:`ALL_SCENES`."""
@@ -56,26 +56,26 @@ class BenchmarkRow:
     method: str
     """Label of the method."""
     sets: int
-    """Number of sets."""
+    """Number of test sets."""
     pairs: int
-    """Number of verified pairs."""
+    """Number of verified image pairs."""
     auc: Mapping[int, float]
-    """Threshold in degrees -> pose AUC in percent, errors of all sets pooled."""
+    """Threshold in degrees -> pose AUC in percent of the pooled errors of all test sets."""
     registered: float
-    """Ratio of registered images."""
+    """Ratio of the images that are registered."""
     seconds: float
-    """Mean wall time per set."""
+    """Mean wall time per test set in seconds."""
     cpu_seconds: float
-    """Mean CPU time per set."""
+    """Mean CPU time per test set in seconds."""
     failed: int
-    """Number of failed sets."""
+    """Number of test sets on which the method failed."""
     dense: Mapping[str, Any] | None = None
-    """Means over the ``sets`` with dense evaluation: ``abs_rel``, and distance in meters -> ratio
-    for each of :data:`CLOUD_METRICS`; None without."""
+    """Means over the ``sets`` with dense evaluation, or None: ``abs_rel``, and a dictionary from
+    distance in meters to ratio for each of :data:`CLOUD_METRICS`."""
 
     @property
     def group(self) -> GroupKey:
-        """Key of the group of records."""
+        """Key of the group of records that the row summarizes."""
         return self.scene, self.config, self.bucket, self.method
 
 
@@ -87,7 +87,7 @@ def pool_errors(records: Iterable[BenchmarkRecord], convention: PoseConvention) 
 def group_records(records: Iterable[BenchmarkRecord]) -> dict[GroupKey, list[BenchmarkRecord]]:
     """Group records by scene, configuration, bucket and method.
 
-    Several scenes are also pooled as the scene :data:`ALL_SCENES`.
+    The records of several scenes are also pooled as the scene :data:`ALL_SCENES`.
     """
     records = list(records)
     groups: dict[GroupKey, list[BenchmarkRecord]] = {}
@@ -101,7 +101,7 @@ def group_records(records: Iterable[BenchmarkRecord]) -> dict[GroupKey, list[Ben
 def build_rows(
     records: Iterable[BenchmarkRecord], convention: PoseConvention = CONVENTIONS["paper"]
 ) -> list[BenchmarkRow]:
-    """Compute the rows of the table in the order of the records."""
+    """Compute the rows of the report table in the order of the records."""
     rows = []
     for key, group in group_records(records).items():
         areas = pose_auc(pool_errors(group, convention), convention)
@@ -136,7 +136,7 @@ def _mean_dense(sets: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
 def format_markdown(
     rows: Sequence[BenchmarkRow], convention: PoseConvention = CONVENTIONS["paper"]
 ) -> str:
-    """Format one Markdown table per scene and configuration, with the convention above."""
+    """Format one Markdown table per scene and configuration below the AUC convention."""
     parts = [f"Pose AUC in percent, convention `{convention.name}`: {convention.description}."]
     if any(row.dense for row in rows):
         parts.append(_DENSE_NOTE)
@@ -149,7 +149,7 @@ def format_markdown(
 
 
 def list_failures(records: Iterable[BenchmarkRecord]) -> list[str]:
-    """Return a line for each failed run with its reason."""
+    """Return a text line with the error of each failed run."""
     return [f"{' / '.join(record.name)}: {record.error}" for record in records if record.error]
 
 
@@ -176,7 +176,7 @@ def write_report(output: Path, records: Sequence[BenchmarkRecord]) -> None:
 
 
 def _lines(rows: Sequence[BenchmarkRow]) -> list[list[str]]:
-    """Return header and cells of a table, with a dense column per distance if evaluated."""
+    """Return header and cells of the report table, with columns for dense evaluation if present."""
     head = ["bucket", "sets", "method", *(f"AUC@{t}°" for t in THRESHOLDS_DEG)]
     head += ["registered", "CPU s / set", "failed"]
     dense = [row.dense for row in rows if row.dense]
@@ -206,7 +206,7 @@ def _dense_cells(row: BenchmarkRow, distances: Sequence[str]) -> list[str]:
 def _page(
     rows: Sequence[BenchmarkRow], records: Sequence[BenchmarkRecord], convention: PoseConvention
 ) -> str:
-    """Return a self-contained page with a table and recall curves per bucket."""
+    """Build a self-contained HTML page with a result table and recall curves per bucket."""
     parts = [
         "<!doctype html><meta charset='utf-8'><title>Benchmark</title>",
         "<style>body{font:14px sans-serif;margin:2em}td,th{padding:2px 10px;text-align:right}"
@@ -239,7 +239,7 @@ def _table(rows: Sequence[BenchmarkRow]) -> str:
 
 
 def _curves(errors: Mapping[str, Float64]) -> str:
-    """Draw recall curves as SVG."""
+    """Draw recall curves of pose errors as SVG."""
     width, height = _PLOT
     shapes = _axes()
     for number, (method, values) in enumerate(errors.items()):

@@ -24,13 +24,13 @@ def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
 
     Args:
         output: Result folder.
-        truth: Folder of 16-bit PNG files in millimeters, named like the images.
+        truth: Folder of true depth maps as 16-bit PNG files in millimeters, named like the images.
 
     Returns:
-        Means over images: ``raw`` (for results in meters) and ``median_scaled``.
+        Means over images: Depth accuracy ``raw`` (for results in meters) and ``median_scaled``.
 
     Raises:
-        InputError: No depth map has true depth.
+        InputError: No depth map of the results has a true depth map.
     """
     scales = {"raw": 1.0, "median_scaled": None}
     accuracies: dict[str, list[DepthAccuracy]] = {name: [] for name in scales}
@@ -59,17 +59,18 @@ def evaluate_cloud(
     true_poses: Mapping[str, Pose],
     tolerances: Sequence[float] = TOLERANCES,
 ) -> dict[str, Any]:
-    """Align a cloud by the camera centers and compare with a scan.
+    """Align a point cloud by the camera centers and compare the cloud with a scan.
 
     Args:
         cloud: PLY file in the frame of the estimated poses.
         truth: (n, 3) points of the scan in the frame of the true poses.
-        estimated: Estimated ``cam_from_world`` by image name.
-        true_poses: True ``cam_from_world`` by image name.
-        tolerances: Distance thresholds in the unit of the truth.
+        estimated: Estimated poses ``cam_from_world`` by image name.
+        true_poses: True poses ``cam_from_world`` by image name.
+        tolerances: Distance thresholds in the unit of the true poses.
 
     Raises:
-        InputError: There are fewer than three common cameras, or the cloud is empty.
+        InputError: Fewer than three images have an estimated and a true pose, or the cloud is
+            empty.
     """
     errors = trajectory_errors(estimated, true_poses)
     if errors is None:
@@ -82,7 +83,7 @@ def read_points(path: Path) -> Float64:
     """Read the points (n, 3) of a PLY file.
 
     Raises:
-        InputError: The file has no points.
+        InputError: The PLY file has no points.
     """
     points, _ = read_ply(path)
     if not len(points):
@@ -93,7 +94,7 @@ def read_points(path: Path) -> Float64:
 def read_true_surface(
     model: Path, depth: Path, images: Collection[str], tolerances: Sequence[float] = TOLERANCES
 ) -> Float64:
-    """Build the true surface with the cameras and poses of a true model."""
+    """Sample the true surface of a scene with the cameras and poses of the true model."""
     true = read_model(model)
     cameras = {
         str(image.name): undistort_camera(true.cameras[image.camera_id], 0.0)

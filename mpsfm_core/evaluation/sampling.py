@@ -1,12 +1,12 @@
 """Sampling of image sets with little overlap, after the paper's low-overlap evaluation.
 
-A set starts with a random image. An image is added if it has enough two-view overlap with a member
-and if no triplet with it exceeds the three-view overlap of the bucket. The set is complete when no
-image can be added. Sets of a bucket differ by at least two images. The same overlap and seed give
-the same sets.
+A test set starts with a random image. An image is added if its two-view overlap with a member is
+sufficient and no triplet exceeds the three-view overlap of the bucket. A test set is complete when
+no image can be added. Sets of a bucket differ by at least two images. The sampling is deterministic
+for given overlap and seed.
 
-In the paper, a minimal set may include images of more overlap that lead to images without overlap,
-to span a whole scene. Minimal sets here satisfy the limit throughout.
+In contrast to the paper, all triplets of a minimal set satisfy the overlap limit. The paper adds
+images of higher overlap to minimal sets, to span a whole scene.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from mpsfm_core.evaluation.overlap import Overlap
 LIMITS: Mapping[str, float] = MappingProxyType(
     {"minimal": 0.01, "leq5": 0.05, "leq10": 0.10, "leq30": 0.30}
 )
-"""Bucket -> maximum three-view overlap [paper, appendix]; minimal is 0 up to rounding."""
+"""Bucket -> maximum three-view overlap [paper, appendix]; the bucket minimal allows 0 up to
+rounding."""
 TRIPLETS: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
         "0": (0.0, 0.0),
@@ -40,24 +41,24 @@ TRIPLETS: Mapping[str, tuple[float, float]] = MappingProxyType(
 
 @dataclass(frozen=True)
 class SamplingOptions:
-    """Options of the sampling of image sets."""
+    """Options for the sampling of test sets."""
 
     min_two_view: float = 0.25
-    """Minimum two-view overlap of an image with a member of the set."""
+    """Minimum two-view overlap of an image with a member of the test set."""
     sets: int = 5
-    """Number of sets per bucket; minimal has twice as many [paper: 5 and 10]."""
+    """Number of test sets per bucket; the bucket minimal has twice as many [paper: 5 and 10]."""
     min_images: int = 5
-    """Minimum number of images of a set [paper]."""
+    """Minimum number of images of a test set [paper]."""
     max_images: int | None = None
-    """Maximum number of images of a set; None for no limit."""
+    """Maximum number of images of a test set; None for no limit."""
     attempts: int = 20
-    """Random starts per requested set."""
+    """Number of random starts per requested test set."""
     seed: int = 0
     """Seed of the random generator."""
 
 
 def sample_buckets(overlap: Overlap, options: SamplingOptions | None = None) -> dict[str, Any]:
-    """Sample the buckets of ``testsets.yaml``; buckets without a set are left out."""
+    """Sample test sets for the buckets of ``testsets.yaml``; empty buckets are omitted."""
     options = options or SamplingOptions()
     buckets: dict[str, Any] = {}
     for number, (bucket, limit) in enumerate(LIMITS.items()):
@@ -74,7 +75,7 @@ def sample_buckets(overlap: Overlap, options: SamplingOptions | None = None) -> 
 
 
 def sample_triplets(overlap: Overlap, options: SamplingOptions) -> dict[str, list[list[str]]]:
-    """Sample triplets in which one image overlaps enough with both others, by group."""
+    """Sample image triplets by three-view overlap, in which one image overlaps with both others."""
     rng = np.random.default_rng([options.seed, len(LIMITS)])
     linked = overlap.two_view >= options.min_two_view
     np.fill_diagonal(linked, False)
@@ -103,7 +104,7 @@ def _triplet_group(three_view: float) -> str:
 def _grow_sets(
     overlap: Overlap, limit: float, options: SamplingOptions, rng: np.random.Generator, count: int
 ) -> Iterator[frozenset[int]]:
-    """Yield sets with enough images, from a limited number of random starts."""
+    """Yield test sets with enough images from a limited number of random starts."""
     for _ in range(options.attempts * count):
         members = _grow_set(overlap, limit, options, rng)
         if len(members) >= options.min_images:
@@ -113,9 +114,9 @@ def _grow_sets(
 def _grow_set(
     overlap: Overlap, limit: float, options: SamplingOptions, rng: np.random.Generator
 ) -> list[int]:
-    """Grow a set from random candidates until none can be added.
+    """Add random images to a test set until no image satisfies the overlap limits.
 
-    A rejected candidate stays rejected, because members are never removed.
+    A rejected image is not tested again, because members are never removed.
     """
     order = [int(i) for i in rng.permutation(len(overlap))]
     members, candidates = order[:1], order[1:]
@@ -137,7 +138,7 @@ def _grow_set(
 
 
 def _select_distinct(sets: Iterator[frozenset[int]], count: int) -> list[frozenset[int]]:
-    """Select the first sets that differ from each other by at least two images."""
+    """Select the first test sets that differ from each other by at least two images."""
     selected: list[frozenset[int]] = []
     for members in sets:
         if all(max(len(members - other), len(other - members)) >= 2 for other in selected):
@@ -148,7 +149,7 @@ def _select_distinct(sets: Iterator[frozenset[int]], count: int) -> list[frozens
 
 
 def _describe_set(overlap: Overlap, members: frozenset[int]) -> dict[str, Any]:
-    """Return names and overlap of a set for ``testsets.yaml``."""
+    """Return image names and overlap of a test set for ``testsets.yaml``."""
     ordered = sorted(members)
     three = max(overlap.three_view(*triplet) for triplet in combinations(ordered, 3))
     two = max(float(overlap.two_view[a, b]) for a, b in combinations(ordered, 2))

@@ -9,9 +9,9 @@ The layout::
     testsets.yaml     optional: bucket -> sets of images, and ``format_version``; else one set of
                       all images
 
-A bucket is a list of sets, or a mapping of group names to lists of sets (for example
-``triplets/0-5``). A set is a list of image names, extensions optional, or a mapping with the list
-under ``images``.
+A bucket is a list of test sets, or a mapping of group names to lists of test sets (for example
+``triplets/0-5``). A test set is a list of image names, extensions optional, or a mapping with the
+list under ``images``.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ FORMAT = 1
 
 @dataclass(frozen=True)
 class EvaluationSet:
-    """Set of images that are reconstructed together."""
+    """Test set: images of a scene that are reconstructed together."""
 
     bucket: str
-    """Bucket of the set."""
+    """Bucket of the test set."""
     index: int
-    """Index of the set in its bucket."""
+    """Index of the test set in its bucket."""
     images: tuple[str, ...]
-    """Names of the images."""
+    """Names of the images in the test set."""
 
     @property
     def name(self) -> str:
-        """Name that is unique in the scene and valid as a folder name."""
+        """Name of the test set, unique in the scene and valid as a folder name."""
         return f"{self.bucket.replace('/', '_')}-{self.index:02d}"
 
 
@@ -58,42 +58,42 @@ class SceneFolder:
     """Scene folder with true poses and test sets."""
 
     path: Path
-    """Folder of the scene."""
+    """Path of the scene folder."""
     truth: Mapping[str, Pose]
-    """True ``cam_from_world`` by image name."""
+    """True poses ``cam_from_world`` by image name."""
     sets: tuple[EvaluationSet, ...]
     """Test sets of all buckets."""
 
     @property
     def name(self) -> str:
-        """Name of the folder."""
+        """Name of the scene, which is the name of its folder."""
         return self.path.resolve().name
 
     @property
     def images(self) -> Path:
-        """Folder of the images."""
+        """Folder of the scene's images."""
         return self.path / "images"
 
     @property
     def intrinsics(self) -> Path:
-        """File or model with the cameras."""
+        """Intrinsics file or COLMAP model with the cameras of the images."""
         file = self.path / "intrinsics.yaml"
         return file if file.is_file() else self.path / "gt"
 
     @property
     def depth(self) -> Path | None:
-        """Folder of the true depth maps, if there is one."""
+        """Folder of the true depth maps, or None without true depth."""
         folder = self.path / "gt_depth"
         return folder if folder.is_dir() else None
 
     def select_sets(self, buckets: Sequence[str] | None) -> list[EvaluationSet]:
-        """Return the sets of some buckets, all by default.
+        """Return the test sets of some buckets, by default of all buckets.
 
         Args:
-            buckets: Names of buckets; ``triplets`` selects all ``triplets/...``.
+            buckets: Names of buckets; The bucket ``triplets`` selects all groups ``triplets/...``.
 
         Raises:
-            InputError: A bucket does not exist.
+            InputError: A bucket does not exist in the scene folder.
         """
         known = dict.fromkeys(item.bucket for item in self.sets)
         selected = list(known) if buckets is None else list(buckets)
@@ -104,14 +104,14 @@ class SceneFolder:
 
 
 def read_scene(path: Path, *, with_sets: bool = True) -> SceneFolder:
-    """Read a scene folder.
+    """Read images, true poses and test sets of a scene folder.
 
     Args:
         path: Scene folder.
-        with_sets: Read ``testsets.yaml``; else return one set of all images.
+        with_sets: Read ``testsets.yaml``; if False, the scene has one test set with all images.
 
     Raises:
-        InputError: Images or true poses are missing, or a set has an image without true pose.
+        InputError: Images or true poses are missing, or a test set has an image without true pose.
     """
     if not (path / "images").is_dir():
         raise InputError(f"{path}: no scene folder; photos must be in images/")
@@ -134,19 +134,20 @@ def read_scene(path: Path, *, with_sets: bool = True) -> SceneFolder:
 
 
 def write_sets(path: Path, buckets: Mapping[str, Sequence[Mapping[str, Any]]], note: str) -> None:
-    """Write ``testsets.yaml`` of a scene folder, with a note as comment in the first line."""
+    """Write ``testsets.yaml`` of a scene folder, with a note as comment in its first line."""
     write_file(path / TESTSETS, f"# {note}\n{write_yaml({VERSION: FORMAT, **buckets})}")
 
 
 def _is_in_bucket(name: str, bucket: str) -> bool:
-    """Return True if a name is the bucket or one of its groups."""
+    """Return True if a name is a bucket or a group of the bucket."""
     return name == bucket or name.startswith(bucket + "/")
 
 
 def _read_sets(file: Path) -> Iterator[tuple[str, int, list[str]]]:
-    """Yield bucket, index of the set in the bucket, and image names."""
+    """Yield bucket, index and image names of each test set in ``testsets.yaml``."""
     try:
-        # The base loader keeps all scalars as text, so that a stem such as 0008 is no number.
+        # The YAML base loader reads all scalars as text, so that an image name such as 0008 is not
+        # a number.
         content = yaml.load(file.read_text(encoding="utf-8"), Loader=yaml.BaseLoader)
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{file} cannot be read: {error}") from error

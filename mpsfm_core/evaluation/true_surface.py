@@ -15,7 +15,7 @@ from mpsfm_core.geometry import camera_center, pixel_centers, unproject
 
 
 def true_depth_file(folder: Path, image: str) -> Path:
-    """Return the file of an image's true depth: the image name with suffix ``.png``."""
+    """Return the path of an image's true depth map, the image name with suffix ``.png``."""
     return folder / PurePosixPath(image).with_suffix(".png")
 
 
@@ -29,14 +29,14 @@ def build_true_surface(
     """Build a point cloud from the true depth maps of images with depth, camera and pose.
 
     Args:
-        folder: Folder of 16-bit PNG files in millimeters.
+        folder: Folder of true depth maps as 16-bit PNG files in millimeters.
         images: Names of the images.
-        cameras: Undistorted cameras of any size by image name.
-        poses: True ``cam_from_world`` by image name.
-        spacing: Side in meters of the cubes that keep one point per map.
+        cameras: Undistorted cameras, at any image size, by image name.
+        poses: True poses ``cam_from_world`` by image name.
+        spacing: Side in meters of the cubes in which each depth map has one point.
 
     Returns:
-        World points (n, 3).
+        Points (n, 3) of the true surface, world frame.
 
     Raises:
         InputError: No image has depth, camera and pose.

@@ -1,6 +1,6 @@
 """Importers that convert scenes of public datasets to scene folders.
 
-The docstring of each module describes the layout of its dataset.
+The docstring of an importer module describes the folder layout of the dataset.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ IMPORTERS: Mapping[str, Callable[[Path], list[Frame]]] = MappingProxyType(
         "scannet": scannet.read_frames,
     }
 )
-"""Name of a dataset -> function that reads the frames of a scene, in the order of their names."""
+"""Dataset name -> function that reads the frames of a scene."""
 
 
 def import_scene(kind: str, source: Path, target: Path, every: int = 1) -> SceneFolder:
@@ -41,11 +41,11 @@ def import_scene(kind: str, source: Path, target: Path, every: int = 1) -> Scene
         kind: Name of the dataset.
         source: Scene as distributed.
         target: Scene folder to write.
-        every: Take every n-th image.
+        every: Step between imported images; n imports every n-th image.
 
     Raises:
-        InputError: The dataset is unknown, the source has another layout, or the target is not
-            empty.
+        InputError: The dataset is unknown, the source does not have its layout, or the target is
+            not empty.
     """
     if kind not in IMPORTERS:
         raise InputError(f"no dataset {kind!r}{did_you_mean(kind, IMPORTERS)}")

@@ -1,4 +1,4 @@
-"""Frames of datasets whose ground truth is a COLMAP model."""
+"""Import of datasets whose ground truth is a COLMAP model."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from mpsfm_core.inputs.models import read_model
 
 
 def model_frames(folder: Path, photo_of: Callable[[str], Path]) -> list[Frame]:
-    """Read the registered images of a model as frames.
+    """Read the registered images of a COLMAP model as frames.
 
-    Cameras are rescaled to the size of the image files.
+    The intrinsics are rescaled to the size of the image files.
 
     Args:
         folder: COLMAP model.
@@ -41,7 +41,7 @@ def model_frames(folder: Path, photo_of: Callable[[str], Path]) -> list[Frame]:
 def _observations(
     model: pycolmap.Reconstruction, image: pycolmap.Image, scale: Float64
 ) -> FrameObservations:
-    """Return the observations of an image, each point once."""
+    """Return the observations of an image, one for each observed 3D point."""
     seen = {int(point.point3D_id): point.xy for point in image.get_observation_points2D()}
     ids: Int64 = np.array(list(seen), dtype=np.int64)
     return FrameObservations(

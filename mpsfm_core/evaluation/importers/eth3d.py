@@ -1,9 +1,9 @@
 """Importer of ETH3D: high-resolution multi-view, undistorted DSLR images.
 
-Reads a scene folder with ``dslr_calibration_undistorted/{cameras,images,points3D}.txt``,
+The source is a scene folder with ``dslr_calibration_undistorted/{cameras,images,points3D}.txt``,
 ``images/dslr_images_undistorted/*.JPG`` and, for depth, ``ground_truth_depth/dslr_images/*.JPG``
-with ``dslr_calibration_jpg/``. Those depth files are no JPEGs: row-major 4-byte floats of the
-original distorted images, infinite where unknown.
+with ``dslr_calibration_jpg/``. The ETH3D depth files contain row-major 4-byte floats of the
+distorted images, infinite where unknown, despite the suffix.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mpsfm_core.inputs.models import read_model
 
 
 def read_frames(source: Path) -> list[Frame]:
-    """Read the frames of a scene, with depth if available."""
+    """Read the frames of an ETH3D scene, with depth if available."""
     calibration = require_path(source / "dslr_calibration_undistorted", "calibration")
     frames = model_frames(calibration, lambda name: source / "images" / name)
     depth, original = source / "ground_truth_depth" / "dslr_images", source / "dslr_calibration_jpg"

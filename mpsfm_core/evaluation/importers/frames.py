@@ -1,4 +1,4 @@
-"""Frames of imported datasets, and their conversion to a scene folder."""
+"""Frames of imported datasets, and conversion of frames to a scene folder."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from mpsfm_core.inputs.image_header import read_header
 PHOTOS = (".jpg", ".jpeg", ".png")
 """Suffixes of image files."""
 _MAX_DEPTH_COLUMNS = 1024
-"""Maximum columns of depth maps that are resampled to another camera."""
+"""Maximum number of columns of a depth map that is resampled to another camera."""
 
 
 @dataclass(frozen=True, eq=False)
 class FrameObservations:
-    """Points that an image observes."""
+    """Observations of 3D points in an image."""
 
     xy: Float64
-    """(p, 2) pixels."""
+    """(p, 2) positions of the observations in COLMAP pixels of the image."""
     ids: Int64
-    """(p,) ids of the 3D points."""
+    """(p,) ids of the observed 3D points."""
     points: Float64
-    """(p, 3) 3D points, world frame."""
+    """(p, 3) coordinates of the observed 3D points, world frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,17 +41,18 @@ class Frame:
     """Image with its true camera, pose and optional depth."""
 
     name: str
-    """Name in the scene folder."""
+    """Name of the image in the scene folder."""
     photo: Path
-    """File of the image."""
+    """File path of the source image."""
     camera: pycolmap.Camera
-    """Camera of the image."""
+    """COLMAP camera of the image."""
     pose: Float64
-    """(3, 4) ``cam_from_world``."""
+    """(3, 4) true pose ``cam_from_world``."""
     depth: Callable[[], Float32] | None = None
-    """Reads the depth map in meters, 0 where unknown, on a grid over the whole image."""
+    """Function that reads the depth map in meters, 0 where unknown, on a grid over the whole
+    image."""
     observations: FrameObservations | None = None
-    """Observed 3D points."""
+    """Observations of 3D points, if the dataset has points."""
 
 
 def write_frames(target: Path, frames: Sequence[Frame]) -> None:
@@ -92,7 +93,7 @@ def photo_size(path: Path) -> tuple[int, int]:
     """Read (width, height) of an image file.
 
     Raises:
-        InputError: The file cannot be read or is no image.
+        InputError: The file cannot be read or is not an image.
     """
     try:
         size = read_header(path.read_bytes()).size
@@ -104,14 +105,14 @@ def photo_size(path: Path) -> tuple[int, int]:
 
 
 def require_path(path: Path, what: str) -> Path:
-    """Return an existing path.
+    """Return a path after checking that it exists.
 
     Args:
         path: File or folder.
-        what: Description for the message.
+        what: Description of the file for the error message.
 
     Raises:
-        InputError: The path does not exist.
+        InputError: The file or folder does not exist.
     """
     if not path.exists():
         raise InputError(f"{what} is missing: {path}")
@@ -140,8 +141,8 @@ def resample_depth(
 
     Args:
         depth: (h, w) depth.
-        depth_camera: Camera of the depth map, may have distortion.
-        camera: Undistorted camera of the result.
+        depth_camera: Camera of the depth map, which may have distortion.
+        camera: Undistorted camera of the resampled depth map.
     """
     width = min(camera.width, _MAX_DEPTH_COLUMNS)
     height = max(1, round(width * camera.height / camera.width))
@@ -163,5 +164,5 @@ def _link(source: Path, target: Path) -> None:
     """Hard-link a file, or copy it if links are impossible."""
     try:
         os.link(source.resolve(), target)
-    except OSError:  # another disk, or a file system without links
+    except OSError:  # The target is on another disk, or the file system has no hard links.
         shutil.copyfile(source, target)

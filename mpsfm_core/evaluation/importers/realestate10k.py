@@ -1,9 +1,9 @@
 """Importer of RealEstate10K.
 
-Reads the text file of a video (``ID.txt``: URL, then for each frame the timestamp, ``fx fy cx cy``
-relative to width and height, two zeros, and the row-major 3 x 4 ``cam_from_world``) and the
-extracted frames, ``TIMESTAMP.png`` or ``.jpg``. The source is the folder of the frames, with the
-text file in it or next to it under the folder's name. Translations have no metric scale.
+The source is a folder of extracted video frames, ``TIMESTAMP.png`` or ``.jpg``. The text file
+``ID.txt`` of the video is in the folder, or next to the folder under the same name. A line of the
+text file has the timestamp, ``fx fy cx cy`` relative to width and height, two zeros, and the
+row-major 3 x 4 ``cam_from_world``. Translations of RealEstate10K have no metric scale.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.importers.frames import PHOTOS, Frame, photo_size, pinhole_camera
 
 _VALUES = 19
-"""Values per line of a frame."""
+"""Number of values in a line of the camera text file."""
 
 
 def read_frames(source: Path) -> list[Frame]:
-    """Read the extracted frames of a video; frames without an image file are skipped."""
+    """Read the extracted frames of a RealEstate10K video; frames without image file are skipped."""
     file = next((f for f in _candidates(source) if f.is_file()), None)
     if file is None:
         raise InputError(f"{source}: no text file with cameras in it or next to it")
@@ -44,7 +44,7 @@ def read_frames(source: Path) -> list[Frame]:
 
 
 def _candidates(source: Path) -> list[Path]:
-    """Return possible text files of the cameras."""
+    """Return the candidate paths of the camera text file of a video."""
     return [
         source / f"{source.name}.txt",
         source.with_suffix(".txt"),

@@ -1,9 +1,9 @@
-"""Importer of ScanNet, as its reader exports a ``.sens`` file.
+"""Importer of ScanNet scenes that ScanNet's SensReader exported from a ``.sens`` file.
 
-Reads ``color/N.jpg``, ``depth/N.png`` (millimeters, 0 unknown), ``pose/N.txt`` (4 x 4
-``world_from_cam``, meters; not finite if tracking was lost), ``intrinsic/intrinsic_color.txt``
-and ``intrinsic_depth.txt`` (4 x 4, the center of the first pixel at (0, 0)). Both cameras are
-assumed to have the same pose, as in their published extrinsics.
+The importer reads ``color/N.jpg``, ``depth/N.png`` (millimeters, 0 unknown), ``pose/N.txt`` (4 x 4
+``world_from_cam``, meters; not finite if tracking was lost), ``intrinsic/intrinsic_color.txt`` and
+``intrinsic_depth.txt`` (4 x 4, the center of the first pixel at (0, 0)). The color and depth camera
+are assumed to have the same pose, as in the published extrinsics.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mpsfm_core.evaluation.prior_quality import read_depth
 
 
 def read_frames(source: Path) -> list[Frame]:
-    """Read the frames with a pose, in temporal order."""
+    """Read the ScanNet frames that have a pose, in temporal order."""
     folder = require_path(source / "color", "folder of photos")
     intrinsic = require_path(source / "intrinsic", "folder of intrinsics")
     frames = []

@@ -1,9 +1,9 @@
 """Importer of 7-Scenes.
 
-Reads a scene (``chess/`` with ``seq-01/``, ...) or one sequence: ``frame-000000.color.png``,
-``.depth.png`` (millimeters, 65535 and 0 unknown) and ``.pose.txt`` (4 x 4 ``world_from_cam``,
-meters). The authors give a focal length of 585 pixels for both cameras and treat depth and
-color as one camera; the actual offset is a few pixels.
+The source is a scene (``chess/`` with ``seq-01/``, ...) or one sequence. A frame has
+``frame-000000.color.png``, ``.depth.png`` (millimeters, 65535 and 0 unknown) and ``.pose.txt`` (4 x
+4 ``world_from_cam``, meters). The authors of 7-Scenes treat depth and color as one camera with a
+focal length of 585 pixels; the actual offset is a few pixels.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.importers.frames import Frame, invert_pose, photo_size, pinhole_camera
 
 _FOCAL_RATIO = 585 / 640
-"""Focal length relative to the image width."""
+"""Focal length of 7-Scenes relative to the image width."""
 _UNKNOWN = 65535
-"""Value of unknown depth."""
+"""Depth image value of pixels without depth."""
 
 
 def read_frames(source: Path) -> list[Frame]:
-    """Read the frames with a pose of all sequences below the source."""
+    """Read the 7-Scenes frames that have a pose, from all sequences below the source."""
     frames = []
     for photo in sorted(source.rglob("frame-*.color.png")):
         stem = photo.name.removesuffix(".color.png")

@@ -1,8 +1,9 @@
 """Importer of the Zip-NeRF scenes of SMERF (Berlin, London, New York, Alameda).
 
-Reads a folder with a COLMAP model in ``sparse/0`` (or ``colmap/sparse/0``) and the images in
-``images`` or the largest available of ``images_2``, ``images_4`` and ``images_8``. Fisheye and
-undistorted versions work. The scenes have no depth, so overlap comes from the points of the model.
+The source is a folder with a COLMAP model in ``sparse/0`` (or ``colmap/sparse/0``) and the images
+in ``images`` or the largest available of ``images_2``, ``images_4`` and ``images_8``. The importer
+supports the fisheye and the undistorted version of a scene. SMERF scenes have no true depth, so the
+points of the COLMAP model determine image overlap.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _PHOTOS = ("images", "images_2", "images_4", "images_8")
 
 
 def read_frames(source: Path) -> list[Frame]:
-    """Read the frames of a scene."""
+    """Read the frames of a SMERF scene."""
     model = next((source / m for m in _MODELS if has_model(source / m)), None)
     photos = next((source / p for p in _PHOTOS if (source / p).is_dir()), None)
     if model is None or photos is None:

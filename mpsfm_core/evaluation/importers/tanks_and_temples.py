@@ -1,10 +1,10 @@
 """Importer of Tanks and Temples.
 
-Reads a folder with the images (in it or in ``images/``) and either a COLMAP model in
-``sparse/0``, whose points give the overlap as in the paper, or the poses of the benchmark in
-``NAME_COLMAP_SfM.log``. The log has, for each image in the order of names, a line of three numbers
-and the 4 x 4 matrix ``world_from_cam``. The log has no intrinsics, so the focal length is a typical
-value of the cameras; a model is more accurate.
+The source is a folder with the images, or with the images in ``images/``. The ground truth is a
+COLMAP model in ``sparse/0``, whose points determine image overlap as in the paper, or the
+trajectory log ``NAME_COLMAP_SfM.log``. The log has a line of three numbers and the 4 x 4 matrix
+``world_from_cam`` for each image in the order of names. The log has no intrinsics, so the importer
+assumes a typical focal length; a COLMAP model is more accurate.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from mpsfm_core.evaluation.importers.frames import (
 from mpsfm_core.evaluation.importers.smerf import has_model
 
 _FOCAL_RATIO = 1165.72 / 1920
-"""Focal length relative to the image width."""
+"""Assumed focal length relative to the image width, for scenes without a COLMAP model."""
 _LINES = 5
-"""Lines of a pose in the log."""
+"""Number of lines of a pose in the trajectory log."""
 
 
 def read_frames(source: Path) -> list[Frame]:
-    """Read the frames of a scene."""
+    """Read the frames of a Tanks and Temples scene."""
     folder = source / "images" if (source / "images").is_dir() else source
     if has_model(source / "sparse" / "0"):
         return model_frames(source / "sparse" / "0", lambda name: folder / name)
@@ -53,7 +53,7 @@ def read_frames(source: Path) -> list[Frame]:
 
 
 def _read_log(path: Path) -> list[Float64]:
-    """Read ``world_from_cam`` (4, 4) of each image."""
+    """Read ``world_from_cam`` (4, 4) of each image from a trajectory log."""
     lines = path.read_text(encoding="utf-8").split("\n")
     lines = [line for line in lines if line.strip()]
     try:
