@@ -64,7 +64,7 @@ def reconstruct(
         poses: COLMAP model or ``transforms.json`` with poses of some or all images;
             ``mapping.known_poses`` chooses whether known poses are fixed or refined.
         overrides: Settings such as ``"runtime.workers=2"``; not allowed with a loaded
-        configuration.
+            configuration.
         registry: Providers to choose from; default: all installed providers.
         fresh: Ignore the checkpoint of an interrupted run, and map from the start.
         database: COLMAP database whose keypoints and matches replace features and matchers. Its

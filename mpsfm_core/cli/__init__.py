@@ -1,7 +1,7 @@
-"""Command line ``mpsfm``: thin commands over the public API.
+"""Command line ``mpsfm``: commands that call the public API.
 
-Each command or command group has a module, and :func:`build_app` adds them all. A command imports
-its dependencies inside its function, so that every command starts fast.
+Each command or command group has a module, and :func:`build_app` adds all of them to the command
+line. A command imports its dependencies inside its function, so that every command starts fast.
 :class:`~mpsfm_core.cli.errors.CommandGroup` turns exceptions into one line on stderr and an exit
 code.
 """
@@ -58,7 +58,7 @@ def build_app() -> typer.Typer:
         callback=_configure_logging,
         no_args_is_help=True,
         add_completion=False,
-        pretty_exceptions_show_locals=False,  # locals include whole images
+        pretty_exceptions_show_locals=False,  # local variables include whole images
     )
     app.command("reconstruct")(reconstruct.reconstruct)
     app.command("demo")(demo.demo)

@@ -1,4 +1,4 @@
-"""Options that several commands share."""
+"""Command-line options shared by several commands."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ViewerName: TypeAlias = Annotated[
 
 
 def config_overrides(overrides: list[str] | None, offline: bool) -> list[str]:
-    """Merge the options ``--set`` and ``--offline`` to configuration overrides."""
+    """Convert the options ``--set`` and ``--offline`` to configuration overrides."""
     return [*(overrides or ()), *(["runtime.offline=true"] if offline else [])]
 
 
@@ -51,10 +51,10 @@ def distance_thresholds(distances: list[float] | None) -> tuple[float, ...]:
 
 
 def parse_overrides(overrides: list[str] | None) -> dict[str, Any]:
-    """Parse the ``--set`` options of a command with settings of its own.
+    """Parse the ``--set`` options of a command without configuration file to a dictionary.
 
     Raises:
-        ConfigError: An option is no assignment.
+        ConfigError: A ``--set`` option is no assignment.
     """
     from mpsfm_core.support.yaml_text import parse_assignment
 

@@ -1,4 +1,4 @@
-"""``mpsfm benchmark``: compare configurations and other mappers on scenes with true poses."""
+"""``mpsfm benchmark``: compare configurations and other mappers with true poses."""
 
 from __future__ import annotations
 
@@ -102,14 +102,14 @@ def benchmark(
 
 
 def _print_record(record: BenchmarkRecord, cached: bool) -> None:
-    """Print a line on stderr for a finished run."""
+    """Print images and time of a finished benchmark run on stderr."""
     images = f"{len(record.estimated)}/{len(record.truth)} images"
     end = "cached" if cached else record.error or f"{record.cpu_seconds:.1f} s"
     typer.echo(f"{record.scene} {record.set_name} {record.label}: {images}, {end}", err=True)
 
 
 def _parse_result(text: str) -> tuple[str, Path]:
-    """Parse name and folder of ``--result``."""
+    """Parse the option ``--result NAME=FOLDER``."""
     import re
 
     from mpsfm_core.data.errors import InputError
@@ -126,7 +126,7 @@ def _parse_result(text: str) -> tuple[str, Path]:
 
 
 def _split_list(text: str) -> tuple[str, ...]:
-    """Split a comma-separated option."""
+    """Split the value of a comma-separated option."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 

@@ -1,4 +1,4 @@
-"""``mpsfm cache``: show and prune the files that runs reuse."""
+"""``mpsfm cache``: show and delete cached provider results, checkpoints and weights."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PARTS = {
     "mapping": "checkpoints of interrupted runs",
     "weights": "downloaded networks",
 }
-"""Subfolder of the cache -> description."""
+"""Description of each subfolder of the cache."""
 
 
 @app.command()
@@ -71,17 +71,17 @@ def prune(
 
 
 def cache_size(folder: Path) -> int:
-    """Return the bytes of all parts of a cache."""
+    """Return the total size of a cache folder in bytes."""
     return sum(size for part in PARTS for _, size, _ in _files(folder / part))
 
 
 def format_size(size: int) -> str:
-    """Format a number of bytes."""
+    """Format a number of bytes in MB or GB."""
     return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.1f} MB"
 
 
 def _files(folder: Path) -> Iterator[tuple[Path, int, float]]:
-    """Yield path, size and time of last use of each file; files that disappear are skipped."""
+    """Yield path, size (bytes) and time of last use of each file in a folder."""
     for path in sorted(folder.rglob("*")):
         with suppress(OSError):
             if path.is_file():
@@ -90,7 +90,7 @@ def _files(folder: Path) -> Iterator[tuple[Path, int, float]]:
 
 
 def _remove_empty(folder: Path) -> None:
-    """Remove empty subfolders."""
+    """Remove the empty subfolders of a folder."""
     for path in sorted(folder.rglob("*"), reverse=True):
         if path.is_dir():
             with suppress(OSError):  # not empty

@@ -1,4 +1,4 @@
-"""``mpsfm calibrate``: fit the uncertainty of a depth or normals provider."""
+"""``mpsfm calibrate``: fit the predicted uncertainty of a depth or normals provider."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 
 _PROVIDER_KEYS = ("options.", "wrap.", "calibration")
-"""Prefixes of settings that belong to the provider."""
+"""Prefixes of ``--set`` keys that are settings of the provider."""
 _GROUND_TRUTH_KEY = "ground_truth."
-"""Prefix of settings that belong to the true maps."""
+"""Prefix of ``--set`` keys that are settings of the true maps."""
 
 
 def calibrate(
@@ -134,10 +134,10 @@ def calibrate(
 def _check_names(
     kind: str, alignments: list[str]
 ) -> tuple[CalibratedKind, tuple[Alignment, ...] | None]:
-    """Check the kind and the alignments.
+    """Check the names of the provider kind and of the alignments.
 
     Raises:
-        InputError: A name is unknown.
+        InputError: The kind or an alignment is unknown.
     """
     from mpsfm_core.calibration.model_selection import Alignment
     from mpsfm_core.data.errors import InputError, did_you_mean
@@ -152,7 +152,7 @@ def _check_names(
 
 
 def _split_overrides(kind: str, overrides: list[str]) -> tuple[list[str], dict[str, Any]]:
-    """Split ``--set`` options into overrides of the configuration and settings of true maps."""
+    """Split ``--set`` options into configuration overrides and settings of the true maps."""
     from mpsfm_core.support.yaml_text import parse_yaml
 
     config_settings, truth_settings = [], {}
@@ -168,7 +168,7 @@ def _split_overrides(kind: str, overrides: list[str]) -> tuple[list[str], dict[s
 
 
 def _print_outcome(result: CalibrationResult) -> None:
-    """Print the fitted values and the cross-validated coverage."""
+    """Print the fitted calibration with intervals, and the cross-validated coverage."""
     report = result.report
     for name, (low, high) in report["intervals_95"].items():
         value = report["calibration"]["after"][name]

@@ -1,4 +1,4 @@
-"""``mpsfm demo``: reconstruct the sample scene and compare with the true poses."""
+"""``mpsfm demo``: reconstruct the sample scene and compare its poses with the true poses."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def demo(
 
 
 def _sample_scene() -> Path:
-    """Return the folder of the sample scene, in the installed package or in a source tree."""
+    """Find the folder of the sample scene in the installed package or in a source tree."""
     import mpsfm_core
 
     package = Path(mpsfm_core.__file__).parent
@@ -59,7 +59,7 @@ def _sample_scene() -> Path:
 
 
 def _compare(estimated: dict[str, Pose], truth: dict[str, Pose], metric: bool) -> None:
-    """Print pose AUC and trajectory errors."""
+    """Print pose AUC and trajectory errors of estimated poses."""
     from mpsfm_core.evaluation import evaluate
 
     report = evaluate(estimated, truth)

@@ -74,7 +74,7 @@ def doctor(
 
 
 def _print_plugins(registry: Registry) -> bool:
-    """Print a line per distribution; returns True if a plugin is broken."""
+    """Print a line per installed plugin package; return True if a plugin is broken."""
     status = registry.status()
     usable = Counter(line.distribution for line in status if line.available)
     versions = {line.distribution: line.version for line in status}
@@ -100,7 +100,7 @@ def _missing_plugins(registry: Registry) -> Iterator[str]:
 
 
 def _better_choices(provision: ProviderResolution) -> Iterator[str]:
-    """Yield the providers that the configuration prefers, with the reasons they are unavailable."""
+    """Yield suggestions to make preferred but unavailable providers available."""
     for choice in provision.choices:
         for name, why in choice.passed_over.items():
             yield f"{choice.block}: {name} would be better: {explain(why).text}"
@@ -109,7 +109,7 @@ def _better_choices(provision: ProviderResolution) -> Iterator[str]:
 
 
 def _gpu() -> str:
-    """Describe the GPUs; the text contains "none" without a usable GPU."""
+    """Describe the GPUs of the machine; the text contains "none" without a usable GPU."""
     if shutil.which("nvidia-smi") is None:
         return "none with CUDA: networks run on the processor"
     query = ["nvidia-smi", "--query-gpu=name,memory.total", "--format=csv,noheader"]
@@ -121,7 +121,7 @@ def _gpu() -> str:
 
 
 def _memory() -> str:
-    """Describe the memory of the machine; empty if unknown."""
+    """Describe the memory of the machine as text; empty if unknown."""
     try:
         text = Path("/proc/meminfo").read_text(encoding="ascii")
     except OSError:

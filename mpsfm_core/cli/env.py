@@ -56,7 +56,7 @@ def remove(name: Name) -> None:
 
 
 def _print_providers(name: str, providers: list[dict[str, str]]) -> None:
-    """Print a line per provider of an environment."""
+    """Print a line per provider of a Python environment."""
     for entry in providers:
         fault = f", not usable: {entry['fault']}" if entry["fault"] else ""
         typer.echo(f"  {entry['kind']}: {entry['name']}@{name} ({entry['distribution']}){fault}")

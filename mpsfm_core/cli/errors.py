@@ -1,7 +1,7 @@
-"""Error handling of commands: a line on stderr and an exit code; ``--debug`` for a traceback.
+"""Error handling of commands: print one line on stderr and set the exit code.
 
-Exit codes: 0 success, 1 internal error or fault of the machine, 2 wrong input or usage, 3 no
-reconstruction, 130 interrupted.
+The option ``--debug`` prints a traceback instead. Exit codes: 0 success, 1 internal error or
+machine failure, 2 wrong input or usage, 3 no reconstruction, 130 interrupted.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from typer.core import TyperGroup
 from mpsfm_core.data.errors import MpsfmError
 
 INTERRUPTED = 130
-"""Exit code of an interrupted command."""
+"""Exit code of a command that Ctrl-C or SIGTERM interrupted."""
 
 
 class CommandGroup(TyperGroup):
     """Root command that turns exceptions of commands into messages and exit codes."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the selected command."""
+        """Run the selected command; convert exceptions to a message and an exit code."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -35,9 +35,9 @@ class CommandGroup(TyperGroup):
 
 
 def handle_sigterm() -> None:
-    """Let SIGTERM end a command like Ctrl-C.
+    """Make SIGTERM end a command like Ctrl-C.
 
-    Call this function after the import of pycolmap, which installs a handler of its own.
+    Call this function after the import of pycolmap, because pycolmap installs a signal handler.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
@@ -49,7 +49,7 @@ def fail(message: str, exit_code: int) -> NoReturn:
 
 
 def _explain(error: Exception) -> tuple[str, int]:
-    """Return the message and exit code of an error."""
+    """Convert an exception to a message and an exit code."""
     if isinstance(error, MpsfmError):
         return str(error), error.exit_code
     if isinstance(error, OSError):  # for example a full disk or missing permissions
@@ -59,7 +59,7 @@ def _explain(error: Exception) -> tuple[str, int]:
 
 
 def _is_control_flow(error: Exception) -> bool:
-    """Return True for exits, usage errors and closed pipes, which typer handles itself."""
+    """Check for exits, usage errors and closed pipes, which typer handles."""
     if isinstance(error, OSError):
         return error.errno == errno.EPIPE
     if isinstance(error, (typer.Exit, typer.Abort)):

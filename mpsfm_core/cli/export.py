@@ -1,4 +1,4 @@
-"""``mpsfm export``: write results in the formats of other programs."""
+"""``mpsfm export``: convert results to the formats of other programs."""
 
 from __future__ import annotations
 

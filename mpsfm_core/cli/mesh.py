@@ -1,4 +1,4 @@
-"""``mpsfm mesh``: build a mesh from the depth maps of a result."""
+"""``mpsfm mesh``: build a mesh from the depth maps of a result folder."""
 
 from __future__ import annotations
 

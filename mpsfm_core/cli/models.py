@@ -35,7 +35,7 @@ FetchTargets: TypeAlias = Annotated[
     ),
 ]
 _RESTRICTED = re.compile(r"\bNC\b|non-?commercial|research", re.IGNORECASE)
-"""Pattern of licenses that forbid commercial use."""
+"""Regular expression for names of licenses that forbid commercial use."""
 
 CacheDir: TypeAlias = Annotated[
     Path | None,
@@ -206,14 +206,14 @@ def path(targets: Targets, cache: CacheDir = None) -> None:
 
 
 def _default_weights() -> Iterator[tuple[str, WeightsFile]]:
-    """Yield kind and name of each available provider with each of its default weights files."""
+    """Yield (kind/name of provider, weights file) for all default weights files."""
     from mpsfm_core.data.errors import InputError
     from mpsfm_core.providers.registry import Registry
 
     registry = Registry.discover()
     for status in registry.status():
         if status.available and status.kind != "plugin":
-            with suppress(InputError):  # no default: the user names the file
+            with suppress(InputError):  # the provider has no default weights
                 for file in registry.weights(status.kind, status.name):
                     yield f"{status.kind}/{status.name}", file
 
@@ -242,7 +242,7 @@ def _select_files(targets: list[str]) -> list[WeightsFile]:
 
 
 def _resolve_targets(targets: list[str], overrides: list[str]) -> list[tuple[str, WeightsFile]]:
-    """Resolve configurations, providers and URIs to unique files with the name of a provider."""
+    """Resolve configurations, providers and URIs to unique (provider name, weights file)."""
     from mpsfm_core.config import load_config, shipped_configs
     from mpsfm_core.pipeline.provider_resolution import preview_providers
     from mpsfm_core.providers.registry import Registry
@@ -291,7 +291,7 @@ def _print_downloads(
 
 
 def _require_acceptance(restricted: tuple[str, str], accepted: list[str]) -> None:
-    """Prompt for acceptance of a license that forbids commercial use.
+    """Prompt the user to accept a license that forbids commercial use.
 
     Raises:
         InputError: The user does not accept the license.
@@ -314,7 +314,7 @@ def _is_uri(target: str) -> bool:
 
 
 def _state(uri: str, path: Path | None) -> str:
-    """Describe the local state of a weights file."""
+    """Describe whether a weights file is local or must be downloaded."""
     if path:
         return "local"
     return "to be downloaded" if "://" in uri else "its package is not installed"

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from mpsfm_core.testing import CheckResult
 
 _CHECKING = "MPSFM_CHECKING"
-"""Environment variable of the process that runs the checks."""
+"""Environment variable that marks the subprocess of ``mpsfm plugins check``."""
 
 app = typer.Typer(no_args_is_help=True, help="Installed plugins and their providers.")
 
@@ -127,7 +127,7 @@ def new(
 
 
 def _check_in_subprocess(name: str, arguments: list[str]) -> int:
-    """Run the checks in a subprocess, which survives crashes; returns the exit code."""
+    """Run the contract checks in a subprocess, which may crash; return its exit code."""
     command = [sys.executable, "-m", "mpsfm_core"]
     environment = {**subprocess_environment(), _CHECKING: "1"}
     with tempfile.TemporaryFile("w+") as errors:
@@ -153,7 +153,7 @@ def _check_in_subprocess(name: str, arguments: list[str]) -> int:
 
 
 def _print_result(result: CheckResult) -> None:
-    """Print the line of a finished check."""
+    """Print status, provider, name and time of a finished contract check."""
     around = f" around {result.around}" if result.around else ""
     line = f"{result.status:5} {result.provider}{around}: {result.id}, {result.seconds:.2f} s"
     typer.echo(f"{line}: {result.message}" if result.message else line)

@@ -1,4 +1,4 @@
-"""Progress bars and lines: plugins that listen to the events of a run."""
+"""Progress bars and progress lines, implemented as hooks for the events of a run."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mpsfm_core.providers.registry import Registry
 
 @contextmanager
 def show_progress(registry: Registry, quiet: bool) -> Iterator[None]:
-    """Show progress on stderr while the block runs: bars on a terminal, else a line per stage."""
+    """Show progress on stderr inside a block: bars on a terminal, else a line per stage."""
     if quiet:
         yield
         return
@@ -58,19 +58,19 @@ class ProgressBars:
 
     @hookimpl
     def mpsfm_notice(self, text: str) -> None:
-        """Print a message above the bars."""
+        """Print a message above the progress bars."""
         self._progress.console.print(text, markup=False)
 
     @hookimpl
     def mpsfm_stage_started(self, stage: str, total: int | None) -> None:
-        """Add the bar of a stage."""
+        """Add the progress bar of a stage."""
         self._tasks[stage] = self._progress.add_task(stage, total=total)
         self._remaining.start_stage(stage, total)
         self._update_run()
 
     @hookimpl
     def mpsfm_stage_progress(self, stage: str, done: int, total: int) -> None:
-        """Advance the bar of a stage."""
+        """Advance the progress bar of a stage."""
         if stage in self._tasks:
             self._progress.update(self._tasks[stage], completed=done, total=total)
         self._remaining.update_stage(stage, done, total)
@@ -78,7 +78,7 @@ class ProgressBars:
 
     @hookimpl
     def mpsfm_stage_finished(self, stage: str, seconds: float) -> None:
-        """Fill the bar of a stage."""
+        """Complete the progress bar of a stage."""
         self._remaining.finish_stage(stage)
         self._update_run()
         task = self._tasks.pop(stage, None)
@@ -93,28 +93,28 @@ class ProgressBars:
         self.mpsfm_stage_progress("mapping", registered, total)
 
     def finish(self) -> None:
-        """Fill the bar of the whole run."""
+        """Complete the progress bar of the whole run."""
         description = " - ".join(("run", *filter(None, (self._registered,))))
         self._progress.update(self._run, description=description, completed=1, total=1)
 
     def _update_run(self) -> None:
-        """Update the description of the whole run."""
+        """Update remaining time and registered images at the bar of the whole run."""
         parts = (format_remaining_time(self._remaining.seconds()), self._registered)
         self._progress.update(self._run, description=" - ".join(("run", *filter(None, parts))))
 
 
 class ProgressLines:
-    """Progress as one line per finished stage, for logs."""
+    """Progress output for log files: one line per finished stage."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
 
     @hookimpl
     def mpsfm_notice(self, text: str) -> None:
-        """Print a message."""
+        """Print a message of the run."""
         self._console.print(text, markup=False, soft_wrap=True)
 
     @hookimpl
     def mpsfm_stage_finished(self, stage: str, seconds: float) -> None:
-        """Print the duration of a stage."""
+        """Print the duration of a finished stage."""
         self._console.print(f"{stage}: {seconds:.1f} s", markup=False)

@@ -101,13 +101,13 @@ def run(
     viewer: str | None = None,
     **arguments: Any,
 ) -> ReconstructionResult:
-    """Reconstruct with progress bars and print a summary.
+    """Run a reconstruction with progress bars, and print a summary.
 
     Args:
         images: Folder of images, or a video.
         output: Output folder.
         config: Name or file of the configuration.
-        quiet: Print neither progress nor summary.
+        quiet: If true, print neither progress nor summary.
         viewer: Name of a viewer that shows the run.
         arguments: Further arguments of :func:`mpsfm_core.pipeline.run.reconstruct`.
     """
@@ -145,7 +145,7 @@ def _print_failure(summary: Mapping[str, Any], output: Path) -> None:
 
 
 def _print_outcome(result: ReconstructionResult, output: Path) -> None:
-    """Print the verdict, weak and missing photos, and the files to open."""
+    """Print the verdict, weak and missing photos, and the files of a successful run."""
     from mpsfm_core.report.findings import findings, weakest
     from mpsfm_core.report.verdict import judge
 
@@ -184,7 +184,7 @@ _YELLOW = ("partial", "doubtful", "warning", "missing")
 
 
 def _row(label: str, text: str) -> None:
-    """Print a line with a colored label."""
+    """Print a line of the summary with a colored label."""
     colors = {"good": "green", **dict.fromkeys(_YELLOW, "yellow")}
     typer.echo(typer.style(f"{label:<9}", fg=colors.get(label), bold=True) + text)
 
@@ -200,7 +200,7 @@ def _unit(metric: dict[str, Any] | None) -> str:
 
 
 def _place(georeference: Mapping[str, Any]) -> str:
-    """Describe the summary's ``georeference``, or why it is missing."""
+    """Describe the GPS alignment in the summary, or why the model is not aligned."""
     if "why_not" in georeference:
         return f"not georeferenced: {explain_gps(georeference['why_not']).text}"
     origin = georeference["origin"]
@@ -212,7 +212,7 @@ def _place(georeference: Mapping[str, Any]) -> str:
 
 
 def _refined_focal_lengths(details: Collection[Mapping[str, Any]]) -> str:
-    """Describe the refined focal lengths from the summary's image details; empty if none."""
+    """Describe the refined focal lengths in the summary; empty if none is refined."""
     changes = {
         (image["focal_length_px"], image["refined_focal_length_px"], image["focal_length_from"])
         for image in details

@@ -1,4 +1,4 @@
-"""Estimate of the remaining time of a run from the speed of its stages."""
+"""Estimation of the remaining time of a run from the speed of its stages."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from mpsfm_core.support.files import write_file
 from mpsfm_core.support.format_versions import VERSION, check_version
 
 TIMINGS = "timings.json"
-"""File of the cache with the speeds of earlier runs."""
+"""File in the cache folder with the stage speeds of earlier runs."""
 FORMAT = 1
-"""Format version of ``timings.json``."""
+"""Version number of the format of ``timings.json``."""
 _DEFAULT_SECONDS = {
     "features": 0.3,
     "matching": 0.5,
@@ -29,21 +29,21 @@ _DEFAULT_SECONDS = {
     "results": 0.3,
     "report": 0.1,
 }
-"""Stages in order, with seconds per image or pair on two cores with the default configuration.
+"""Stages in order, with seconds per image or pair (two cores, default configuration).
 
-Speeds of earlier runs on the same machine replace these values."""
+Stage speeds of earlier runs on the same machine replace the default values."""
 _PAIRWISE = {"matching", "verification", "adjustment"}
-"""Stages whose unit is a pair of images."""
+"""Stages whose work is counted in image pairs instead of images."""
 _FULL_WEIGHT_RATIO = 0.2
-"""Ratio of a stage after which only its own speed counts [ours]."""
+"""Completed ratio of a stage above which only its measured speed is used [ours]."""
 
 
 class RemainingTimeEstimator:
-    """Estimator of the remaining time, fed by the events of a run.
+    """Estimator of the remaining time of a run, updated by progress events.
 
     Args:
-        cache_dir: Cache of the run, which stores the speeds for the next run.
-        clock: Returns the time in seconds.
+        cache_dir: Cache folder, in which stage speeds are stored for the next run.
+        clock: Function that returns the time in seconds.
     """
 
     def __init__(
@@ -57,26 +57,26 @@ class RemainingTimeEstimator:
         self._ended: dict[str, float] = {}
 
     def start_stage(self, stage: str, total: int | None) -> None:
-        """Record the start of a stage and its number of units."""
+        """Record the start of a stage and its number of images or pairs."""
         if stage in _DEFAULT_SECONDS:
             if stage == "features" and total:
                 self._images = total
             self._running[stage] = (self._clock(), 0, total or self._num_units(stage))
 
     def update_stage(self, stage: str, done: int, total: int) -> None:
-        """Record the finished units of a stage."""
+        """Record the number of finished images or pairs of a stage."""
         if stage in self._running:
             self._running[stage] = (self._running[stage][0], done, total)
 
     def finish_stage(self, stage: str) -> None:
-        """Record the end of a stage and its speed, unless the stage had no units."""
+        """Record the end and the speed of a stage."""
         if stage in self._running:
             start, _, total = self._running.pop(stage)
             if total:
                 self._ended[stage] = (self._clock() - start) / total
 
     def seconds(self) -> float | None:
-        """Estimate the seconds until the end of the run; None before the number of images."""
+        """Estimate the seconds until the end of the run; None before features are extracted."""
         if not self._images:
             return None
         stages = list(_DEFAULT_SECONDS)
@@ -87,7 +87,7 @@ class RemainingTimeEstimator:
         )
 
     def save(self) -> None:
-        """Store the speeds for the next run; a cache that is not writable is ignored."""
+        """Store the stage speeds for the next run, if the cache folder is writable."""
         speeds = {stage: round(seconds, 6) for stage, seconds in self._ended.items()}
         timings = {**_read_timings(self._file), **speeds}
         with suppress(OSError):
@@ -109,7 +109,7 @@ class RemainingTimeEstimator:
 
 
 def format_remaining_time(seconds: float | None) -> str:
-    """Format seconds as ``about 3 min left``; empty for None."""
+    """Format seconds as text, for example ``about 3 min left``; empty for None."""
     if seconds is None:
         return ""
     if seconds < 60:
@@ -120,7 +120,7 @@ def format_remaining_time(seconds: float | None) -> str:
 
 
 def _read_timings(file: Path) -> dict[str, float]:
-    """Read the speeds of earlier runs; empty if the file is missing or damaged."""
+    """Read the stage speeds of earlier runs; empty if the file is missing or damaged."""
     try:
         timings = json.loads(file.read_text(encoding="utf-8"))
         check_version(timings, FORMAT, file)

@@ -15,7 +15,7 @@ def report(
 ) -> None:
     """Write DIR/report.html again; every run writes the page once.
 
-    Reads DIR only. The page opens in any browser without a network.
+    The command reads DIR only. The page opens in any browser without a network.
     """
     from mpsfm_core.report.page import write_report
 

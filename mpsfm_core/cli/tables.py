@@ -1,4 +1,4 @@
-"""Tables for the terminal."""
+"""Tables on the terminal."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from rich.table import Table
 from rich.text import Text
 
 _PIPE_WIDTH = 2000
-"""Columns if the output is no terminal; wide enough that grep sees whole lines."""
+"""Width in characters if the output is no terminal, so that lines are not wrapped."""
 
 
 def print_table(header: Sequence[str], rows: Iterable[Sequence[str | Text]]) -> None:
-    """Print rows under a header; texts are never interpreted as markup."""
+    """Print a table with header; texts are never interpreted as markup of rich."""
     console = Console(highlight=False)
     if not console.is_terminal:
         console.width = _PIPE_WIDTH

@@ -1,4 +1,4 @@
-"""``mpsfm view``: show results and COLMAP models in a viewer plugin."""
+"""``mpsfm view``: show results or COLMAP models with a viewer plugin."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def view(
 
 
 def open_viewer(registry: Registry, name: str, output: Path, pictures: Pictures) -> Any:
-    """Open a viewer by name.
+    """Open the viewer plugin of the given name.
 
     Raises:
         InputError: No installed plugin provides the viewer, or the viewer fails to open.
@@ -59,9 +59,9 @@ def open_viewer(registry: Registry, name: str, output: Path, pictures: Pictures)
 
 @contextmanager
 def show_run(registry: Registry, name: str | None, photos: Path, output: Path) -> Iterator[None]:
-    """Show the run of the block in a viewer; without a name, show nothing.
+    """Show the run inside the ``with`` block in a viewer; do nothing without a name.
 
-    After a successful run the viewer stays open until Ctrl-C.
+    After a successful run, the viewer stays open until Ctrl-C.
     """
     if name is None:
         yield

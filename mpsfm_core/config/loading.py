@@ -68,7 +68,7 @@ def load_config(
 
     Args:
         name_or_path: Name of a shipped configuration, or a YAML file (a slash, .yaml or .yml marks
-        a file).
+            a file).
         overrides: Texts ``a.b=value`` with a YAML value, applied last; list entries by index.
         registry: Providers to check names and options against; default: ``Registry.discover()``.
         complete: If false, required provider options may be missing (null in the result).
@@ -78,7 +78,7 @@ def load_config(
 
     Raises:
         ConfigError: a setting is wrong. The message has file, line, YAML path and, for unknown
-        keys, the nearest valid key.
+            keys, the nearest valid key.
     """
     layers = _read_chain(_find_file(str(name_or_path), Path()))
     # ``--set X.use=...`` drops options and fast pass, so it precedes overrides that set them.
@@ -145,7 +145,9 @@ def _read_chain(path: Path, children: tuple[Path, ...] = ()) -> list[_Layer]:
     path = path.resolve()
     chain = (*children, path)
     if path in children:
-        raise ConfigError("extends goes in a circle: " + " -> ".join(map(str, chain)))
+        raise ConfigError(
+            "extends: the files extend each other in a circle: " + " -> ".join(map(str, chain))
+        )
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
@@ -183,8 +185,8 @@ def _merge_all(layers: Sequence[_Layer]) -> tuple[dict[str, Any], list[str]]:
             if named and has_fast_pass and not layer.shipped and "fast_pass" not in layer.data:
                 place = layer.locate((named[0], "use"))
                 warnings.append(
-                    f"{place}: naming {' and '.join(named)} switches the fast pass off, so all "
-                    "pairs are matched with it; set fast_pass to keep it"
+                    f"{place}: naming {' and '.join(named)} disables the fast pass, so the named "
+                    "providers process all images and pairs; set fast_pass to use a fast pass"
                 )
             merged = _merge(merged, layer.data)
         except IndexError as error:
@@ -341,7 +343,7 @@ def _missing_blocks(config: Config) -> list[SettingProblem]:
     problems = []
     if config.fast_pass is not None and config.depth.use == FROM_MATCHER:
         problems.append(
-            SettingProblem(("fast_pass",), "gives no depth, as depth.use: matcher needs")
+            SettingProblem(("fast_pass",), "predicts no depth, which depth.use: matcher requires")
         )
     if config.depth.use == FROM_MULTIVIEW and config.multiview is None:
         problems.append(SettingProblem(("multiview",), "is needed by depth.use: multiview"))

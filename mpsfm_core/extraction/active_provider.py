@@ -110,7 +110,7 @@ class ActiveProvider:
             del self._local.provider
             raise ProviderRunError(
                 f"provider {self.spec.name!r}: no answer within {timeout_s:g} s; raise "
-                f"runtime.timeout_s if it is that slow"
+                f"runtime.timeout_s for a slow provider"
             ) from error
         seconds = time.perf_counter() - started
         with self._lock:

@@ -103,7 +103,7 @@ class MappingCheckpoints:
             return None
         if header.get("code") != code_key():
             self.unreadable(
-                f"it was written by other code ({header.get('version')}, format or libraries)"
+                f"it was written by other code (version {header.get('version')} or other libraries)"
             )
             return None
         placed = f"{header['registered']} of {self._total} images registered in the last component"

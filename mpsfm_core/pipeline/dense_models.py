@@ -71,7 +71,9 @@ def _densify_model(
     colmap, poses = read_model(model, images), read_poses(model, images)
     matched = match_names(find_images(images), poses)
     if len(matched) < 2:
-        raise InputError(f"{images}: has {len(matched)} of the photos of {model}, two are needed")
+        raise InputError(
+            f"{images}: contains {len(matched)} of the photos of {model}, two are needed"
+        )
     photos = load_images(images, model=model, names=list(matched))
     points = {str(image.name): _point_depths(colmap, image) for image in colmap.images.values()}
     depths, poses_use_depth = [], True
@@ -86,7 +88,7 @@ def _densify_model(
         photos, [poses[matched[photo.name]] for photo in photos], depths
     )
     if not posed.images:
-        raise InputError(f"{model}: has no points, which the depth range of the surfaces needs")
+        raise InputError(f"{model}: has no points, from which the depth range is computed")
     view_of = _view_of(photos)
     disk = DiskArrays(cache_folder())
     dense, report = densify(

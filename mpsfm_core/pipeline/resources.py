@@ -167,14 +167,14 @@ def find_shortages(estimate: ResourceEstimate, cache: Path, output: Path | None)
     total_mb, free_mb = measure_memory()
     warnings = []
     need = f"this run takes about {estimate.memory_mb:.0f} MB of memory"
-    remedy = "set inputs.max_image_size or dense.max_size lower, use fewer photos"
+    remedy = "reduce inputs.max_image_size or dense.max_size, use fewer photos"
     if estimate.memory_mb > TOLERANCE * total_mb:
         raise InputError(
-            f"{need} and {total_mb:.0f} MB are there: {remedy}, "
+            f"{need}, but the machine or container has {total_mb:.0f} MB: {remedy}, "
             f"or set runtime.check_resources=false"
         )
     if estimate.memory_mb > free_mb:
-        warnings.append(f"{need} and {free_mb:.0f} MB are free: it may fail; {remedy}")
+        warnings.append(f"{need}, but {free_mb:.0f} MB are free, so the run may fail: {remedy}")
     folders = {"the cache": (cache, estimate.cache_mb)}
     if output is not None:
         folders["the results"] = (output, estimate.output_mb)
@@ -185,7 +185,7 @@ def find_shortages(estimate: ResourceEstimate, cache: Path, output: Path | None)
             raise InputError(f"{text}: free disk space, or set runtime.check_resources=false")
         on_same_disk = (mb for path, mb in folders.values() if _same_disk(path, folder))
         if sum(on_same_disk) > free_mb:
-            warnings.append(f"{text}: it may fail")
+            warnings.append(f"{text}: the run may fail")
     return warnings
 
 

@@ -97,7 +97,9 @@ def reconstruct(
     if not isinstance(config, Config):
         config = load_config(config, overrides, registry)
     elif overrides:
-        raise TypeError("overrides need a configuration's name or file, this one is loaded already")
+        raise TypeError(
+            "overrides require the name or file of a configuration, not a loaded configuration"
+        )
     if database is not None and hloc is not None:
         raise TypeError("give either database or hloc, not both")
     matches = (database,) if database is not None else hloc or ()
@@ -291,8 +293,8 @@ class _Run:
         matchers = (config.matcher, config.dense_matcher)
         names = " and ".join(matcher.use for matcher in matchers if matcher is not None)
         self._stages.notice(
-            f"the fast pass does not constrain {len(unconstrained)} of {len(images)} images: "
-            f"{names} matches them"
+            f"{len(unconstrained)} of {len(images)} images have too few points after the fast "
+            f"pass: {names} matches these images again"
         )
         with self._stages.stage("extraction"):
             extraction = extend_matches(
@@ -408,7 +410,7 @@ class _Run:
             try:
                 write_report(self._output)
             except Exception as error:
-                _log.warning("no report was written, all results were: %s", error)
+                _log.warning("report.html cannot be written, all other results are: %s", error)
                 _log.debug("the report", exc_info=True)
 
     def _complete_summary(self, summary: dict[str, Any]) -> None:
@@ -467,7 +469,7 @@ class _Run:
                 workers = resources.reduce_workers(estimate, thread_limit(), free_mb)
                 self._limit_workers(workers)
                 self._estimate = estimate(workers)
-        self._stages.notice(f"takes about {self._estimate}")
+        self._stages.notice(f"the run takes about {self._estimate}")
         if config.runtime.check_resources:
             cache = cache_folder(config.runtime.cache_dir)
             for text in resources.find_shortages(self._estimate, cache, self._output):

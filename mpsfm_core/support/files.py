@@ -180,7 +180,7 @@ def _read_plan(scratch: Path) -> tuple[list[str], list[str]]:
             raise ValueError("contains a symbolic link")
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise InputError(
-            f"{path}: not written by mpsfm ({error}); remove {scratch} if you know where it is from"
+            f"{path}: not written by mpsfm ({error}); remove {scratch} after a check"
         ) from error
     return entries, new
 
@@ -191,7 +191,7 @@ def _clear_up(output: Path) -> None:
         if scratch.is_symlink() or not scratch.is_dir():
             continue  # not a scratch folder
         if (scratch / _READY).is_file() and (scratch / "new").is_dir():
-            _log.warning("%s: finishing the results of a killed run", output)
+            _log.warning("%s: completing the results of a killed run", output)
             _exchange(output, scratch)
         shutil.rmtree(scratch)
 
@@ -216,7 +216,7 @@ def _lock(folder: Path) -> Iterator[bool]:
             if error.errno not in _NO_LOCKS:
                 if isinstance(error, BlockingIOError):
                     raise InputError(
-                        f"{folder}: another run is writing its results there; wait for its end or "
+                        f"{folder}: another run writes to this folder; wait for its end or "
                         "choose another output folder"
                     ) from error
                 raise

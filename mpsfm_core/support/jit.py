@@ -98,6 +98,6 @@ def _choose_cache_folder() -> None:
 @cache
 def _warn_without_cache() -> None:
     _log.warning(
-        "compiled code cannot be kept, and every run compiles it again: set MPSFM_CACHE to a "
-        "writable folder"
+        "compiled kernels cannot be stored, so every run compiles them again: set MPSFM_CACHE to "
+        "a writable folder"
     )

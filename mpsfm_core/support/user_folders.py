@@ -44,7 +44,7 @@ def user_data_folder() -> Path:
 def _temporary_folder() -> Path:
     folder = Path(tempfile.gettempdir()) / f"mpsfm-{os.getuid() if hasattr(os, 'getuid') else 0}"
     _log.warning(
-        "this account has no home folder: caches go to %s; set %s or HOME to keep them elsewhere",
+        "this account has no home folder: caches are stored in %s; set %s or HOME to change it",
         folder,
         CACHE_VARIABLE,
     )

@@ -138,8 +138,8 @@ class TestMerging:
     @pytest.mark.parametrize(
         ("text", "overrides", "named"),
         [
-            ("matcher: {use: lighterglue}", (), "run.yaml:2: naming matcher switches the fast"),
-            ("", ("features.use=xfeat",), "--set features.use=xfeat: naming features switches"),
+            ("matcher: {use: lighterglue}", (), "run.yaml:2: naming matcher disables the fast"),
+            ("", ("features.use=xfeat",), "--set features.use=xfeat: naming features disables"),
             ("depth: {use: files, options: {directory: maps}}", (), None),
             ("fast_pass: null\nmatcher: {use: lighterglue}", (), None),
             ("matcher: {use: lighterglue}", (f"fast_pass={QUICK}",), None),
@@ -243,7 +243,7 @@ class TestErrors:
             ),
             (
                 "fast_pass: {}\ndepth: {use: matcher}\n",
-                ": fast_pass: gives no depth, as depth.use: mat",
+                ": fast_pass: predicts no depth, which depth.use: mat",
             ),
             (
                 "features: {use: sift}\nmatcher: {use: lighterglue}\n",

@@ -77,8 +77,7 @@ class AdjustedKeypoints(NamedTuple):
     keypoints: Float64
     """(n, 2) adjusted keypoints, pixels."""
     measured: Bool
-    """(n,) true for keypoints moved by patch alignments; the positions of the others are
-    unchanged."""
+    """(n,) true for keypoints moved by patch alignment; other keypoints are unchanged."""
 
 
 class PairSide(NamedTuple):
@@ -266,7 +265,7 @@ def adjust_keypoints(
         pairs: Pairs that were aligned.
         aligned: Alignment of each pair.
         max_shift_std: Maximum shift in keypoint standard deviations; keypoints with larger shifts
-        are not moved.
+            are not moved.
     """
     counts = [len(xy) for xy in keypoints]
     std = np.repeat(np.asarray(std_px, dtype=np.float64), counts)

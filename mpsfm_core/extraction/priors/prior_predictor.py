@@ -25,7 +25,7 @@ class PriorPredictor:
         context: Views, options and progress of the run.
         matcher: Matcher that predicts depth, for ``depth.use: matcher``.
         candidates: Candidate matches, from which the pair with the best depth of each image is
-        chosen.
+            chosen.
         groups: Predictions of the multi-view network, for ``depth.use: multiview``.
     """
 
