@@ -1,1 +1,1 @@
-"""Fitting the uncertainty of a prior, and the report on it."""
+"""Calibration of the uncertainty of depth and normal priors, with a report."""

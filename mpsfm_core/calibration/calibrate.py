@@ -1,8 +1,9 @@
 """Calibration of a provider on a folder of images.
 
-The truth are true maps, the points of a COLMAP model, or a reconstruction of the images.
+The ground truth is a folder of true maps, the points of a COLMAP model, or a reconstruction of the
+images.
 
-The calibration model itself is in :mod:`mpsfm_core.providers.uncertainty.calibration`.
+:mod:`mpsfm_core.providers.uncertainty.calibration` defines the calibration model.
 """
 
 from __future__ import annotations
@@ -56,22 +57,22 @@ _METRICS = ("coverage", "coverage_without_scaling", "z_mad", "nll", "nll_heavy",
 
 @dataclass(frozen=True)
 class CalibrationImages:
-    """Images to calibrate on, as in :func:`mpsfm_core.reconstruct`."""
+    """Images with ground truth, with the parameters of :func:`mpsfm_core.reconstruct`."""
 
     folder: Path
     """Folder of the images."""
     intrinsics: Path | None = None
-    """File or model with the cameras."""
+    """Intrinsics file or COLMAP model with the cameras of the images."""
     image_list: Path | None = None
     """File with the names of the images to use."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """Result of a calibration."""
+    """Calibration file and report of a calibration."""
 
     file: CalibrationFile
-    """Calibration with provenance."""
+    """Fitted calibration with its provenance."""
     report: dict[str, Any]
     """All values of the report as plain data."""
 
@@ -90,20 +91,20 @@ def calibrate(
     """Calibrate the depth or normals provider of a configuration.
 
     Args:
-        photos: Images to calibrate on.
-        config: Configuration; its ``depth`` or ``normals`` provider is calibrated.
-        kind: Kind of the provider.
-        ground_truth: Options of the provider ``files`` for the true maps.
-        model: COLMAP model whose points are true depth. Without maps and model, the images are
+        photos: Images on which the provider is calibrated.
+        config: Configuration whose ``depth`` or ``normals`` provider is calibrated.
+        kind: Kind of the provider, depth or normals.
+        ground_truth: Options of the provider ``files``, which reads the true maps.
+        model: COLMAP model whose points are true depth. Without true maps and model, the images are
             reconstructed repeatedly until the std converges.
-        alignments: Candidate alignments of depth; by default the scale for metric networks and all
-            for others.
-        options: Options of the fit.
+        alignments: Candidate alignments of depth; by default only the scale for metric networks,
+            and all alignments for non-metric networks.
+        options: Options of the calibration study.
         registry: Registry of plugins; by default all installed plugins.
 
     Raises:
-        InputError: An argument is wrong, or the data do not suffice for a fit.
-        ReconstructionError: Self-calibration without a reconstruction.
+        InputError: An argument is wrong, or there are too few samples for a fit.
+        ReconstructionError: Self-calibration cannot reconstruct the images.
     """
     if ground_truth is not None and model is not None:
         raise InputError("give true maps or a model for the calibration, not both")
@@ -128,21 +129,22 @@ def compare_prior(
     options: StudyOptions | None = None,
     registry: Registry | None = None,
 ) -> CalibrationData:
-    """Compare a prior with true maps or the points of a model.
+    """Compare a prior with true maps or with the points of a COLMAP model.
 
-    The result is for :func:`~mpsfm_core.calibration.cross_validation.evaluate_calibrations`.
+    :func:`~mpsfm_core.calibration.cross_validation.evaluate_calibrations` evaluates the result.
 
     Args:
-        photos: Images to compare on.
-        config: Configuration with the provider.
-        ground_truth: Options of the provider ``files`` for the true maps.
-        kind: Kind of the provider.
+        photos: Images on which prior and truth are compared.
+        config: Configuration with the provider of the prior.
+        ground_truth: Options of the provider ``files``, which reads the true maps.
+        kind: Kind of the provider, depth or normals.
         model: COLMAP model whose points are true depth.
         options: Options of the sampling.
         registry: Registry of plugins.
 
     Raises:
-        InputError: Not exactly one of `ground_truth` and `model` is given, or both lack data.
+        InputError: Both or neither of `ground_truth` and `model` are given, or the ground truth has
+            too few samples.
     """
     if (ground_truth is None) == (model is None):
         raise InputError("give true maps or a model")
@@ -157,7 +159,7 @@ def compare_prior(
 
 
 class _Run:
-    """Run of a calibration."""
+    """Calibration run on a folder of images with one configuration."""
 
     def __init__(
         self,
@@ -169,7 +171,7 @@ class _Run:
         options: StudyOptions,
     ) -> None:
         stages = Stages(registry)
-        needed = ("depth", "normals", "masks")  # a reconstruction resolves the other providers
+        needed = ("depth", "normals", "masks")  # Reconstruction resolves more providers.
         config = resolve_providers(config, registry, stages, needed).config
         self._photos, self._config, self._kind = photos, config, kind
         self._registry, self._options = registry, options
@@ -180,16 +182,16 @@ class _Run:
         self._comparison = PriorComparison(self._context, kind, alignments, options)
 
     def prepare(self) -> None:
-        """Run the mask providers; masked pixels are not compared."""
+        """Run the mask providers, because masked pixels are excluded from the comparison."""
         self._context.run_masks()
 
     def with_files(self, options: Mapping[str, Any]) -> CalibrationResult:
-        """Calibrate with true maps."""
+        """Calibrate the provider with true maps."""
         data = self.data_of_files(options)
         return self._finish(data, f"{self._kind} maps in {PurePath(options['directory']).name}")
 
     def with_model(self, folder: Path) -> CalibrationResult:
-        """Calibrate with the points of a COLMAP model."""
+        """Calibrate the provider with the points of a COLMAP model."""
         return self._finish(self.data_of_model(folder), f"points of a model: {folder.name}")
 
     def data_of_files(self, options: Mapping[str, Any]) -> CalibrationData:
@@ -206,7 +208,7 @@ class _Run:
         return self._comparison.with_points(truth)
 
     def self_calibrate(self) -> CalibrationResult:
-        """Self-calibrate: reconstruct, fit to depth triangulated from rays, and repeat."""
+        """Calibrate the provider with depth triangulated from reconstructions of the images."""
         current, rounds = self._declared, []
         without_bootstrap = self._options.model_copy(update={"bootstraps": 0})
         for _ in range(MAX_ROUNDS):
@@ -221,7 +223,7 @@ class _Run:
         return CalibrationResult(result.file, {**result.report, "rounds": rounds})
 
     def _reconstruct(self, calibration: Calibration) -> dict[str, DepthTruth]:
-        """Reconstruct with a calibration and triangulate true depth from the rays of all models."""
+        """Reconstruct with a calibration and triangulate true depth from viewing rays."""
         values = calibration.model_dump(mode="json")
         backend = self._backend.model_copy(update={"calibration": values})
         result = reconstruct(
@@ -274,7 +276,7 @@ class _Run:
 
 
 def _median_change(data: CalibrationData, before: Calibration, after: Calibration) -> float:
-    """Return the median relative change of the std over the samples."""
+    """Compute the median relative change of the declared std between two calibrations."""
     stds = [std_of(c, data.residuals(c)) for c in (before, after)]
     return float(np.expm1(np.median(np.abs(np.log(stds[1] / stds[0])))))
 
@@ -287,7 +289,7 @@ def _weights(provider: ActiveProvider) -> dict[str, str]:
 
 
 def _round_values(value: Any) -> Any:
-    """Round the numbers of plain data to four digits."""
+    """Round the numbers in nested plain data to four significant digits."""
     if isinstance(value, dict):
         return {key: _round_values(content) for key, content in value.items()}
     if isinstance(value, list):
@@ -296,12 +298,12 @@ def _round_values(value: Any) -> Any:
 
 
 def _last_folders(folder: Path) -> str:
-    """Return the last two folders, because many image folders have the same name."""
+    """Return the last two folders of a path, because many image folders have the same name."""
     return "/".join(folder.resolve().parts[-2:])
 
 
 def _strip_folders(value: Any) -> Any:
-    """Replace existing paths in plain data by file names, so that results are portable."""
+    """Replace existing paths in nested plain data by file names, so that results are portable."""
     if isinstance(value, dict):
         return {key: _strip_folders(content) for key, content in value.items()}
     if isinstance(value, list):

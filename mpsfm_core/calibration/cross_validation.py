@@ -26,51 +26,52 @@ from mpsfm_core.geometry.statistics import MAD_TO_STD
 from mpsfm_core.providers.uncertainty.calibration import Calibration
 
 FEW_IMAGES = 10
-"""Number of images below which a warning appears [ours]."""
+"""Number of images below which the report warns [ours]."""
 WIDE_INTERVAL = 0.25
-"""Relative half width of an interval above which a warning appears [ours]."""
+"""Relative half width of a confidence interval above which the report warns [ours]."""
 MANY_GROSS = 0.2
-"""Ratio of gross errors above which the truth is doubtful [ours]."""
+"""Ratio of gross errors above which the report doubts the ground truth [ours]."""
 _INTERVAL = (2.5, 97.5)
 
 CalibrationData: TypeAlias = DepthData | NormalData
 
 
 class StudyOptions(Options):
-    """Options of a calibration study."""
+    """Options of a calibration study: sampling, cross-validation and bootstrap."""
 
     seed: int = Field(0, ge=0)
     """Seed of the pixel sampling and of the bootstrap."""
     folds: int = Field(4, ge=2)
     """Number of folds of the cross-validation.
 
-    A fold is a group of successive images, because neighbors in a video are nearly equal. With
-    several folders, a fold is a group of folders. The final values are fitted to all images."""
+    A fold is a group of successive images, because neighboring video frames are nearly equal. If
+    the images are in several folders, a fold is a group of folders. The final calibration is fitted
+    to all images."""
     bootstraps: int = Field(100, ge=0)
-    """Number of bootstrap samples for confidence intervals; 0 for none."""
+    """Number of bootstrap samples for confidence intervals; 0 disables the intervals."""
     samples_per_image: int = Field(500, ge=20)
-    """Maximum number of pixels of dense truth per image; their errors are correlated."""
+    """Maximum number of pixels per image from dense true maps, whose errors are correlated."""
 
 
 @dataclass(frozen=True, eq=False)
 class CalibrationStudy:
-    """Result of a calibration study."""
+    """Calibration, report and warnings of a calibration study."""
 
     calibration: Calibration
-    """Fitted calibration."""
+    """Calibration that is fitted to all images."""
     report: dict[str, Any]
     """All values of the report as plain data."""
     warnings: tuple[str, ...]
-    """Reasons to doubt the calibration."""
+    """Warnings with reasons to doubt the calibration."""
 
 
 def run_study(
     data: CalibrationData, declared: Calibration, options: StudyOptions
 ) -> CalibrationStudy:
-    """Fit a calibration and compare with the declared one by cross-validation.
+    """Fit a calibration and compare it with the declared calibration by cross-validation.
 
     Args:
-        data: Samples of at least one image.
+        data: Samples of prior and truth from at least one image.
         declared: Calibration that the plugin declares.
         options: Options of the study.
     """
@@ -106,7 +107,7 @@ def run_study(
 
 
 def _folds(names: Sequence[str], wanted: int) -> list[tuple[Int64, Int64]]:
-    """Return indices of training and test images of each fold; none for a single image."""
+    """Return the indices of training and test images of each fold; no folds for a single image."""
     if len(names) < 2:
         return []
     folders, scene = np.unique([str(PurePosixPath(n).parent) for n in names], return_inverse=True)
@@ -120,10 +121,10 @@ def _folds(names: Sequence[str], wanted: int) -> list[tuple[Int64, Int64]]:
 def evaluate_calibrations(
     held_out: Sequence[CalibrationData], calibrations: Sequence[Calibration]
 ) -> dict[str, Any]:
-    """Compute the metrics of each calibration on its test images.
+    """Compute the metrics of each fold's calibration on the test images of the fold.
 
-    The metrics pool all images after the scale of each image. Coverage is also reported per fold,
-    and for metric priors without scaling.
+    The metrics pool all images after scaling each depth map. Coverage is also reported per fold,
+    and without scaling for metric priors.
     """
     scaled, std = _apply(held_out, calibrations, scaled=True)
     metrics = compute_metrics(concatenate_residuals(scaled), np.concatenate(std))
@@ -140,7 +141,7 @@ def evaluate_calibrations(
 def _apply(
     held_out: Sequence[CalibrationData], calibrations: Sequence[Calibration], *, scaled: bool
 ) -> tuple[list[Residuals], list[Float64]]:
-    """Return errors and declared std of each fold."""
+    """Compute errors and declared std of the test images of each fold."""
     parts = [d.residuals(c, scaled=scaled) for d, c in zip(held_out, calibrations, strict=True)]
     return parts, [std_of(c, r) for c, r in zip(calibrations, parts, strict=True)]
 
@@ -150,14 +151,14 @@ def _coverage(residuals: Residuals, std: Float64) -> list[float]:
 
 
 def _place(data: CalibrationData) -> str:
-    """Return the label of the quantity that errors are broken down by."""
+    """Return the label of the quantity, depth or slant, that groups errors."""
     if isinstance(data, NormalData):
         return "slant (degrees)"
     return "depth (m)" if data.in_meters else "depth (unit of the model)"
 
 
 def _scale(data: CalibrationData, calibration: Calibration) -> dict[str, float] | None:
-    """Return the ratio of true to prior depth: median over images, and std of its log."""
+    """Compute the median over images of the scale (true to prior depth), and the std of its log."""
     if isinstance(data, NormalData):
         return None
     scales = data.residuals(calibration).scales
@@ -169,7 +170,7 @@ def _scale(data: CalibrationData, calibration: Calibration) -> dict[str, float] 
 def _intervals(
     residuals: Residuals, fit: StdFit, count: int, rng: np.random.Generator
 ) -> dict[str, list[float]]:
-    """Compute 95 % intervals of the determined factors; angles in degrees."""
+    """Compute 95 % confidence intervals of the determined std factors; angles in degrees."""
     if count == 0 or residuals.images < 2:
         return {}
     low, high = np.percentile(bootstrap_fit(residuals, fit, count, rng), _INTERVAL, axis=0)

@@ -1,4 +1,4 @@
-"""True depth and normals from files, read by the provider ``files``."""
+"""True depth and normals from map files that the provider ``files`` reads."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from mpsfm_core.providers.builtin.options import DepthFileOptions, FileOptions, 
 from mpsfm_core.providers.provider_config import ProviderConfig
 
 EXACT = 1e-4
-"""Default relative std of true depth: negligible for every prior, and positive."""
+"""Default relative std of true depth, negligible compared with the std of priors."""
 
 
 class FileTruth:
-    """Reader of true maps that samples pixels of an image.
+    """Reader of true depth or normal maps that samples pixels of an image.
 
     Args:
         context: Extraction context.
         kind: ``depth`` or ``normals``.
         options: Options of the provider ``files``.
         count: Maximum number of pixels per image.
-        seed: Seed of the sampling.
+        seed: Seed of the pixel sampling.
     """
 
     def __init__(
@@ -64,7 +64,7 @@ class FileTruth:
         true = validation.run_depth(self._provider.spec, self._provider.instance, view)
         rows, xy = self._sample_pixels(true.valid, view, index)
         depth = true.depth[rows].astype(np.float64)
-        assert true.variance is not None  # the files provider declares one
+        assert true.variance is not None  # The provider ``files`` always declares a variance.
         return DepthTruth(xy, depth, np.sqrt(true.variance[rows]) / depth)
 
     def normals(self, view: View, index: int) -> NormalTruth:
@@ -77,7 +77,7 @@ class FileTruth:
     def _sample_pixels(
         self, valid: Bool, view: View, index: int
     ) -> tuple[tuple[Int64, Int64], Float64]:
-        """Sample valid pixels; returns rows and columns, and pixels (n, 2) of the view."""
+        """Sample valid pixels and return array indices and COLMAP pixels (n, 2) of the view."""
         height, width = valid.shape
         centers = scale_pixels(pixel_centers(width, height), (width, height), view.camera.size)
         if view.mask is not None:

@@ -14,23 +14,25 @@ from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.geometry.statistics import MAD_TO_STD, weighted_quantile
 
 CURVE_POINTS = 50
-"""Points of a sensitivity curve."""
+"""Number of points of a sensitivity curve."""
 BINS = 10
-"""Bins of a calibration curve."""
+"""Number of bins of a calibration curve."""
 RANGES = 5
-"""Ranges of depth or slant."""
+"""Number of ranges of depth or slant in the report."""
 NORMAL_COVERAGE = (ONE_SIGMA, 0.9545, 0.9973)
-"""Probabilities of a normal error within 1, 2 and 3 stds."""
+"""Probabilities that a normally distributed error is within 1, 2 and 3 stds."""
 
 
 def compute_metrics(residuals: Residuals, std: Float64) -> dict[str, Any]:
-    """Compute all metrics of a std (n,); images have equal weight except in the curves.
+    """Compute all metrics of a declared std (n,); images have equal weight except in curves.
 
-    ``coverage``: share of errors within 1, 2, 3 std. ``z_mad``: 1.4826 times the median of
-    ``|error / std|``, 1 when right. ``nll``: mean negative log density if errors were normal,
-    ``nll_heavy``: if they had the fit's heavy tails and the same coverage of 1 std. ``ause``: area
-    between the sensitivity curve and that of the true order of errors, as a share of the total
-    RMSE; 0 is a perfect order. ``rmse``: in meters or rad. Then the curves behind them.
+    ``coverage``: ratio of errors within 1, 2 and 3 stds. ``z_mad``: 1.4826 times the median of
+    ``|error / std|``, 1 for a correct std. ``nll``: mean negative log density of a normal
+    distribution with the std. ``nll_heavy``: mean negative log density of the fitted Student t
+    distribution with the same coverage of 1 std. ``ause``: area between the sensitivity curves for
+    errors sorted by std and by true error, relative to the total RMSE; 0 is a perfect order.
+    ``rmse``: RMSE in meters or rad. The remaining values are sensitivity and calibration curves,
+    and coverage by range.
     """
     total, weights = np.hypot(std, residuals.noise), residuals.weights()
     heavy_scale = total / STD_OF_T
@@ -61,8 +63,8 @@ def sensitivity_curve(errors: Float64, std: Float64) -> dict[str, list[float]]:
     """Compute the sensitivity (sparsification) curve [paper, appendix C].
 
     Returns:
-        ``recall`` in (0, 1]; ``predicted`` and ``ideal``: RMSE of the samples with the smallest std
-        and with the smallest errors, relative to the RMSE of all samples.
+        ``recall``, ratio of samples in (0, 1]. ``predicted`` and ``ideal``: RMSE of the samples
+        with the smallest std and with the smallest errors, relative to the RMSE of all samples.
     """
     count = len(errors)
     ends = np.unique(np.ceil(np.linspace(0, 1, CURVE_POINTS + 1)[1:] * count).astype(np.int64))
@@ -97,7 +99,7 @@ def _curve_by_std(error: Float64, total: Float64) -> list[dict[str, float]]:
 
 
 def _by_range(residuals: Residuals, total: Float64) -> list[dict[str, Any]]:
-    """Compute coverage in ranges of depth or slant."""
+    """Compute the coverage of the declared std in ranges of depth or slant."""
     weights = residuals.weights()
     return [
         {
@@ -117,7 +119,7 @@ def _summary(error: Float64, total: Float64, weights: Float64) -> dict[str, Any]
 
 
 def _quantile_bins(values: Float64, count: int) -> list[Bool]:
-    """Split values into bins of similar size, from small to large; returns masks (n,)."""
+    """Split values into bins of similar size and return a mask (n,) of each bin."""
     edges = np.unique(np.quantile(values, np.linspace(0, 1, count + 1)[1:-1]))
     number = np.searchsorted(edges, values, side="right")
     rows = [number == bin_ for bin_ in range(len(edges) + 1)]

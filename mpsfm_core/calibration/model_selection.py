@@ -1,7 +1,7 @@
 """Model selection: fit calibration models of growing complexity and select the best.
 
-A more complex model must improve the mean log density by more than two standard errors over the
-images.
+A more complex calibration model must improve the mean log density by more than two standard errors
+over the images.
 """
 
 from __future__ import annotations
@@ -30,18 +30,19 @@ from mpsfm_core.providers.uncertainty.calibration import (
 )
 
 Alignment = Literal["scale", "scale-shift", "disparity"]
-"""Ambiguity of the depth of an image: a scale; a scale and a shift of depth or of inverse depth."""
+"""Alignment of depth priors: scale, scale and depth shift, or scale and inverse depth shift."""
 
 EDGE_RATIOS = (1.05, 1.1, 1.2)
-"""Candidate ratios of neighboring depths at edges; slanted planes have steps of 2 to 3 % [ours]."""
+"""Candidate ratios of neighboring depths at depth edges, larger than on slanted planes [ours]."""
 SHIFT_RANGE = (-0.95, 5.0)
-"""Range of shifts in medians of the depth map [ours]."""
+"""Range of candidate shifts in units of the depth map's median [ours]."""
 DEFAULT_FLOOR = 0.02
-"""Floor of the std in meters if the data do not determine it [paper, appendix C]."""
+"""Default floor of the std in meters, if the data do not determine the floor [paper, appendix
+C]."""
 MIN_GAIN_STD_ERRORS = 2.0
-"""Minimum gain of a more complex model in standard errors [ours]."""
+"""Minimum log density gain of a more complex model in standard errors [ours]."""
 MIN_GAIN = 1e-3
-"""Minimum gain of the mean log density [ours]; less than the cost of a std that is 2 % off."""
+"""Minimum gain of the mean log density, less than the loss from a std error of 2 % [ours]."""
 _NUM_DIGITS = 4
 _NUM_SHIFTS = 61
 _SPACES: Mapping[Alignment, Literal["depth", "disparity"]] = {
@@ -52,24 +53,24 @@ _SPACES: Mapping[Alignment, Literal["depth", "disparity"]] = {
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Fitted calibration model."""
+    """Candidate of model selection: a fitted calibration model."""
 
     name: str
-    """Description of the model."""
+    """Description of the calibration model for the report."""
     fit: StdFit
-    """Fitted std."""
+    """Maximum-likelihood fit of the std."""
     calibration: Calibration
-    """Fitted calibration."""
+    """Calibration with the fitted parameters."""
     gain: float
-    """Gain of the mean log density over the previous selection; 0 for the first model."""
+    """Gain of the mean log density over the previously selected model; 0 for the first model."""
     standard_error: float
-    """Standard error of the gain over the images; 0 for the first model."""
+    """Standard error of ``gain`` over the images; 0 for the first model."""
     chosen: bool
-    """True if the model is better than all before."""
+    """True if the model is better than all simpler models."""
 
 
 def std_of(calibration: Calibration, residuals: Residuals) -> Float64:
-    """Compute the std (n,) that a calibration declares, of log depth or in rad."""
+    """Compute the std (n,) of log depth, or of normals in rad, that a calibration declares."""
     if isinstance(calibration, DepthCalibration):
         factors = {
             "std_scale": calibration.std_scale * calibration.use_network_variance,
@@ -97,7 +98,8 @@ def std_of(calibration: Calibration, residuals: Residuals) -> Float64:
 class DepthData:
     """Samples of depth priors, one entry per image.
 
-    ``alignments``: what may be tried, the simplest first. ``in_meters``: whether the truth is.
+    ``alignments`` are the candidate alignments, the simplest first. ``in_meters`` is True if the
+    true depth is in meters.
     """
 
     samples: tuple[DepthSamples, ...]
@@ -105,16 +107,16 @@ class DepthData:
     in_meters: bool = True
 
     def of(self, images: Int64) -> DepthData:
-        """Return the data of some images."""
+        """Return the samples of some images."""
         return replace(self, samples=tuple(self.samples[i] for i in images))
 
     def residuals(self, calibration: Calibration, *, scaled: bool = True) -> Residuals:
-        """Compute errors after the shift and, if `scaled`, after the scale of each image."""
+        """Compute depth errors after the shift and, if `scaled`, after scaling each image."""
         assert isinstance(calibration, DepthCalibration)
         return depth_residuals(self.samples, calibration, scaled=scaled)
 
     def fit(self) -> list[Candidate]:
-        """Fit alignment, terms and edges in this order, for :func:`select_candidate`."""
+        """Fit candidates of growing complexity: alignment, then std terms, then depth edges."""
         floor = ("std_floor",) * self.samples[0].metric
         search = _ModelSearch()
         for alignment in self.alignments:
@@ -137,15 +139,15 @@ class NormalData:
     samples: tuple[NormalSamples, ...]
 
     def of(self, images: Int64) -> NormalData:
-        """Return the data of some images."""
+        """Return the samples of some images."""
         return replace(self, samples=tuple(self.samples[i] for i in images))
 
     def residuals(self, calibration: Calibration, *, scaled: bool = True) -> Residuals:
-        """Return errors along both tangent directions; normals have no scale."""
+        """Compute normal errors along both tangent directions; `scaled` has no effect."""
         return normal_residuals(self.samples)
 
     def fit(self) -> list[Candidate]:
-        """Fit a constant std, and a scaled network std with a floor if available."""
+        """Fit a constant std and, if the network predicts a std, its scaled std with a floor."""
         base = NormalCalibration()
         residuals = self.residuals(base)
         search = _ModelSearch()
@@ -157,15 +159,15 @@ class NormalData:
 
 
 def select_candidate(candidates: Sequence[Candidate]) -> Candidate:
-    """Return the selected model: the last that was better than all before."""
+    """Return the selected candidate, the last that is better than all simpler candidates."""
     return next(c for c in reversed(candidates) if c.chosen)
 
 
 def calibration_from_fit(base: Calibration, fit: StdFit) -> Calibration:
     """Convert a fit to a calibration with the shift of `base`, rounded to four digits.
 
-    Terms that the data do not determine, because they are rarely the largest, are left out. The
-    floor then has its default value.
+    The calibration omits std terms that are rarely the largest, because the data do not determine
+    them. An undetermined floor has the default value.
     """
     factors = {
         name: round_significant(value)
@@ -196,7 +198,7 @@ def calibration_from_fit(base: Calibration, fit: StdFit) -> Calibration:
 
 
 class _CandidateModel(NamedTuple):
-    """Model to fit; `base` has the shift."""
+    """Calibration model to fit; `base` contains the shift of the alignment."""
 
     base: Calibration
     residuals: Residuals
@@ -205,7 +207,7 @@ class _CandidateModel(NamedTuple):
 
 
 class _ModelSearch:
-    """Search over models of growing complexity."""
+    """Search for the best calibration model by growing complexity."""
 
     def __init__(self) -> None:
         self.candidates: list[Candidate] = []
@@ -213,7 +215,7 @@ class _ModelSearch:
         self._density: Float64 | None = None
 
     def offer(self, name: str, attempts: Sequence[_CandidateModel]) -> None:
-        """Fit variants of a model; select the most likely if better than the selection."""
+        """Fit variants of a model and select the most likely if better than the selected model."""
         fits = [fit_std(a.residuals, a.names, a.edge_ratio) for a in attempts]
         place = int(np.argmax([fit.log_density.mean() for fit in fits]))
         attempt, fit = attempts[place], fits[place]
@@ -234,7 +236,7 @@ def _standard_error(values: Float64) -> float:
 
 
 def _shift(samples: Sequence[DepthSamples], alignment: Alignment) -> DepthCalibration:
-    """Find the shift with the smallest mean error of log depth."""
+    """Find the depth or inverse depth shift with the smallest mean error of log depth."""
     if alignment == "scale":
         return DepthCalibration()
     space = _SPACES[alignment]
@@ -251,7 +253,7 @@ def _shift(samples: Sequence[DepthSamples], alignment: Alignment) -> DepthCalibr
 
 
 def _shift_loss(samples: Sequence[DepthSamples], model: DepthCalibration) -> float:
-    """Compute the mean absolute error of log depth; pixels that the shift invalidates are gross."""
+    """Compute the mean absolute error of log depth; non-positive depth counts as gross error."""
     residuals = depth_residuals(samples, model)
     lost = sum(len(image.prior) for image in samples) - len(residuals)
     return float((np.abs(residuals.error).sum() + lost * GROSS_DEPTH) / (len(residuals) + lost))

@@ -1,11 +1,11 @@
 """True depth from the points of a COLMAP model.
 
-The poses of the model are kept, and every point is triangulated again from its rays alone. Depth
-priors of the reconstruction therefore do not influence the truth, and the covariance of a point is
-that of its rays.
+The poses of the model are fixed, and every point is triangulated again from its viewing rays alone.
+The depth priors of the reconstruction therefore do not influence the true depth. The covariance of
+a point contains only the errors of its rays.
 
-Points concentrate on texture, where networks have smaller errors than on blank walls. Pixels are
-therefore sampled evenly, each with its nearest point.
+Points concentrate on texture, where depth networks have smaller errors than on textureless
+surfaces. Pixels are therefore sampled uniformly, and each pixel uses its nearest point.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from mpsfm_core.optimize.covariance import compute_point_covariances, propagate_
 from mpsfm_core.optimize.options import SOFT_L1_OPTIONS
 
 MIN_ANGLE_DEG = 2.0
-"""Minimum triangulation angle of a true point [reference: robust_triangles]."""
+"""Minimum triangulation angle of a true point in degrees [reference: robust_triangles]."""
 MAX_LOG_STD = 0.05
-"""Maximum relative std of a true depth [ours]."""
+"""Maximum relative std of the depth of a true point [ours]."""
 MAX_ERROR_STD = 4.0
 """Maximum reprojection error of a true point in stds [reference: 4 px]."""
 STD_PX_RANGE = (0.3, 3.0)
-"""Bounds of the measured keypoint noise in pixels [ours]."""
+"""Minimum and maximum of the estimated keypoint noise in pixels [ours]."""
 REACH = 0.08
 """Maximum distance of a pixel to its nearest point, relative to the image width [ours]."""
 
@@ -42,7 +42,7 @@ REACH = 0.08
 def depth_truth_from_model(
     model: pycolmap.Reconstruction, images: ImageSet
 ) -> dict[str, DepthTruth]:
-    """Triangulate true depth at the observed points of each common image, by image name."""
+    """Triangulate true depth at the observations of each image of a COLMAP model, by image name."""
     seen = _observe(model, images)
     if not len(seen.points):
         return {}
@@ -64,14 +64,14 @@ def depth_truth_from_model(
 def sample_evenly(
     truth: DepthTruth, size: tuple[int, int], count: int, rng: np.random.Generator
 ) -> DepthTruth:
-    """Sample pixels uniformly and take the nearest point of each.
+    """Sample pixels uniformly and return the true depth of the point nearest to each pixel.
 
-    A point may occur repeatedly. Pixels without a point within :data:`REACH` are left out.
+    A point may be sampled repeatedly. Pixels without a point within :data:`REACH` are omitted.
 
     Args:
-        truth: True depth at points.
+        truth: True depth at the observed points of a view.
         size: (width, height) of the view.
-        count: Number of pixels.
+        count: Number of sampled pixels.
         rng: Random generator.
     """
     pixels = rng.uniform((0.0, 0.0), size, (count, 2))
@@ -85,7 +85,7 @@ class _ModelObservations(NamedTuple):
     """Observations of a model with n images, p points and m observations, sorted by point."""
 
     names: list[str]
-    """Names of the images."""
+    """Names of the n images."""
     rotations: Float64
     """(n, 3, 3) rotations of ``cam_from_world``."""
     translations: Float64
@@ -93,19 +93,19 @@ class _ModelObservations(NamedTuple):
     focals: Float64
     """(n,) focal lengths in pixels."""
     points: Float64
-    """(p, 3) points, world frame."""
+    """(p, 3) triangulated points, world frame."""
     image: Int64
-    """(m,) image of each observation."""
+    """(m,) image index of each observation."""
     point: Int64
-    """(m,) point of each observation."""
+    """(m,) point index of each observation."""
     xy: Float64
-    """(m, 2) undistorted pixels relative to the principal point."""
+    """(m, 2) undistorted positions of the observations, pixels relative to the principal point."""
     view_xy: Float64
-    """(m, 2) pixels of the view."""
+    """(m, 2) positions of the observations in COLMAP pixels of the view."""
 
 
 def _observe(model: pycolmap.Reconstruction, images: ImageSet) -> _ModelObservations:
-    """Collect the observations of the common images."""
+    """Collect the observations of the images that are in the model and in the image set."""
     sources = {image.name: image for image in images}
     posed = [i for i in model.images.values() if i.has_pose and i.name in sources]
     posed.sort(key=lambda image: str(image.name))
@@ -157,7 +157,7 @@ def _triangulate(seen: _ModelObservations) -> BundleProblem:
 
 
 def _noise_px(problem: BundleProblem) -> float:
-    """Estimate the std of keypoints from the residuals of tracks longer than two."""
+    """Estimate the std of keypoints in pixels from the residuals of tracks longer than two."""
     lengths = np.bincount(problem.obs_point)[problem.obs_point]
     long = lengths > 2
     if not long.any():
@@ -169,7 +169,7 @@ def _noise_px(problem: BundleProblem) -> float:
 
 
 def _reliable_points(problem: BundleProblem) -> Bool:
-    """Return the mask (p,) of points with a large angle and small errors in all images."""
+    """Return the mask (p,) of points with large triangulation angle and small residuals."""
     centers = camera_center(problem.rotations, problem.translations)[problem.obs_image]
     angles = compute_max_triangulation_angles(
         problem.points, np.asarray(problem.obs_point, dtype=np.int64), centers
@@ -191,7 +191,7 @@ def _camera_points(problem: BundleProblem) -> Float64:
 
 
 def _residuals(problem: BundleProblem) -> Float64:
-    """Compute reprojection residuals (m, 2) in pixels; infinite behind the camera."""
+    """Compute reprojection residuals (m, 2) in pixels, infinite for points behind the camera."""
     points = _camera_points(problem)
     focal = problem.intrinsics[problem.camera_of_image[problem.obs_image], 0]
     front = points[:, 2] > 0

@@ -21,8 +21,8 @@ def draw_plots(metrics: Mapping[str, Metrics], place: str, error: str) -> tuple[
     """Draw four plots of the metrics ``before`` and ``after`` as SVG element and PNG file.
 
     Args:
-        metrics: Metrics by ``before`` and ``after``.
-        place: Label of the quantity that errors are broken down by.
+        metrics: Metrics of the calibrations ``before`` and ``after``.
+        place: Label of the quantity that groups errors, depth or slant.
         error: Label of the errors.
     """
     panels: tuple[Callable[[Axes, Mapping[str, Metrics]], None], ...] = (
@@ -31,7 +31,7 @@ def draw_plots(metrics: Mapping[str, Metrics], place: str, error: str) -> tuple[
         _coverage,
         _ranges,
     )
-    # Fixed salt and no date, so that equal values give equal files.
+    # A fixed hash salt and no date make the files reproducible.
     with mpl.rc_context({"svg.hashsalt": "mpsfm", "font.size": 9, "svg.fonttype": "none"}):
         figure = Figure(figsize=(10, 7.5), layout="constrained")
         for axes, panel in zip(figure.subplots(2, 2).flat, panels, strict=True):

@@ -1,4 +1,4 @@
-"""Comparison of a provider's priors with the truth on all images."""
+"""Comparison of a provider's depth or normal priors with ground truth on all images."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 Samples = TypeVar("Samples", DepthSamples, NormalSamples)
 
 ALL_ALIGNMENTS: tuple[Alignment, ...] = ("scale", "scale-shift", "disparity")
-"""Alignments of priors that are not metric."""
+"""Candidate alignments of depth priors that are not metric."""
 
 
 class PriorComparison:
-    """Comparison of one kind of prior with the truth.
+    """Comparison of depth or normal priors with ground truth.
 
     Args:
         context: Extraction context.
-        kind: Kind of the prior.
-        alignments: Candidate alignments of depth; None for the default of the provider.
-        options: Options of the study.
+        kind: Kind of the prior, depth or normals.
+        alignments: Candidate alignments of depth; None selects the default for the provider.
+        options: Options of the calibration study.
     """
 
     def __init__(
@@ -58,17 +58,17 @@ class PriorComparison:
 
     @property
     def provider(self) -> ActiveProvider:
-        """Provider to calibrate."""
+        """Provider that is calibrated."""
         return (self._kind == "normals" and self._raw.normals) or self._raw.depth
 
     def with_files(self, options: Mapping[str, Any]) -> CalibrationData:
-        """Compare with true maps in files; images without a file are left out.
+        """Compare the priors with true map files; images without a file are omitted.
 
         Args:
             options: Options of the provider ``files``.
 
         Raises:
-            InputError: No image has a file or enough valid pixels.
+            InputError: No image has a true map file with enough valid pixels.
         """
         sampling = self._options
         truth = FileTruth(
@@ -89,13 +89,13 @@ class PriorComparison:
         return self._depth_data(self._compare(known, depth), in_meters=True)
 
     def with_points(self, truth: Mapping[str, DepthTruth]) -> CalibrationData:
-        """Compare with true depth at points, weighted by image area.
+        """Compare depth priors with true depth at points, sampled uniformly over the image.
 
         Args:
-            truth: True depth by image name, in any unit.
+            truth: True depth at points by image name, in any unit.
 
         Raises:
-            InputError: No image has enough points.
+            InputError: No image has enough points with valid prior depth.
         """
         names, sampling = self._context.images.names, self._options
         points = {i: truth[name] for i, name in enumerate(names) if name in truth}

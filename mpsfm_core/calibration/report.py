@@ -45,14 +45,15 @@ _IDEAL = {
 def write_report(calibration_file: Path, report: Mapping[str, Any]) -> tuple[Path, Path]:
     """Write ``NAME.report.html``, ``.json`` and ``.png`` next to ``NAME.yaml``.
 
-    Without matplotlib there is no PNG, and the page has a hint.
+    Without matplotlib, the PNG file is not written and the HTML page explains how to install
+    matplotlib.
 
     Args:
         calibration_file: Calibration file ``NAME.yaml`` or ``NAME.json``.
-        report: Values of the report.
+        report: Report of the calibration study as plain data.
 
     Returns:
-        Paths of the HTML page and the JSON file.
+        Paths of the written HTML page and JSON file.
     """
     page = calibration_file.with_suffix(".report.html")
     numbers = calibration_file.with_suffix(".report.json")
@@ -143,7 +144,7 @@ def _candidates(report: Mapping[str, Any]) -> Iterable[Sequence[str]]:
 
 
 def _rounds(report: Mapping[str, Any]) -> Iterable[str]:
-    """Format the rounds of a self-calibration."""
+    """Format the results of each self-calibration round as text."""
     rounds = report.get("rounds", [])
     if rounds:
         rows = [
@@ -155,7 +156,7 @@ def _rounds(report: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _plots(report: Mapping[str, Any]) -> tuple[str, bytes | None]:
-    """Return the plots for the page and as PNG file; None without matplotlib."""
+    """Return the plots as HTML text and as PNG bytes; None instead of PNG without matplotlib."""
     try:
         from mpsfm_core.calibration.plots import draw_plots
     except ImportError:

@@ -1,4 +1,4 @@
-"""Samples of a prior and the truth, and the errors that a calibration is fitted to."""
+"""Samples of prior and true depth or normals, and the errors that a calibration fits."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, depth
 MIN_SAMPLES = 20
 """Minimum number of samples to estimate the scale of an image [ours]."""
 GROSS_DEPTH = float(np.log(4))
-"""Largest error of log depth, for the density of gross errors [ours]."""
+"""Maximum error of log depth, the range of the uniform density of gross errors [ours]."""
 GROSS_NORMAL = float(np.pi / 2)
-"""Largest error of a normal in rad, for the density of gross errors."""
+"""Maximum error of a normal in rad, the range of the uniform density of gross errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,11 +31,11 @@ class DepthTruth:
     """True depth at n pixels of a view."""
 
     xy: Float64
-    """(n, 2) float64, COLMAP pixels of the view."""
+    """(n, 2) float64 positions of the samples, COLMAP pixels of the view."""
     depth: Float64
-    """(n,) float64 z-depth > 0."""
+    """(n,) float64 true z-depth > 0."""
     std: Float64
-    """(n,) float64 std of the log of the true depth; 0 if exact."""
+    """(n,) float64 std of the true log depth; 0 if exact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,11 +43,11 @@ class NormalTruth:
     """True normals at n pixels of a view."""
 
     xy: Float64
-    """(n, 2) float64, COLMAP pixels of the view."""
+    """(n, 2) float64 positions of the samples, COLMAP pixels of the view."""
     normals: Float64
-    """(n, 3) unit normals, camera frame."""
+    """(n, 3) true unit normals, camera frame."""
     std: Float64
-    """(n,) std in rad along each tangent direction."""
+    """(n,) std of the true normals in rad along each tangent direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,19 +57,19 @@ class DepthSamples:
     name: str
     """Name of the image."""
     prior: Float64
-    """(n,) prior depth."""
+    """(n,) prior depth in the unit of the network."""
     network_std: Float64 | None
-    """(n,) std that the network predicts; None without."""
+    """(n,) depth std that the network predicts, or None without prediction."""
     step: Float64
-    """(n,) largest step of log depth to a neighbor."""
+    """(n,) maximum difference of log depth to the four neighboring pixels."""
     truth: Float64
-    """(n,) true depth."""
+    """(n,) true depth at the samples."""
     truth_std: Float64
-    """(n,) std of the log of the true depth."""
+    """(n,) std of the true log depth."""
     depth_medians: tuple[float, float]
-    """Medians of depth and of inverse depth over the depth map."""
+    """Medians of depth and of inverse depth over the prior's depth map."""
     metric: bool
-    """True if the prior is in meters."""
+    """True if the prior depth is in meters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +79,11 @@ class NormalSamples:
     name: str
     """Name of the image."""
     prior: Float64
-    """(n, 3) predicted normals."""
+    """(n, 3) unit normals of the prior, camera frame."""
     network_std: Float64 | None
-    """(n,) std that the network predicts in rad; None without."""
+    """(n,) normal std in rad that the network predicts, or None without prediction."""
     truth: Float64
-    """(n, 3) true normals."""
+    """(n, 3) true unit normals of the samples, camera frame."""
     truth_std: Float64
     """(n,) std of the true normals in rad."""
 
@@ -95,38 +95,38 @@ class Residuals:
     error: Float64
     """(n,) errors of log depth, or of a normal along one tangent direction in rad."""
     noise: Float64
-    """(n,) std of the truth in the unit of ``error``."""
+    """(n,) std of the true value in the unit of ``error``."""
     terms: Float64
-    """(n, m) terms of the std."""
+    """(n, m) terms ``term_j`` of the modeled std."""
     names: tuple[str, ...]
-    """(m,) names of the factors ``theta_j``."""
+    """(m,) names of the std factors ``theta_j``."""
     step: Float64
-    """(n,) largest step of log depth to a neighbor; 0 for normals."""
+    """(n,) maximum difference of log depth to the four neighboring pixels; 0 for normals."""
     image: Int64
-    """(n,) index of the image."""
+    """(n,) image index of each sample."""
     magnitude: Float64
-    """(n,) absolute error in meters or rad."""
+    """(n,) absolute depth error in meters or normal error in rad."""
     unit: Float64
-    """(n,) factor that converts the std to the unit of ``magnitude``."""
+    """(n,) factor that converts the modeled std to the unit of ``magnitude``."""
     place: Float64
-    """(n,) quantity that errors are broken down by: depth, or slant in degrees."""
+    """(n,) quantity that groups errors in the report: depth, or slant in degrees."""
     images: int
     """Number of images."""
     limit: float
-    """Largest error; larger errors are clipped."""
+    """Maximum error, at which larger errors are clipped."""
     scales: Float64
-    """(images,) log of the scale of each image; empty for normals."""
+    """(images,) log of the depth scale of each image; empty for normals."""
 
     def __len__(self) -> int:
         return len(self.error)
 
     def weights(self) -> Float64:
-        """Return weights (n,), the inverse number of samples of the image."""
+        """Return sample weights (n,), the inverse number of samples of the image."""
         return 1.0 / np.bincount(self.image, minlength=self.images)[self.image]
 
 
 def concatenate_residuals(parts: Sequence[Residuals]) -> Residuals:
-    """Concatenate the residuals of different images."""
+    """Concatenate the residuals of disjoint groups of images."""
     names = ("error", "noise", "terms", "step", "magnitude", "unit", "place", "scales")
     arrays: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}
     firsts = np.cumsum([0, *(part.images for part in parts)])
@@ -137,7 +137,7 @@ def concatenate_residuals(parts: Sequence[Residuals]) -> Residuals:
 def compare_depth(
     name: str, prior: DepthPrior, size: tuple[int, int], truth: DepthTruth
 ) -> DepthSamples | None:
-    """Sample a depth prior bilinearly where the truth is known, as the mapper does at keypoints.
+    """Sample a depth prior bilinearly at pixels with true depth, as the mapper at keypoints.
 
     Args:
         name: Name of the image.
@@ -146,7 +146,7 @@ def compare_depth(
         truth: True depth.
 
     Returns:
-        The samples, or None with fewer than :data:`MIN_SAMPLES` valid samples.
+        The depth samples, or None with fewer than :data:`MIN_SAMPLES` valid samples.
     """
     xy = scale_pixels(truth.xy, size, (prior.shape[1], prior.shape[0]))
     depth, ok = sample_bilinear(prior.depth, prior.valid, xy)
@@ -171,7 +171,7 @@ def compare_depth(
 def compare_normals(
     name: str, prior: NormalPrior, size: tuple[int, int], truth: NormalTruth
 ) -> NormalSamples | None:
-    """Sample the nearest normals where the truth is known; see :func:`compare_depth`."""
+    """Sample a normal prior at pixels with true normals; the nearest prior pixel is used."""
     xy = scale_pixels(truth.xy, size, (prior.shape[1], prior.shape[0]))
     ok = sample_nearest(prior.valid, xy)
     if ok.sum() < MIN_SAMPLES:
@@ -186,9 +186,9 @@ def compare_normals(
 def depth_residuals(
     samples: Sequence[DepthSamples], model: DepthCalibration, *, scaled: bool = True
 ) -> Residuals:
-    """Compute errors of log depth after the shift and, if `scaled`, the scale per image.
+    """Compute errors of log depth after the shift and, if `scaled`, after scaling each image.
 
-    The scale of an image is the median ratio of truth to prior, as in the mapper.
+    The scale of an image is the median ratio of true to prior depth, as in the mapper.
     """
     network = all(image.network_std is not None for image in samples)
     parts, scales = [], []
@@ -214,7 +214,7 @@ def depth_residuals(
 
 
 def normal_residuals(samples: Sequence[NormalSamples]) -> Residuals:
-    """Compute errors of normals along both tangent directions in rad; a pixel gives two errors."""
+    """Compute errors of normals in rad along both tangent directions, two errors per pixel."""
     network = all(image.network_std is not None for image in samples)
     parts = []
     for number, image in enumerate(samples):
@@ -240,7 +240,8 @@ def tangent_errors(prior: Float64, truth: Float64) -> Float64:
         truth: (n, 3) true unit normals.
 
     Returns:
-        (n, 2) rad along two orthogonal tangent directions; the length is the angle.
+        (n, 2) errors in rad along two orthogonal tangent directions; the norm is the angle between
+        the normals.
     """
     first = np.cross(prior, np.array([0.0, 1.0, 0.0]))
     first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)

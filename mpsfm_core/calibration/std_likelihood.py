@@ -1,10 +1,11 @@
 """Maximum-likelihood fit of a std ``max_j(theta_j * term_j)`` to errors.
 
-The likelihood is a mixture. An inlier error has a Student t distribution with the modeled variance
-plus the variance of the truth, because networks have heavier tails than a normal distribution. A
-gross error is uniform up to the largest possible error; the ratio of gross errors is fitted, too.
-Maximum likelihood determines the proportions of the terms. Their common factor is set by coverage:
-68.27 % of the inlier errors are within one std. All images have equal weight.
+The likelihood is a mixture of inlier errors and gross errors. An inlier error has a Student t
+distribution with the modeled variance plus the variance of the truth. Errors of networks have
+heavier tails than a normal distribution. A gross error is uniform up to the largest possible error;
+the ratio of gross errors is also fitted. Maximum likelihood determines the ratios between the
+factors ``theta_j``. The common scale of the factors is set such that 68.27 % of the inlier errors
+are within one std. All images have equal weight in the likelihood.
 
 The paper chose the factors of appendix C from calibration plots and the area under sensitivity
 curves. The likelihood rewards both the ranking and the size of the std.
@@ -26,53 +27,55 @@ from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.geometry.statistics import MAD_TO_STD, weighted_quantile
 
 ONE_SIGMA = 0.6827
-"""Probability of a normal error within one std."""
+"""Probability that a normally distributed error is within one std."""
 FREEDOM = 4.0
 """Degrees of freedom of the Student t distribution [Lange, Little & Taylor, JASA 1989]."""
 MAX_GROSS = 0.5
-"""Maximum ratio of gross errors."""
+"""Maximum ratio of gross errors in the mixture."""
 DOMINANT_SHARE = 0.01
-"""Minimum ratio of samples with a dominant term that determine the term [ours]."""
+"""Minimum ratio of samples for which a term is the largest, so that the data determine its factor
+[ours]."""
 STD_OF_T = float(student_t(FREEDOM).ppf(0.5 + ONE_SIGMA / 2))
-"""Scale factor of the t distribution with the coverage of one normal std."""
+"""Quantile of the t distribution with the coverage of one std of a normal distribution."""
 _NORMALISER = gamma(0.5 * (FREEDOM + 1)) / gamma(0.5 * FREEDOM) / np.sqrt(FREEDOM * np.pi)
 _RESTARTS = 5
 _SMALLEST_GAIN = 1e-6
 _RANGE = 1e4
-"""Bound of a factor relative to its value as the only term."""
+"""Bound of a factor of the std relative to its value as the only term."""
 
 
 @dataclass(frozen=True, eq=False)
 class StdFit:
-    """Fitted std with m terms."""
+    """Fitted model of the std with m terms."""
 
     names: tuple[str, ...]
-    """Names of the terms."""
+    """Names of the m terms of the std."""
     values: Float64
-    """(m,) factors of the terms."""
+    """(m,) factors ``theta_j`` of the terms."""
     edge_ratio: float | None
-    """Minimum ratio of neighboring depths at an edge; None without edges."""
+    """Minimum ratio of neighboring depths at a depth edge; None for a model without edges."""
     edge_scale: float
-    """Factor of the std at edges."""
+    """Factor of the std at depth edges."""
     gross: float
-    """Ratio of gross errors."""
+    """Ratio of gross errors in the mixture."""
     shares: Float64
     """(m,) ratio of samples for which each term is the largest."""
     limits: Float64
-    """(m,) factors up to which a term is not determined, because it is rarely the largest."""
+    """(m,) factors below which a term is rarely the largest, so that the data do not determine its
+    factor."""
     log_density: Float64
-    """(images,) mean log density per image."""
+    """(images,) mean log density of the errors of each image."""
 
 
 def fit_std(
     residuals: Residuals, names: Sequence[str] | None = None, edge_ratio: float | None = None
 ) -> StdFit:
-    """Fit the factors of the terms and of edges.
+    """Fit the factors of the std terms and of depth edges to errors.
 
     Args:
         residuals: Errors and terms.
-        names: Names of the terms; all by default.
-        edge_ratio: Minimum ratio of neighboring depths at an edge; None for no edges.
+        names: Names of the fitted terms; all terms by default.
+        edge_ratio: Minimum ratio of neighboring depths at a depth edge; None fits no edge factor.
     """
     problem = _Problem(residuals, tuple(names or residuals.names), edge_ratio)
     best = min((problem.solve(start) for start in problem.starts()), key=lambda found: found[1])
@@ -82,10 +85,10 @@ def fit_std(
 def bootstrap_fit(
     residuals: Residuals, fit: StdFit, count: int, rng: np.random.Generator
 ) -> Float64:
-    """Repeat a fit on bootstrap samples of images.
+    """Repeat a fit of the std on bootstrap samples of images.
 
     Returns:
-        (count, m + 1) factors and edge scale.
+        (count, m + 1) factors of the terms and the edge factor for each bootstrap sample.
     """
     problem = _Problem(residuals, fit.names, fit.edge_ratio)
     start = problem.vector(fit)
@@ -101,22 +104,22 @@ def bootstrap_fit(
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Terms of the likelihood and its gradient for n errors at one parameter vector."""
+    """Quantities of the likelihood and its gradient for n errors at one parameter vector."""
 
     largest: Int64
-    """(n,) index of the largest term."""
+    """(n,) index of the largest std term of each sample."""
     variance: Float64
-    """(n,) modeled variance."""
+    """(n,) modeled variance of each error."""
     total: Float64
     """(n,) modeled variance plus variance of the truth."""
     inlier: Float64
-    """(n,) posterior probability of an inlier."""
+    """(n,) posterior probability that the error is an inlier."""
     log_density: Float64
-    """(n,) log density."""
+    """(n,) log density of each error."""
 
 
 class _Problem:
-    """Optimization problem of the fit.
+    """Maximum-likelihood problem of the std fit, solved by L-BFGS.
 
     The parameters are the logs of the factors, the log of the edge scale (with edges), and the
     logit of the ratio of gross errors relative to its maximum.
@@ -141,13 +144,13 @@ class _Problem:
         self._alone = self._factors_alone()
 
     def reweighted(self, repeats: Int64) -> _Problem:
-        """Return the problem with each image repeated the given number of times."""
+        """Return the problem with each image repeated, for a bootstrap sample."""
         other = copy(self)
         other._weights = self._weights * repeats[self._residuals.image]
         return other
 
     def starts(self) -> list[Float64]:
-        """Return start vectors: all terms equal, and each term dominant in turn."""
+        """Return start parameters with equal terms, and with each term dominant in turn."""
         count = len(self._names)
         rest = [0.0] * (self._edge_ratio is not None) + [-2.0]
         mixes = [np.zeros(count)]
@@ -156,18 +159,18 @@ class _Problem:
         return [np.concatenate([self._alone + mix, rest]) for mix in mixes]
 
     def vector(self, fit: StdFit) -> Float64:
-        """Return the parameter vector of a fit."""
+        """Convert a fit to the parameter vector of the optimization."""
         edges = [np.log(fit.edge_scale)] * (self._edge_ratio is not None)
         share = np.clip(fit.gross / MAX_GROSS, 1e-4, 1 - 1e-4)
         return np.concatenate([np.log(fit.values), edges, [np.log(share / (1 - share))]])
 
     def solve(self, start: Float64) -> tuple[Float64, float]:
-        """Minimize the negative log likelihood from a start; returns parameters and minimum."""
+        """Minimize the negative log likelihood and return parameters and minimum."""
         span = np.log(_RANGE)
         bounds = [(v - span, v + span) for v in self._alone]
         bounds += [(0.0, span)] * (self._edge_ratio is not None) + [(-9.0, 9.0)]
         best = minimize(self._objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
-        for _ in range(_RESTARTS):  # changes of the largest term invalidate the L-BFGS memory
+        for _ in range(_RESTARTS):  # A new largest term invalidates the L-BFGS memory.
             again = minimize(self._objective, best.x, jac=True, method="L-BFGS-B", bounds=bounds)
             gain = best.fun - again.fun
             best = again if gain > 0 else best
@@ -176,7 +179,7 @@ class _Problem:
         return np.asarray(best.x), float(best.fun)
 
     def finish(self, vector: Float64) -> StdFit:
-        """Set the common factor by coverage and build the fit."""
+        """Scale all factors to the coverage of one std and build the fit."""
         state = self._evaluate(vector)
         count = len(self._names)
         inside = np.maximum(self._squared - self._noise, 0) / state.variance
@@ -201,7 +204,7 @@ class _Problem:
         )
 
     def _limits(self, vector: Float64) -> Float64:
-        """Compute factors up to which other terms dominate; infinite for a single term."""
+        """Compute the factor below which each term is rarely the largest; infinite for one term."""
         count = len(self._names)
         limits = np.full(count, np.inf)
         scaled = self._terms * np.exp(vector[:count])
@@ -211,7 +214,7 @@ class _Problem:
         return limits
 
     def _factors_alone(self) -> Float64:
-        """Compute the log of each factor as the only term, from the median error."""
+        """Compute the log of each factor from the median error, if its term is the only term."""
         spread = MAD_TO_STD * np.median(np.abs(self._residuals.error))
         values: Float64 = np.log(max(spread, 1e-9) / np.median(self._terms, axis=0))
         return values
@@ -237,7 +240,7 @@ class _Problem:
     def _objective(self, vector: Float64) -> tuple[float, Float64]:
         """Compute the negative mean log density and its gradient."""
         state, weights, count = self._evaluate(vector), self._weights, len(self._names)
-        # d log density / d log std, through the variance
+        # Derivative of the log density by log std, through the variance.
         far = self._far(state.total)
         slope = weights * state.inlier * ((FREEDOM + 1) * far / (1 + far) - 1)
         slope *= state.variance / state.total
