@@ -1,7 +1,7 @@
 """Comparison of a provider's output with the ground truth, for each kind of provider.
 
 Each tolerance is several times the error of a correct provider on the synthetic views, and several
-times below the error of the mistakes that it detects. Each states both.
+times below the error of the mistakes that it detects.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def require_small_shift(
     map_pixel_px = max(1.0, width / shape[1], height / shape[0])
     limit = SHIFT_TOLERANCE_PX * map_pixel_px
     if shift.std > limit / 2:
-        raise CheckSkipped(f"a map of {shape[1]} x {shape[0]} is too coarse to see a shift")
+        raise CheckSkipped(f"a map of {shape[1]} x {shape[0]} is too coarse to measure a shift")
     text = f"shifted by ({shift.x:+.2f}, {shift.y:+.2f}) px"
     central = max(abs(shift.x), abs(shift.y))
     largest = central if case.truth_source == "image" else shift.largest

@@ -260,7 +260,7 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
     if not matching:
         plugin = find_plugin(registry, name)
         if plugin is not None and plugin.available:
-            raise ProviderError(f"{name} brings hooks and no providers to check")
+            raise ProviderError(f"{name} only has hooks and no providers to check")
         if plugin is not None:
             raise ProviderError(f"{name} {plugin.reason}; {plugin.install_hint}")
         candidates = {n for line in registry.status() for n in (line.name, line.distribution)}

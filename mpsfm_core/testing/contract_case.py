@@ -49,11 +49,12 @@ class ContractSetup:
 
     The values of ``truth_source`` are:
 
-    * ``"painted"``: a tiny test network decodes depth and normals from the colors of the views, see
-      :mod:`mpsfm_core.testing.painted_views`. * ``"prepared"``: ``prepare`` writes the ground truth
-      to files, for providers that read files. * ``"image"``: the correct output follows from a
-      textured view, with or without real weights. * ``"none"``: the ground truth is unknown, and
-      checks that need it are skipped.
+    * ``"painted"``: A tiny test network decodes depth and normals from the colors of the views, see
+      :mod:`mpsfm_core.testing.painted_views`.
+    * ``"prepared"``: The function ``prepare`` writes the ground truth to files, for providers that
+      read files.
+    * ``"image"``: The correct output follows from a textured view, with or without real weights.
+    * ``"none"``: The ground truth is unknown, and checks that need it are skipped.
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -71,7 +72,7 @@ class ContractSetup:
 
     def __post_init__(self) -> None:
         if self.truth_source == "prepared" and self.prepare is None:
-            raise ValueError("truth_source='prepared' needs prepare")
+            raise ValueError("truth_source='prepared' requires the function prepare")
         for check, reason in self.expected_failures.items():
             if not reason.strip():
                 raise ValueError(f"expected failure of {check!r} needs a reason")
@@ -139,7 +140,7 @@ class ContractCase:
         """
         if self.truth_source == "none":
             raise CheckSkipped(
-                "the correct answer is unknown: declare a truth_source in the contract setup "
+                "the ground truth is unknown: declare a truth_source in the ContractSetup "
                 "(docs/contract.md)"
             )
         if self.truth_source not in sources:

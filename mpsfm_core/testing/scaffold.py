@@ -33,9 +33,9 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> list[Path]:
     """
     module = name.replace("-", "_")
     if not _NAME.fullmatch(name) or keyword.iskeyword(module):
-        raise InputError(f"{name!r} is not made of lower-case letters, digits and single dashes")
+        raise InputError(f"{name!r} may only have lower-case letters, digits and single dashes")
     if importlib.util.find_spec(module) is not None:
-        raise InputError(f"there is a module {module!r} already: choose another name")
+        raise InputError(f"a module {module!r} exists: choose another name")
     target = folder / name
     if target.exists():
         raise InputError(f"{target} exists already")

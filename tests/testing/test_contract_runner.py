@@ -72,7 +72,7 @@ def test_expected_failures_need_a_reason_and_a_check() -> None:
 
 
 def test_told_needs_somebody_to_tell() -> None:
-    with pytest.raises(ValueError, match="needs prepare"):
+    with pytest.raises(ValueError, match="requires the function prepare"):
         ContractSetup(truth_source="prepared")
 
 
@@ -147,7 +147,7 @@ def test_a_plugin_without_providers_has_nothing_to_check(install_plugin: Any) ->
             return pairs
     """
     install_plugin("mpsfm-hooks", source)
-    with pytest.raises(ProviderError, match="mpsfm-hooks brings hooks and no providers to check"):
+    with pytest.raises(ProviderError, match="mpsfm-hooks only has hooks and no providers to check"):
         find_providers(Registry.discover(), "mpsfm-hooks")
 
 

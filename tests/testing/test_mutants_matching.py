@@ -173,12 +173,12 @@ class WantsTwoNeighbours(MutualNearest):
 @pytest.mark.parametrize(
     ("factory", "check", "message"),
     [
-        (ColumnsSwapped, "matcher-sides", "matches are right"),
-        (SortsViews, "matcher-order", "indices: must be below|matches are right"),
+        (ColumnsSwapped, "matcher-sides", "matches are correct"),
+        (SortsViews, "matcher-order", "indices: must be below|matches are correct"),
         (OutOfRange, "output-rules", "indices: must be below"),
         (Duplicates, "output-rules", "must use each feature at most once"),
         (Percent, "output-rules", r"scores: must lie in \[0, 1\]"),
-        (Distances, "matcher-scores", "right matches score 0.1.*, wrong ones 0.[89]"),
+        (Distances, "matcher-scores", "correct matches score 0.1.*, wrong matches 0.[89]"),
         (WantsFeatures, "matcher-no-features", "out of bounds"),
         (WantsTwoNeighbours, "matcher-few-features", "kth"),
     ],
@@ -218,7 +218,7 @@ class DepthOfRays(ToldMatcher):
     [
         (SidesSwapped, "matcher-sides", "the two sides are exchanged"),
         (DenseIntegerCentres, "matcher-pixel-convention", r"shifted by \(\+0.50, \+0.50\) px"),
-        (DepthSwapped, "matcher-pair-depth", "the two sides are exchanged"),
+        (DepthSwapped, "matcher-pair-depth", "depth_a and depth_b are swapped"),
         (DepthOfRays, "matcher-pair-depth", r"depth is proportional to z \* \(ray length / z\)"),
     ],
 )
@@ -264,7 +264,7 @@ class Hash(Thumbnail):
         (Infinite, "output-rules", "descriptor: must be finite"),
         (Rows, "retrieval-dimension", "descriptors have .* and .* values"),
         (NotNormalised, "retrieval-self-similarity", "lengths of descriptors are"),
-        (Hash, "retrieval-overlap", "to its neighbour"),
+        (Hash, "retrieval-overlap", "to a neighboring view"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:divide by zero", "ignore:invalid value")
@@ -312,7 +312,7 @@ class LeftHalf(PaintedMask):
         (Grey, "output-rules", "2-dimensional bool"),
         (Displaced, "mask-place", "of the pixels have the wrong value"),
         (Backwards, "mask-channel-order", "follows the blue channel"),
-        (LeftHalf, "mask-flip", "of the pixels of the mirrored view"),
+        (LeftHalf, "mask-flip", "the mask of the mirrored view differs"),
     ],
 )
 def test_masks(caught: Callable[..., None], factory: type, check: str, message: str) -> None:

@@ -198,9 +198,9 @@ class Chains(Changed):
     ("factory", "check", "message"),
     [
         (RayLength, "depth-is-z", "is the length of the ray"),
-        (Std, "depth-variance", "is the std itself"),
-        (LastFirst, "multiview-order", "another order than the views"),
-        (EachItsOwn, "multiview-one-unit", "differ in their unit, by"),
+        (Std, "depth-variance", "equals the std"),
+        (LastFirst, "multiview-order", "order of the maps differs"),
+        (EachItsOwn, "multiview-one-unit", "units of the maps in one group differ by"),
         (AlongTheFirst, "multiview-own-axis", "it is z of the first view"),
         (GroupFromCamera, "multiview-poses", "they are group_from_cam"),
         (OpenGL, "multiview-poses", "off by .* degrees"),

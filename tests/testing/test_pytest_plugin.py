@@ -77,7 +77,7 @@ def test_by_option_with_options(site: Path, tmp_path: Path) -> None:
     code, output = run_pytest(tmp_path, *arguments)
     assert code == 0
     assert "1 passed, 1 skipped" in output
-    assert "correct answer is unknown" in output
+    assert "ground truth is unknown" in output
 
 
 def test_by_option_without_such_a_plugin(site: Path, tmp_path: Path) -> None:
@@ -94,7 +94,7 @@ def test_in_a_file_of_ones_own(site: Path, tmp_path: Path) -> None:
     code, output = run_pytest(tmp_path, "-q", "-k", "is-z or depth-scale")
     assert code == 1
     assert "1 failed, 1 passed" in output
-    assert "is called metric and is 3 times too large" in output
+    assert "is declared metric and is 3 times the true depth" in output
 
 
 def test_others_pay_nothing(tmp_path: Path) -> None:

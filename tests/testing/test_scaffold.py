@@ -96,7 +96,7 @@ def test_the_command(tmp_path: Path) -> None:
     [
         ("My_Depth", "lower-case letters"),
         ("class", "lower-case letters"),
-        ("numpy", "there is a module 'numpy' already"),
+        ("numpy", "a module 'numpy' exists"),
     ],
 )
 def test_names_that_are_no_good(name: str, message: str, tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ def check_specification(case: ContractCase) -> str:
         raise CheckFailed("a wrapper has to declare 'wraps-depth' or 'wraps-normals'")
     case.registry.validate_options(case.spec.kind, case.spec.name, case.setup.options)
     if case.spec.code_license == "unknown":
-        return "code_license is not declared; users will ask for it"
+        return "declare code_license, which users need to know"
     return ""
 
 
@@ -85,7 +85,7 @@ def check_light_import(case: ContractCase) -> str:
     process = subprocess.run(command, capture_output=True, text=True)
     if process.returncode:
         last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
-        raise CheckFailed(f"importing it fails: {last_line}")
+        raise CheckFailed(f"importing the plugin module fails: {last_line}")
     # The last line is the result; native code of a plugin may print other lines.
     seconds, heavy = json.loads(process.stdout.splitlines()[-1])
     if heavy:
@@ -157,7 +157,7 @@ def check_inputs_unchanged(case: ContractCase) -> None:
     for name, old, new in zip(("image", "mask", "depth or features"), before, after, strict=True):
         difference = describe_difference(old, new)
         if difference:
-            raise CheckFailed(f"changes the {name} it is given: {difference}")
+            raise CheckFailed(f"modifies its input {name}: {difference}")
 
 
 def check_name_does_not_matter(case: ContractCase) -> None:
@@ -169,7 +169,7 @@ def check_name_does_not_matter(case: ContractCase) -> None:
     if case.declares("uncached"):
         raise CheckSkipped("declares 'uncached'")
     if case.setup.prepare is not None:
-        raise CheckSkipped("the setup prepares files by the names of views")
+        raise CheckSkipped("the ContractSetup prepares one file per view name")
     expected = case.run(case.example)
     renamed = replace(case.example.view, name="another/name.jpg")
     _require_same(expected, case.run_on_view(renamed, case.example), "of a renamed view")
@@ -193,7 +193,9 @@ def check_intrinsics_declared(case: ContractCase) -> None:
         expected, answer = _select_valid_in_both(expected, answer)
     difference = describe_difference(expected, answer)
     if difference:
-        raise CheckFailed(f"depends on the focal length and does not declare it: {difference}")
+        raise CheckFailed(
+            f"depends on the focal length without declaring 'intrinsics-aware': {difference}"
+        )
 
 
 def check_threads(case: ContractCase) -> None:
@@ -225,8 +227,8 @@ def check_threads(case: ContractCase) -> None:
         thread.join()
     for expected, answer in zip(alone, parallel, strict=True):
         if isinstance(answer, Exception):
-            raise CheckFailed(f"in two threads in parallel: {answer}") from answer
-        _require_same(expected, answer, "in two threads in parallel")
+            raise CheckFailed(f"in two parallel threads: {answer}") from answer
+        _require_same(expected, answer, "in two parallel threads")
 
 
 def check_pickles(case: ContractCase) -> None:
@@ -241,7 +243,7 @@ def check_pickles(case: ContractCase) -> None:
             copy = pickle.loads(pickle.dumps(value))
         except Exception as error:
             reason = f"{type(error).__name__}: {error}"
-            raise CheckFailed(f"its {name} cannot be pickled: {reason}") from error
+            raise CheckFailed(f"the {name} cannot be pickled: {reason}") from error
     _require_same(answer, copy, "after pickling")
 
 
@@ -257,9 +259,9 @@ def check_offline(case: ContractCase) -> None:
         except Exception as error:
             if not attempts:
                 raise
-            raise CheckFailed(f"fails without network: {error}") from error
+            raise CheckFailed(f"fails without network access: {error}") from error
     if attempts:
-        raise CheckFailed(f"goes to the network: {attempts[0]}")
+        raise CheckFailed(f"opens a network connection: {attempts[0]}")
 
 
 def check_memory_released(case: ContractCase) -> str:
@@ -286,8 +288,8 @@ def check_memory_released(case: ContractCase) -> str:
     finally:
         tracemalloc.stop()
     if retained > _MAX_RETAINED_BYTES:
-        raise CheckFailed(f"keeps {retained / 1000:.0f} kB of each view")
-    return f"keeps {max(retained, 0) / 1000:.1f} kB a view"
+        raise CheckFailed(f"retains {retained / 1000:.0f} kB per view")
+    return f"retains {max(retained, 0) / 1000:.1f} kB per view"
 
 
 def check_speed(case: ContractCase) -> str:
@@ -396,7 +398,7 @@ COMMON = (
 def _require_same(expected: object, answer: object, when: str) -> None:
     difference = describe_difference(expected, answer)
     if difference:
-        raise CheckFailed(f"the answer {when} differs: {difference}")
+        raise CheckFailed(f"the output {when} differs: {difference}")
 
 
 def _select_valid_in_both(first: NormalPrior, second: NormalPrior) -> tuple[object, object]:
@@ -440,7 +442,7 @@ def _forbid_sockets() -> Iterator[list[str]]:
 
     def refuse(*arguments: Any, **_: Any) -> Any:
         attempts.append(str(next((a for a in arguments if not isinstance(a, socket.socket)), "")))
-        raise OSError("the network is switched off by the contract kit")
+        raise OSError("network access is disabled during this contract check")
 
     replaced: list[tuple[Any, str]] = [(socket.socket, "connect"), (socket.socket, "connect_ex")]
     replaced += [(socket.socket, "sendto"), (socket, "getaddrinfo"), (socket, "create_connection")]

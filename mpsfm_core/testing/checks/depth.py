@@ -56,7 +56,7 @@ def check_depth_is_z(case: ContractCase) -> str:
     power = map_errors.estimate_ray_exponent(_run(case), case.example)
     if abs(power) > RAY_TOLERANCE:
         kind = "the length of the ray" if abs(power - 1) < RAY_TOLERANCE else "something else"
-        raise CheckFailed(f"is {kind}: it is proportional to z * (ray length / z) ** {power:.2f}")
+        raise CheckFailed(f"depth is {kind}: proportional to z * (ray length / z) ** {power:.2f}")
     return f"z * (ray length / z) ** {power:.3f}"
 
 
@@ -67,10 +67,10 @@ def check_depth_scale(case: ContractCase) -> str:
     errors = map_errors.log_errors(prior, case.example, any_scale=not prior.metric)
     factor = float(np.exp(np.median(errors)))
     if abs(np.log(factor)) > DEPTH_TOLERANCE:
-        raise CheckFailed(f"is called metric and is {factor:.3g} times too large")
+        raise CheckFailed(f"depth is declared metric and is {factor:.3g} times the true depth")
     spread = map_errors.error_quantile(errors - np.median(errors))
     if spread > DEPTH_TOLERANCE:
-        raise CheckFailed(f"is not proportional to z: relative error {spread:.2g}")
+        raise CheckFailed(f"depth is not proportional to z: relative error {spread:.2g}")
     return f"factor {factor:.3f}, relative error {spread:.2g}"
 
 
@@ -82,7 +82,9 @@ def check_depth_channel_order(case: ContractCase) -> None:
     right = _median_deviation(prior, truth.depth, truth.smooth)
     swapped = read_depth(swap_painted_channels(case.example, prior.shape))
     if _median_deviation(prior, swapped, truth.smooth & (swapped > 0)) < right:
-        raise CheckFailed("follows the blue channel where it should follow the red one")
+        raise CheckFailed(
+            "the network receives BGR instead of RGB: the output follows the blue channel"
+        )
 
 
 def check_depth_pixel_convention(case: ContractCase) -> str:
@@ -125,15 +127,19 @@ def check_depth_flip(case: ContractCase) -> str:
     """
     prior, mirrored = _run(case), first_depth(case.run(case.example.mirror()))
     if prior.shape != mirrored.shape:
-        raise CheckFailed(f"has shape {mirrored.shape} on the mirrored view, else {prior.shape}")
+        raise CheckFailed(
+            f"the map of the mirrored view has shape {mirrored.shape}, not {prior.shape}"
+        )
     both = prior.valid & mirrored.valid[:, ::-1] & case.example.truth(prior.shape).smooth
     if not both.any():
-        raise CheckFailed("has no pixel that is valid in the view and in the mirrored one")
+        raise CheckFailed("no pixel is valid in both the view and the mirrored view")
     ratio = np.log(prior.depth[both] / mirrored.depth[:, ::-1][both].astype(np.float64))
     found = map_errors.error_quantile(ratio)
     limit = FLIP_TOLERANCE if case.truth_source == "none" else DEPTH_TOLERANCE
     if found > limit:
-        raise CheckFailed(f"differs by {found:.1%} on the mirrored view, {limit:.0%} is allowed")
+        raise CheckFailed(
+            f"depth of the mirrored view differs by {found:.1%}, {limit:.0%} is allowed"
+        )
     return f"relative difference {found:.2g}"
 
 
@@ -152,7 +158,9 @@ def check_depth_same_in_larger_view(case: ContractCase) -> str:
     ]
     factor = float(np.exp(medians[1] - medians[0]))
     if abs(np.log(factor)) > DEPTH_TOLERANCE:
-        raise CheckFailed(f"grows {factor:.3g} times when image and intrinsics are enlarged twice")
+        raise CheckFailed(
+            f"depth grows {factor:.3g} times if image and intrinsics are enlarged twice"
+        )
     return f"factor {factor:.3f}"
 
 
@@ -169,11 +177,11 @@ def check_depth_intrinsics(case: ContractCase) -> str:
     changed = first_depth(case.run_on_view(replace(case.example.view, camera=longer), case.example))
     both = prior.valid & changed.valid
     if not both.any():
-        raise CheckFailed("has no pixel that is valid with both focal lengths")
+        raise CheckFailed("no pixel is valid with both focal lengths")
     factor = float(np.median(changed.depth[both] / prior.depth[both]))
     if not _FOCAL_RANGE[0] < factor < _FOCAL_RANGE[1]:
         raise CheckFailed(
-            f"changes by {factor:.2f} for a focal length {FOCAL_FACTOR} times as long"
+            f"depth changes by {factor:.2f} if the focal length grows {FOCAL_FACTOR} times"
         )
     return f"factor {factor:.2f} for {FOCAL_FACTOR} times the focal length"
 
@@ -208,7 +216,7 @@ def check_depth_joint(case: ContractCase) -> str:
     depth, normals = validation.run_joint(case.spec, case.provider, case.example.view)
     changed = describe_difference(_run(case), depth)
     if changed:
-        raise CheckFailed(f"predict_joint gives another depth than predict: {changed}")
+        raise CheckFailed(f"predict_joint and predict return different depth: {changed}")
     return _compare_joint_normals(case, normals)
 
 
@@ -229,7 +237,10 @@ def check_depth_focal(case: ContractCase) -> str:
             raise CheckSkipped("estimates no focal length with these options")
         found.append(focal)
     if not 1.5 < found[1] / found[0] < 2.7:
-        raise CheckFailed(f"estimates {found[0]:.0f} px, and {found[1]:.0f} px at twice the size")
+        raise CheckFailed(
+            f"the estimated focal length is {found[0]:.0f} px, and {found[1]:.0f} px at twice the "
+            f"image size"
+        )
     return f"{found[0]:.0f} px, the truth is {case.example.camera.fx:.0f} px"
 
 
@@ -262,7 +273,7 @@ def _compare_joint_normals(case: ContractCase, normals: NormalPrior) -> str:
         return "the true normals are unknown"
     angle = map_errors.error_quantile(map_errors.angle_errors_deg(normals, case.example))
     if angle > NORMALS_TOLERANCE_DEG:
-        raise CheckFailed(f"its normals are {angle:.0f} degrees off")
+        raise CheckFailed(f"normals of predict_joint are {angle:.0f} degrees off")
     return f"normals off by {angle:.2g} degrees"
 
 

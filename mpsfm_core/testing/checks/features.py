@@ -49,8 +49,8 @@ def check_features_axes(case: ContractCase) -> str:
     if inside < _MIN_INSIDE_RATIO:
         swapped = float(((y >= left - margin) & (x <= bottom + margin)).mean())
         reason = ": x and y are swapped" if swapped > inside else ""
-        raise CheckFailed(f"only {inside:.0%} of the keypoints are where there is texture{reason}")
-    return f"{inside:.0%} of the keypoints are where there is texture"
+        raise CheckFailed(f"only {inside:.0%} of the keypoints are on the textured part{reason}")
+    return f"{inside:.0%} of the keypoints are on the textured part"
 
 
 def check_features_pixel_convention(case: ContractCase) -> str:
@@ -70,7 +70,9 @@ def check_features_pixel_convention(case: ContractCase) -> str:
     offsets = _offsets_to_nearest(found.keypoints, back, radius) / 2
     if len(offsets) < max(_MIN_COUNT, _MIN_REPEATED_RATIO * len(found)):
         text = f"{len(offsets)} of {len(found)} keypoints"
-        raise CheckSkipped(f"repeats only {text} in the rotated view, too few for this check")
+        raise CheckSkipped(
+            f"the detector repeats only {text} in the rotated view, too few for this check"
+        )
     x, y = offsets.mean(axis=0)
     text = f"shifted by ({x:+.2f}, {y:+.2f}) px"
     limit = PIXEL_TOLERANCE * max(1.0, found.std_px)
@@ -107,11 +109,11 @@ def check_features_large_view(case: ContractCase) -> str:
     inside = float(((x >= left - margin) & (y >= top - margin)).mean())
     if inside < _MIN_INSIDE_RATIO:
         raise CheckFailed(
-            f"only {inside:.0%} of the keypoints of a {width} x {height} view are where there is "
-            f"texture, the largest are x = {x.max():.0f}, y = {y.max():.0f}: keypoints of a "
-            f"reduced image have to be scaled back"
+            f"only {inside:.0%} of the keypoints of a {width} x {height} view are on the textured "
+            f"part, the largest are x = {x.max():.0f}, y = {y.max():.0f}: scale the keypoints of a "
+            f"reduced image back"
         )
-    return f"{inside:.0%} of {len(features)} keypoints are where there is texture"
+    return f"{inside:.0%} of {len(features)} keypoints are on the textured part"
 
 
 def check_features_descriptors(case: ContractCase) -> str:
@@ -129,7 +131,7 @@ def check_features_descriptors(case: ContractCase) -> str:
     distance = np.linalg.norm(b.keypoints[columns] - true.xy_b, axis=1)
     right = (distance < 3 * max(1.0, a.std_px, b.std_px))[true.visible]
     if len(right) < _MIN_COUNT:
-        raise CheckSkipped(f"only {len(right)} mutual nearest neighbours")
+        raise CheckSkipped(f"only {len(right)} mutual nearest neighbors")
     if right.mean() < _MIN_CORRECT_RATIO:
         raise CheckFailed(f"only {right.mean():.0%} of the nearest descriptors are the same point")
     return f"{right.mean():.0%} of the nearest descriptors are the same point"
@@ -160,7 +162,9 @@ CHECKS = (
 def _require_enough(features: Features) -> None:
     """Require that the detector finds keypoints in a textured view."""
     if len(features) < _MIN_COUNT:
-        raise CheckFailed(f"finds only {len(features)} keypoints in a view full of texture")
+        raise CheckFailed(
+            f"the detector finds only {len(features)} keypoints in a fully textured view"
+        )
 
 
 def _offsets_to_nearest(found: Float64, others: Float64, radius: float) -> Float64:

@@ -40,8 +40,8 @@ def require_reported_std(variance: Float32, expected_std: Float64) -> str:
     if 1 / STD_FACTOR < factor < STD_FACTOR:
         return f"std {factor:.3f} times the reported one"
     if 1 / STD_FACTOR < float(np.median(variance / expected_std)) < STD_FACTOR:
-        raise CheckFailed("the variance is the std itself: it has to be squared")
-    raise CheckFailed(f"the std is {factor:.2g} times what the stand-in reports")
+        raise CheckFailed("the variance equals the std: return the squared std")
+    raise CheckFailed(f"the std is {factor:.2g} times the std that the test network reports")
 
 
 def require_true_validity(valid: Bool, truth: TrueMaps) -> str:
@@ -60,7 +60,7 @@ def require_true_validity(valid: Bool, truth: TrueMaps) -> str:
     """
     empty, full = truth.edge_free & ~truth.valid, truth.smooth
     if not (empty.any() and full.any()):
-        raise CheckSkipped("the map is too coarse to tell surfaces from sky")
+        raise CheckSkipped("the map is too coarse to separate surfaces from sky")
     wrong, lost = float(valid[empty].mean()), float(1 - valid[full].mean())
     if wrong > VALIDITY_TOLERANCE:
         raise CheckFailed(f"{wrong:.0%} of the pixels without any surface are valid")

@@ -20,7 +20,9 @@ def check_mask_polarity(case: ContractCase) -> str:
     answer, truth = case.run(case.example), case.example.truth()
     agreement = float((answer == truth.valid)[truth.edge_free].mean())
     if agreement < MASK_TOLERANCE:
-        raise CheckFailed(f"is inverted: {1 - agreement:.0%} of the pixels have the wrong value")
+        raise CheckFailed(
+            f"the mask is inverted: {1 - agreement:.0%} of the pixels have the wrong value"
+        )
     return f"{agreement:.1%} of the pixels agree"
 
 
@@ -42,7 +44,9 @@ def check_mask_channel_order(case: ContractCase) -> None:
         float((answer == expected)[truth.edge_free].mean()) for expected in (truth.valid, swapped)
     )
     if right < 1 - MASK_TOLERANCE <= backwards:
-        raise CheckFailed("follows the blue channel where it should follow the red one")
+        raise CheckFailed(
+            "the network receives BGR instead of RGB: the output follows the blue channel"
+        )
 
 
 def check_mask_flip(case: ContractCase) -> str:
@@ -51,7 +55,7 @@ def check_mask_flip(case: ContractCase) -> str:
     where = case.example.truth().edge_free
     wrong = float((answer != np.asarray(mirrored)[:, ::-1])[where].mean())
     if wrong > MASK_TOLERANCE:
-        raise CheckFailed(f"differs at {wrong:.0%} of the pixels of the mirrored view")
+        raise CheckFailed(f"the mask of the mirrored view differs at {wrong:.0%} of the pixels")
     return f"differs at {wrong:.1%} of the pixels"
 
 

@@ -50,7 +50,7 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
     Integer pixel centers shift the matched coordinates.
     """
     if not case.declares("dense"):
-        raise CheckSkipped("sparse: positions are the keypoints'")
+        raise CheckSkipped("sparse matches have the positions of the keypoints")
     case.require_truth("image", "prepared")
     width, height = case.example.camera.size
     small, large = case.example.sized(width // 2, height // 2), case.example
@@ -59,32 +59,36 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
     residual = matches.points_b - 2 * matches.points_a
     near = np.abs(residual).max(axis=1) < 4 * max(1.0, matches.std_px)
     if near.sum() < MIN_MATCHES:
-        raise CheckSkipped(f"only {near.sum()} matches between a view and its reduction")
+        raise CheckSkipped(
+            f"only {near.sum()} matches between a view and its copy at half the size"
+        )
     shift = np.median(residual[near], axis=0)
     limit = SHIFT_TOLERANCE * max(1.0, matches.std_px)
     text = f"shifted by ({shift[0]:+.2f}, {shift[1]:+.2f}) px"
     if np.abs(shift).max() > limit:
-        raise CheckFailed(f"matches between a view and its reduction are {text}")
+        raise CheckFailed(f"matches between a view and its copy at half the size are {text}")
     return text
 
 
 def check_matcher_no_features(case: ContractCase) -> None:
     """Require empty output if a view has no features."""
     if not case.declares("sparse"):
-        raise CheckSkipped("needs no features")
+        raise CheckSkipped("the matcher needs no features")
     a, b = case.example, case.example.partner
     some = case.extract_features(a.view, b.view)
     none = _take_first(some[0], 0), _take_first(some[1], 0)
     for given in ((some[0], none[1]), (none[0], some[1]), none):
         found = validation.run_matcher(case.spec, case.provider, (a.view, b.view), given)
         if found.sparse is not None and len(found.sparse):
-            raise CheckFailed(f"finds {len(found.sparse)} matches where a view has no features")
+            raise CheckFailed(
+                f"the matcher returns {len(found.sparse)} matches for a view without features"
+            )
 
 
 def check_matcher_few_features(case: ContractCase) -> None:
     """Require valid output for one or two features."""
     if not case.declares("sparse"):
-        raise CheckSkipped("needs no features")
+        raise CheckSkipped("the matcher needs no features")
     a, b = case.example, case.example.partner
     some = case.extract_features(a.view, b.view)
     for count_a, count_b in ((1, 1), (2, 1), (1, len(some[1]))):
@@ -99,7 +103,7 @@ def check_matcher_many_features(case: ContractCase) -> str:
     run.
     """
     if not case.declares("sparse"):
-        raise CheckSkipped("needs no features")
+        raise CheckSkipped("the matcher needs no features")
     a, b = case.example, case.example.partner
     features = case.extract_features(a.view, b.view)
     if not (len(features[0]) and len(features[1])):
@@ -124,8 +128,8 @@ def check_matcher_scores(case: ContractCase) -> str:
         return f"{right.sum()} right and {(~right).sum()} wrong matches: too few to compare"
     means = matches.scores[right].mean(), matches.scores[~right].mean()
     if means[0] < means[1]:
-        raise CheckFailed(f"right matches score {means[0]:.2f}, wrong ones {means[1]:.2f}")
-    return f"right matches score {means[0]:.2f}, wrong ones {means[1]:.2f}"
+        raise CheckFailed(f"correct matches score {means[0]:.2f}, wrong matches {means[1]:.2f}")
+    return f"correct matches score {means[0]:.2f}, wrong matches {means[1]:.2f}"
 
 
 def check_matcher_pair_depth(case: ContractCase) -> str:
@@ -141,7 +145,7 @@ def check_matcher_pair_depth(case: ContractCase) -> str:
             raise CheckFailed(f"depth is proportional to z * (ray length / z) ** {power:.2f}")
     error = max(_depth_error(depth.depth_a, a), _depth_error(depth.depth_b, b))
     if max(_depth_error(depth.depth_a, b), _depth_error(depth.depth_b, a)) < 0.5 * error:
-        raise CheckFailed("depth: the two sides are exchanged")
+        raise CheckFailed("depth_a and depth_b are swapped")
     if error > DEPTH_TOLERANCE:
         raise CheckFailed(f"depth has a relative error of {error:.2g}")
     return f"relative error {error:.2g}"
@@ -169,14 +173,16 @@ def _require_correct(case: ContractCase, a: Example, b: Example) -> str:
         exchanged = replace(matches, points_a=matches.points_b, points_b=matches.points_a)
         swapped = float((match_errors_px(a, b, exchanged) < limit).mean())
         reason = ": the two sides are exchanged" if swapped > 2 * right else ""
-        raise CheckFailed(f"only {right:.0%} of {len(matches)} matches are right{reason}")
-    return f"{right:.0%} of {len(matches)} matches are right"
+        raise CheckFailed(f"only {right:.0%} of {len(matches)} matches are correct{reason}")
+    return f"{right:.0%} of {len(matches)} matches are correct"
 
 
 def _require_enough(count: int) -> None:
     """Require that the matcher finds matches between views that overlap."""
     if count < MIN_MATCHES:
-        raise CheckFailed(f"finds only {count} matches between views that overlap by 90 %")
+        raise CheckFailed(
+            f"the matcher finds only {count} matches between views that overlap by 90 %"
+        )
 
 
 def _depth_error(prior: DepthPrior, example: Example) -> float:

@@ -41,7 +41,7 @@ def check_multiview_order(case: ContractCase) -> None:
     group = case.run_on_group(*examples)
     right = max(map(_scale_free_error, group.depth, examples))
     if max(map(_scale_free_error, group.depth[::-1], examples)) < 0.5 * right:
-        raise CheckFailed("the maps come in another order than the views")
+        raise CheckFailed("the order of the maps differs from the order of the views")
 
 
 def check_multiview_own_axis(case: ContractCase) -> str:
@@ -73,7 +73,7 @@ def check_multiview_one_unit(case: ContractCase) -> str:
     factors = _log_factors(case.run_on_group(*examples), examples)
     spread = float(np.ptp(factors))
     if spread > DEPTH_TOLERANCE:
-        raise CheckFailed(f"the maps of one group differ in their unit, by {np.expm1(spread):.0%}")
+        raise CheckFailed(f"the units of the maps in one group differ by {np.expm1(spread):.0%}")
     return f"units differ by {np.expm1(spread):.1%}"
 
 

@@ -62,7 +62,9 @@ def check_normals_channel_order(case: ContractCase) -> None:
         _angle_error_deg(prior.normals[where], values[where]) for values in (truth.normals, swapped)
     ]
     if angles[1] < angles[0]:
-        raise CheckFailed("follows the channels in the order blue, green, red")
+        raise CheckFailed(
+            "the network receives BGR instead of RGB: the normals follow the wrong channels"
+        )
 
 
 def check_normals_pixel_convention(case: ContractCase) -> str:
@@ -91,15 +93,17 @@ def check_normals_flip(case: ContractCase) -> str:
     """
     prior, mirrored = _run(case), case.run(case.example.mirror())
     if prior.shape != mirrored.shape:
-        raise CheckFailed(f"has shape {mirrored.shape} on the mirrored view, else {prior.shape}")
+        raise CheckFailed(
+            f"the map of the mirrored view has shape {mirrored.shape}, not {prior.shape}"
+        )
     both = prior.valid & mirrored.valid[:, ::-1] & case.example.truth(prior.shape).smooth
     if not both.any():
-        raise CheckFailed("has no pixel that is valid in the view and in the mirrored one")
+        raise CheckFailed("no pixel is valid in both the view and the mirrored view")
     back = mirrored.normals[:, ::-1] * (-1.0, 1.0, 1.0)
     angle = _angle_error_deg(prior.normals[both], back[both])
     limit = FLIP_TOLERANCE_DEG if case.truth_source == "none" else NORMALS_TOLERANCE_DEG
     if angle > limit:
-        raise CheckFailed(f"differs by {angle:.0f} degrees on the mirrored view")
+        raise CheckFailed(f"normals of the mirrored view differ by {angle:.0f} degrees")
     return f"angle {angle:.2g} degrees"
 
 

@@ -55,8 +55,10 @@ def check_retrieval_overlap(case: ContractCase) -> str:
     similarity = [float(case.run(example).astype(np.float64) @ case.run(e)) for e in examples]
     neighbor, unrelated = min(similarity[:2]), max(similarity[2:])
     if neighbor <= unrelated:
-        raise CheckFailed(f"similarity {neighbor:.3f} to its neighbour, {unrelated:.3f} to another")
-    return f"similarity {neighbor:.3f} to its neighbour, {unrelated:.3f} to another scene"
+        raise CheckFailed(
+            f"similarity {neighbor:.3f} to a neighboring view, {unrelated:.3f} to another scene"
+        )
+    return f"similarity {neighbor:.3f} to a neighboring view, {unrelated:.3f} to another scene"
 
 
 CHECKS = (

@@ -1,7 +1,6 @@
-"""Checks of wrappers.
+"""Contract checks of wrappers around a provider that returns the ground truth.
 
-Contract checks of wrappers, which are put around a provider that returns the ground truth. A
-wrapper has to pass the checks of this module and all checks of the kind that it wraps.
+A wrapper has to pass the checks of this module and all checks of the kind that it wraps.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ def check_wrapper_keeps_variance(case: ContractCase) -> None:
     The calibration of the wrapped provider expects a variance.
     """
     if case.run(case.example).variance is None:
-        raise CheckFailed("drops the variance of the provider it wraps")
+        raise CheckFailed("the wrapper drops the variance of the wrapped provider")
 
 
 def check_wrapper_without_variance(case: ContractCase) -> None:
@@ -32,7 +31,9 @@ def check_wrapper_keeps_unit(case: ContractCase) -> None:
         raise CheckSkipped("applies to depth only")
     for metric in (True, False):
         if case.run(case.example, case.create_provider(metric=metric)).metric != metric:
-            raise CheckFailed(f"calls depth metric={not metric} that the provider calls {metric}")
+            raise CheckFailed(
+                f"returns depth with metric={not metric}, the wrapped provider with {metric}"
+            )
 
 
 def check_wrapper_uses_the_provider(case: ContractCase) -> str:
@@ -45,10 +46,12 @@ def check_wrapper_uses_the_provider(case: ContractCase) -> str:
     once, twice = case.run(case.example), case.run(case.example, case.create_provider(scale=2.0))
     both = once.valid & twice.valid
     if not both.any():
-        raise CheckFailed("has no pixel that is valid both times")
+        raise CheckFailed("no pixel is valid in both outputs")
     factor = float(np.median(twice.depth[both] / once.depth[both]))
     if abs(factor - 2) > 0.05:
-        raise CheckFailed(f"twice the depth inside is {factor:.2f} times the depth outside")
+        raise CheckFailed(
+            f"if the wrapped depth doubles, the wrapper's depth grows {factor:.2f} times"
+        )
     return f"factor {factor:.2f}"
 
 
@@ -62,7 +65,7 @@ def check_wrapper_hands_on_depth(case: ContractCase) -> None:
     case.run(case.example, case.create_provider())
     given = case.received_depth()
     if not given or any(depth is None for depth in given):
-        raise CheckFailed("does not hand on the depth prior to the provider it wraps")
+        raise CheckFailed("the wrapper does not pass the depth prior to the wrapped provider")
 
 
 CHECKS = (

@@ -168,8 +168,8 @@ class Rendering:
     Normals face the camera along the ray, so n_z can be positive at grazing angles off the axis.
     """
 
-    depth: Float32  # (h, w), meters along z
-    normals: Float32  # (h, w, 3), unit, camera frame
+    depth: Float32  # (h, w), z-depth in meters
+    normals: Float32  # (h, w, 3), unit normals in the camera frame
     _colors: Callable[[], UInt8]
 
     @cached_property
@@ -181,19 +181,19 @@ class Rendering:
 class SurfaceSamples(NamedTuple):
     """Surface points seen at given pixels; entries are 0 where ``valid`` is false."""
 
-    points: Float64  # (n, 3), world
-    depth: Float64  # (n,), meters along z
-    normals: Float64  # (n, 3), camera frame, facing the camera
-    surface: Int64  # (n,), index into the scene's surfaces
-    valid: Bool  # (n,)
+    points: Float64  # (n, 3), points in the world frame, in meters
+    depth: Float64  # (n,), z-depth in meters
+    normals: Float64  # (n, 3), unit normals in the camera frame that face the camera
+    surface: Int64  # (n,), indices of the surfaces of the scene
+    valid: Bool  # (n,), True where the pixel shows a surface
 
 
 class TrueCorrespondences(NamedTuple):
     """Exact positions in view b of surface points that are seen in view a."""
 
-    xy_b: Float64  # (n, 2), pixels; 0 where not visible
-    points: Float64  # (n, 3), world
-    visible: Bool  # (n,): inside image b and not occluded there
+    xy_b: Float64  # (n, 2), pixels in view b; 0 where view b does not see the point
+    points: Float64  # (n, 3), points in the world frame, in meters
+    visible: Bool  # (n,), True where view b sees the point without occlusion
 
 
 @dataclass(frozen=True)

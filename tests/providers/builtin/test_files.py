@@ -185,7 +185,7 @@ def test_damaged(suffix, folder: Path, context: ProviderContext) -> None:
 
 def test_wrong_array_name(folder: Path, context: ProviderContext) -> None:
     np.savez(folder / "side" / "a.npz", distance=DEPTH)
-    assert "no array 'depth', it has distance" in refused(folder, context)
+    assert "no array 'depth', only distance" in refused(folder, context)
 
 
 def normals_of(folder: Path, context: ProviderContext, **options: object):
