@@ -56,7 +56,7 @@ def reconstruct(
     Args:
         images: Folder of photos, including subfolders; or a video, whose keyframes are selected
             by ``inputs.video`` and written into ``frames/`` of the output.
-        output: Result folder, used by one run at a time; None writes nothing.
+        output: Result folder, used by one run at a time, or None to write nothing.
         config: Name of a shipped configuration, a YAML file, or a loaded configuration.
         intrinsics: ``intrinsics.yaml``, a COLMAP model or ``transforms.json``. Default: the cameras
             of ``poses``, else EXIF, else the estimate of the depth provider, else a default.
@@ -78,7 +78,7 @@ def reconstruct(
     Raises:
         InputError: images, intrinsics, poses, configuration, weights or output are wrong. Missing
             providers are found before any image is decoded.
-        ReconstructionError: no reconstruction was possible; ``summary.json`` has the reasons.
+        ReconstructionError: no reconstruction was possible; the reasons are in ``summary.json``.
         MpsfmError: a provider failed or violated the provider contract, or the disk is full.
     """
     from mpsfm_core.pipeline.run import reconstruct

@@ -2,8 +2,8 @@
 
 Each command or command group has a module, and :func:`build_app` adds all of them to the command
 line. A command imports its dependencies inside its function, so that every command starts fast.
-:class:`~mpsfm_core.cli.errors.CommandGroup` turns exceptions into one line on stderr and an exit
-code.
+The class :class:`~mpsfm_core.cli.errors.CommandGroup` turns exceptions into one line on stderr and
+an exit code.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def _escape_unprintable_characters() -> None:
-    """Print characters that the terminal's encoding lacks as escapes instead of failing."""
+    """Print characters that are missing in the terminal's encoding as escape sequences."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")

@@ -83,9 +83,9 @@ def calibrate(
 ) -> None:
     """Fit the uncertainty of a depth or normals provider and report its quality.
 
-    Compares with true maps or with the points of a COLMAP model. Given neither, reconstructs the
-    photos and compares with the points. Writes FILE for `depth.calibration: FILE`, and a report
-    next to FILE.
+    Compares predictions with true maps or with the points of a COLMAP model. Without true maps and
+    model, reconstructs the photos and compares with the points. Writes FILE for `depth.calibration:
+    FILE`, and a report next to FILE.
     """
     from mpsfm_core.calibration.calibrate import CalibrationImages, calibrate
     from mpsfm_core.calibration.cross_validation import StudyOptions

@@ -85,7 +85,7 @@ def evaluate(
 
 
 def _select_names(images: str | None, image_list: Path | None) -> list[str] | None:
-    """Return the image names selected by ``--images`` or ``--image-list``; None for all."""
+    """Return the image names selected by ``--images`` or ``--image-list``, or None for all."""
     from mpsfm_core.data.errors import InputError
 
     if images is not None and image_list is not None:

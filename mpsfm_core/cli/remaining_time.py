@@ -76,7 +76,7 @@ class RemainingTimeEstimator:
                 self._ended[stage] = (self._clock() - start) / total
 
     def seconds(self) -> float | None:
-        """Estimate the seconds until the end of the run; None before features are extracted."""
+        """Estimate the seconds until the end of the run, or None before features are extracted."""
         if not self._images:
             return None
         stages = list(_DEFAULT_SECONDS)

@@ -1,11 +1,11 @@
 """Read YAML files and ``--set`` overrides into one checked :class:`Config`.
 
 A configuration file may extend a shipped configuration or another file with ``extends:``. Mappings
-are merged key by key, and other values replace those of the parent file. There are three
+are merged key by key, and other values replace those of the parent file. The merge has three
 exceptions:
 
-* A provider block with another ``use:`` drops the parent's other keys, because another provider has
-  other options.
+* A provider block with another ``use:`` drops all keys of the parent's block, because another
+  provider has different options.
 
 * A provider block with ``use:`` drops the parent's ``fallback:``.
 
@@ -222,8 +222,8 @@ def _merge_items(base: list[Any], change: Mapping[str, Any]) -> list[Any]:
 def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complete: bool) -> Config:
     """Check the options of every provider block, and fill in default options.
 
-    A block with ``fallback:`` or ``same-network`` needs one valid candidate. The options of such a
-    block stay as given.
+    A block with ``fallback:`` or ``same-network`` needs one valid candidate. The options of a block
+    with ``fallback:`` stay as given.
     """
     problems: list[SettingProblem] = []
     checked = config

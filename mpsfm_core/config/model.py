@@ -32,8 +32,8 @@ FORMAT = 1
 class RuntimeOptions(Options):
     """Options of the computation: workers, device, cache, executor, error handling.
 
-    Of these options, only the seed changes the results. Results of networks may differ by rounding
-    between devices and thread counts. Cached results are valid on all devices.
+    Of the runtime options, only the seed changes the results. Results of networks may differ by
+    rounding between devices and thread counts. Cached results are valid on all devices.
     """
 
     workers: int | None = Field(None, ge=1)
@@ -87,7 +87,7 @@ class FastPass(Options):
 
 
 class Config(Options):
-    """All settings of a run, except its images and its output folder."""
+    """All settings of a run, except input images and output folder."""
 
     description: str = ""
     """Description of the configuration for ``mpsfm config list``; not inherited."""
@@ -123,7 +123,7 @@ class Config(Options):
         return self._warnings
 
     def with_warnings(self, warnings: tuple[str, ...]) -> Config:
-        """Return a copy of the configuration with these warnings."""
+        """Return a copy of the configuration with the given warnings."""
         config = self.model_copy()
         config._warnings = warnings
         return config

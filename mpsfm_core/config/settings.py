@@ -17,7 +17,7 @@ def is_expert(field: FieldInfo) -> bool:
 def user_settings(options: BaseModel) -> dict[str, Any]:
     """Return settings as plain data; expert settings with default values are omitted.
 
-    Blocks that contain only such expert settings are omitted.
+    Configuration blocks that contain only expert settings with default values are omitted.
     """
     values = options.model_dump(mode="json")
     settings = {}

@@ -39,8 +39,8 @@ class Cache:
     """Folder of cache entries, shared by threads and processes.
 
     Args:
-        folder: Cache folder, default ``$MPSFM_CACHE`` or the platform's user cache. Entries go into
-            its subfolder ``extraction/``.
+        folder: Cache folder, default ``$MPSFM_CACHE`` or the platform's user cache. Entries are
+            stored in the subfolder ``extraction/``.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -49,17 +49,21 @@ class Cache:
         remove_temporary_files(self._unfinished)
 
     def load(self, kind: str, key: str, cls: type[T]) -> T | None:
-        """Load a cache entry as an object of ``cls``; None without a readable entry."""
+        """Load a cache entry as an object of ``cls``, or None without a readable entry."""
         path = self._path(kind, key)
         try:
             return unpack(cls, read_npz(path))
         except FileNotFoundError:
             return None
         except OSError as error:
-            _log.warning("cache entry %s cannot be read (%s): computing it again", path, error)
+            _log.warning(
+                "cache entry %s cannot be read (%s): the result is computed again", path, error
+            )
             return None
         except Exception as error:  # constructors of data classes raise errors of any kind
-            _log.warning("cache entry %s is damaged (%s): computing it again", path, error)
+            _log.warning(
+                "cache entry %s is damaged (%s): the result is computed again", path, error
+            )
             return None
 
     def store(self, kind: str, key: str, value: object) -> None:

@@ -46,7 +46,7 @@ class ExtractionContext:
         """Error message of each skipped image, by image index."""
         self._events = events
         self.run_remotely: Callable[[str, Sequence[Any]], Generator[None, None, None]] | None = None
-        """Function that runs a stage on remote workers; None without an executor."""
+        """Function that runs a stage on remote workers, or None without an executor."""
         self.shared_run = ""
         """Identifier of the run, under which remote workers share provider failures."""
         self._mask_providers: list[ActiveProvider] = []
@@ -161,7 +161,7 @@ class ExtractionContext:
         return replace(view, mask=self.mask(index)) if self._mask_providers else view
 
     def mask(self, index: int) -> Bool | None:
-        """Return the mask (H, W) of usable pixels of a view; None if all pixels are usable."""
+        """Return the mask (H, W) of usable pixels of a view, or None if all pixels are usable."""
         mask = self.images.mask(index)
         if not self._mask_providers:
             return mask

@@ -9,7 +9,7 @@ class ExtractionEvents(Protocol):
     """Receiver of extraction progress; called in the thread that called ``extract``."""
 
     def stage_started(self, stage: str, total: int | None) -> None:
-        """Report the start of a stage with ``total`` steps; None if the number is unknown."""
+        """Report the start of a stage with ``total`` steps, or None if the number is unknown."""
 
     def stage_progress(self, stage: str, done: int, total: int) -> None:
         """Report the number of finished steps of a stage."""

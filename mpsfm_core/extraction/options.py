@@ -24,7 +24,7 @@ class PairOptions(Options):
     """``sequential`` and ``auto``: number of following images that each image is paired with.
     [reference noverlap]"""
     quadratic: bool = expert(False)
-    """``sequential`` and ``auto``: pair each image with those 1, 2, 4, 8 ... positions later.
+    """``sequential`` and ``auto``: pair each image with the images 1, 2, 4, 8 ... positions later.
     [COLMAP quadratic_overlap]"""
     top_k: int = Field(20, ge=1)
     """``retrieval``: number of most similar images that each image is paired with. [reference
@@ -45,7 +45,7 @@ class VerificationOptions(Options):
     pairs of small overlap. [COLMAP min_num_inliers]"""
     max_chance: float = expert(1e-8, ge=0, le=1)
     """Maximum probability that random matches give as many inliers for a fixed epipolar geometry
-    (a-contrario test). 1 disables the test. [tuned: benchmarks.pairs]"""
+    (a-contrario test). The value 1 disables the test. [tuned: benchmarks.pairs]"""
 
 
 class AdjustmentOptions(Options):

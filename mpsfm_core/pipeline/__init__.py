@@ -1,1 +1,1 @@
-"""Run a reconstruction: the only package that uses all others."""
+"""Run of a reconstruction: this package connects all other packages."""

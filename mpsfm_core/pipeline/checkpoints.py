@@ -63,7 +63,7 @@ class MappingCheckpoints:
     Implements :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`.
 
     Args:
-        cache_dir: Cache folder; None uses the cache folder of the platform.
+        cache_dir: Cache folder, or None for the platform's cache folder.
         problem: Input of the mapper.
         options: Options of the mapper.
         stages: Receiver of messages to the user.
@@ -92,7 +92,7 @@ class MappingCheckpoints:
             self._path.unlink()
 
     def load(self) -> CheckpointArrays | None:
-        """Load the mapper state from the checkpoint; None if missing or invalid."""
+        """Load the mapper state from the checkpoint, or None if missing or invalid."""
         self._clear_up()
         if not self._path.is_file():
             return None
@@ -162,7 +162,7 @@ class DenseCheckpoints:
     Implements :class:`mpsfm_core.dense.densify.StereoCheckpoints`.
 
     Args:
-        cache_dir: Cache folder; None uses the cache folder of the platform.
+        cache_dir: Cache folder, or None for the platform's cache folder.
         reconstruction: Reconstruction whose depth maps the dense stage computes.
         image_keys: Content keys of all images.
         options: Options of the dense stage.
@@ -186,7 +186,7 @@ class DenseCheckpoints:
         self._failed, self._warning_lock = False, Lock()
 
     def load(self, name: str) -> StereoDepth | None:
-        """Load the stereo depth of an image; None if not stored."""
+        """Load the stereo depth of an image, or None if not stored."""
         return self._cache.load("dense", self._key(name), StereoDepth)
 
     def save(self, name: str, depth: StereoDepth) -> None:

@@ -44,15 +44,16 @@ def densify_model(
 ) -> DenseReport:
     """Compute and write depth maps of a posed model by multi-view stereo.
 
-    The depth search of an image starts from its map in ``model/depth`` of a result folder, or else
-    from the depth range of its observed points. Images with neither are omitted.
+    The depth search of an image starts from its map in ``model/depth`` of a result folder. Without
+    such a map, the search starts from the depth range of the image's 3D points. Images without map
+    and points are omitted.
 
     Args:
         model: COLMAP model, ``transforms.json`` or result folder.
         images: Folder of the original photos.
         output: Output folder for the depth maps, ``dense.ply`` and the model.
         options: Options of the dense stage.
-        workers: Number of threads; None uses one thread per core.
+        workers: Number of threads, or None for one thread per core.
 
     Returns:
         Report of the dense stage.
@@ -141,7 +142,7 @@ def mesh_model(
     photos: PathLike | None = None,
     options: MeshOptions | None = None,
 ) -> TriangleMesh:
-    """Mesh the depth maps of a result folder into its ``mesh.ply`` and ``mesh.glb``.
+    """Mesh the depth maps of a result folder; write ``mesh.ply`` and ``mesh.glb``.
 
     The PLY file has the frame of the model. The GLB file is rotated so that gravity points down.
 

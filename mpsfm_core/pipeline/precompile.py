@@ -1,9 +1,9 @@
 """Precompile the numba kernels of extraction, mapping and the dense stage.
 
-If kernels are not compiled yet, a run compiles them in parallel to extraction, and waits for the
-end of compilation before mapping. ``python -m mpsfm_core.pipeline.precompile`` compiles all kernels
-at installation. Two processes reconstruct a small synthetic scene and share the kernels on disk.
-Each process starts with other kernels.
+A run without compiled kernels compiles all kernels in parallel to extraction, and waits for the
+compilation before mapping. ``python -m mpsfm_core.pipeline.precompile`` compiles all kernels at
+installation. Two processes reconstruct a small synthetic scene and share the kernels on disk. The
+first process starts with bundle adjustment, the second with depth integration.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def start_compilation() -> Compilation | None:
     """Start compiling the kernels in background processes.
 
     Returns:
-        The running compilation; None if the kernels are compiled already, or cannot be stored on
+        The running compilation, or None if the kernels are compiled already, or cannot be stored on
         disk.
     """
     stamp = _stamp_path()

@@ -112,7 +112,7 @@ def preview_providers(
 ) -> ProviderResolution:
     """Resolve providers as if every download succeeded; download nothing.
 
-    Arguments and errors are those of :func:`resolve_providers`.
+    The function has the arguments and raises the errors of :func:`resolve_providers`.
     """
     runtime = config.runtime
     store = WeightStore(runtime.cache_dir, True if runtime.offline else None)

@@ -161,8 +161,8 @@ def find_shortages(estimate: ResourceEstimate, cache: Path, output: Path | None)
     """Compare an estimate with free memory and disk; return a warning per shortage.
 
     Raises:
-        InputError: the run cannot fit: the estimate exceeds all memory of the machine or container,
-            or the free disk space of the results, by more than :data:`TOLERANCE`.
+        InputError: the estimate exceeds the total memory of the machine or container, or the free
+            disk space, by more than the factor :data:`TOLERANCE`.
     """
     total_mb, free_mb = measure_memory()
     warnings = []
@@ -193,7 +193,7 @@ def measure_memory(groups: ControlGroups | None = None) -> tuple[float, float]:
     """Return total and free memory in MB that this process may use.
 
     Args:
-        groups: Control groups with memory limits; default: those of this process.
+        groups: Control groups with memory limits; default: the control groups of this process.
     """
     machine = psutil.virtual_memory()
     limits = (groups or ControlGroups()).memory_limits()

@@ -69,13 +69,13 @@ class ReconstructionResult:
     model: pycolmap.Reconstruction
     """COLMAP model of the largest component, with the cameras of the original photos."""
     further_models: tuple[pycolmap.Reconstruction, ...]
-    """Models of the other components, largest first."""
+    """COLMAP models of all components except the largest, sorted by size."""
     mapping: MappingResult
     """Poses, points and refined depth maps as arrays."""
     summary: dict[str, Any]
     """Content of ``summary.json``."""
     output: Path | None
-    """Result folder; None for a run without output folder."""
+    """Result folder, or None for a run without output folder."""
 
 
 def reconstruct(
@@ -131,7 +131,7 @@ class _Source:
 
 
 class _Run:
-    """State of one reconstruction run; :meth:`execute` runs its stages in order."""
+    """One reconstruction run; the method ``execute`` runs all stages in order."""
 
     def __init__(
         self,
@@ -274,7 +274,7 @@ class _Run:
             self._compilation.stop()
 
     def _map(self, problem: MappingProblem, options: MapperOptions | None = None) -> MappingResult:
-        """Run the mapper; ``options`` default to those of the configuration."""
+        """Run the mapper, by default with the mapper options of the configuration."""
         options = options or self._config.mapper_options()
         with self._stages.stage("mapping"):
             checkpoints = self._mapping_checkpoints(problem, options)

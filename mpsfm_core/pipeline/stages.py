@@ -23,7 +23,7 @@ class StageRecord:
 
     seconds: float
     peak_memory_mb: float | None
-    """Peak resident memory of this process; None if the operating system reports none."""
+    """Peak resident memory of this process, or None if the operating system reports none."""
 
     def after(self, earlier: StageRecord | None) -> StageRecord:
         """Combine with an earlier record of the same stage: sum of times, maximum of peaks."""
@@ -59,7 +59,7 @@ class Stages:
 
     @contextmanager
     def step(self, name: str, total: int | None) -> Iterator[None]:
-        """Report a step of a stage that runs in the ``with`` block; ``total`` counts its units."""
+        """Report a step of a stage that runs in the ``with`` block, with ``total`` work units."""
         started = time.perf_counter()
         self.stage_started(name, total)
         try:
@@ -87,7 +87,7 @@ class Stages:
         self.notice(f"warning: {text}")
 
     def stage_started(self, stage: str, total: int | None) -> None:
-        """Forward the start of a stage to plugins; ``total`` is the number of steps or None."""
+        """Forward the start of a stage with ``total`` steps (None if unknown) to plugins."""
         self._registry.call_hook("mpsfm_stage_started", stage=stage, total=total)
 
     def stage_progress(self, stage: str, done: int, total: int) -> None:
@@ -121,7 +121,7 @@ def _reset_peak_memory() -> None:
 
 
 def peak_memory_mb() -> float | None:
-    """Return the peak resident memory of this process in MB; None if unknown."""
+    """Return the peak resident memory of this process in MB, or None if unknown."""
     with suppress(OSError):
         for line in (_PROC / "status").read_text().splitlines():
             if line.startswith("VmHWM:"):

@@ -34,8 +34,8 @@ _TEMPORARY = ".tmp"
 _GRACE_S = 60.0
 """Age in seconds below which a temporary file may not be locked yet by its writer."""
 _READY = "ready.json"
-"""File in a scratch folder that lists the entries to replace. Its existence commits the
-replacement."""
+"""File in a scratch folder that lists the entries to replace. The existence of ``ready.json``
+commits the replacement."""
 FORMAT = 1
 """Version number of the format of ``ready.json``."""
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -201,8 +201,8 @@ def _lock(folder: Path) -> Iterator[bool]:
     """Lock a folder until the end of the block; yield False if locks are unsupported.
 
     The folder itself is locked, so no lock file remains. Windows and some network disks do not
-    support folder locks. Concurrent runs are not detected on such systems, and remains of killed
-    runs are not removed.
+    support folder locks. Without folder locks, concurrent runs are not detected, and remains of
+    killed runs are not removed.
     """
     if fcntl is None:
         yield False

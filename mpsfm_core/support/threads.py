@@ -33,7 +33,7 @@ def count_cores(groups: ControlGroups | None = None) -> int:
     cores.
 
     Args:
-        groups: Control groups with a CPU quota; default: those of this process.
+        groups: Control groups with a CPU quota; default: the control groups of this process.
     """
     if hasattr(os, "sched_getaffinity"):
         available = len(os.sched_getaffinity(0))
@@ -63,7 +63,7 @@ def limit_threads(count: int | None) -> Iterator[None]:
     at the same time.
 
     Args:
-        count: Maximum number of threads; None means one per core.
+        count: Maximum number of threads, or None for one thread per core.
     """
     token, opencv = _LIMIT.set(count), cv2.getNumThreads()
     cv2.setNumThreads(1)

@@ -56,7 +56,7 @@ _MIN_DETERMINANT = 0.05
 
 @dataclass(frozen=True, eq=False)
 class AlignedPair:
-    """Linear equations of one pair: ``shift_b - warp @ shift_a = offset``."""
+    """Linear equations ``shift_b - warp @ shift_a = offset`` of the keypoint shifts of a pair."""
 
     rows: Int64
     """(m,) rows of the matches whose patches were aligned."""

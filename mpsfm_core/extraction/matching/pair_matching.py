@@ -48,7 +48,7 @@ class CandidateMatches:
     sparse: SparseMatches
     """Matches between detected features."""
     points: PointMatches
-    """Matches sampled from dense matches; their rows follow those of ``sparse``."""
+    """Matches sampled from dense matches; in match indices, ``points`` follow ``sparse``."""
     std_px: float
     """Standard deviation of the sampled ``points``, pixels."""
     precision: tuple[float, float] = (0.0, 0.0)
@@ -257,7 +257,7 @@ def adjust_problem_keypoints(context: ExtractionContext, problem: MappingProblem
 
 
 def merge_matches(problem: MappingProblem, more: AssembledMatches) -> MappingProblem:
-    """Add matches to a mapping problem; new keypoints follow those of the problem."""
+    """Add matches to a mapping problem; append new keypoints to its keypoints."""
     offsets = [len(image.keypoints) for image in problem.images]
     images = tuple(
         replace(

@@ -23,7 +23,7 @@ def exhaustive_pairs(count: int) -> list[Pair]:
 
 
 def sequential_pairs(count: int, options: PairOptions) -> list[Pair]:
-    """Pair each image with the following images, or with those 1, 2, 4, 8 ... positions later."""
+    """Pair each image with following images; quadratic mode uses distances 1, 2, 4, 8 ..."""
     steps = range(options.overlap)
     offsets = [2**step if options.quadratic else step + 1 for step in steps]
     return _sort_pairs((a, a + d) for a in range(count) for d in offsets if a + d < count)

@@ -17,7 +17,7 @@ class RawPriors:
 
     Attributes:
         depth: Provider of depth.
-        normals: Provider of normals; None if one forward pass of the depth provider predicts both.
+        normals: Provider of normals, or None if the depth provider predicts both in one pass.
     """
 
     def __init__(self, context: ExtractionContext) -> None:
