@@ -139,7 +139,7 @@ def compare_prior(
         ground_truth: Options of the provider ``files``, which reads the true maps.
         kind: Kind of the provider, depth or normals.
         model: COLMAP model whose points are true depth.
-        options: Options of the sampling.
+        options: Options of the pixel sampling.
         registry: Registry of plugins.
 
     Raises:
@@ -171,7 +171,7 @@ class _Run:
         options: StudyOptions,
     ) -> None:
         stages = Stages(registry)
-        needed = ("depth", "normals", "masks")  # Reconstruction resolves more providers.
+        needed = ("depth", "normals", "masks")  # Self-calibration resolves more providers.
         config = resolve_providers(config, registry, stages, needed).config
         self._photos, self._config, self._kind = photos, config, kind
         self._registry, self._options = registry, options

@@ -143,7 +143,7 @@ class NormalData:
         return replace(self, samples=tuple(self.samples[i] for i in images))
 
     def residuals(self, calibration: Calibration, *, scaled: bool = True) -> Residuals:
-        """Compute normal errors along both tangent directions; `scaled` has no effect."""
+        """Compute normal errors along both tangent directions (normals have no scale)."""
         return normal_residuals(self.samples)
 
     def fit(self) -> list[Candidate]:
@@ -198,7 +198,7 @@ def calibration_from_fit(base: Calibration, fit: StdFit) -> Calibration:
 
 
 class _CandidateModel(NamedTuple):
-    """Calibration model to fit; `base` contains the shift of the alignment."""
+    """Calibration model to fit, with the shift of the alignment in `base`."""
 
     base: Calibration
     residuals: Residuals

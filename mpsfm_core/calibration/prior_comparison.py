@@ -39,7 +39,7 @@ class PriorComparison:
     Args:
         context: Extraction context.
         kind: Kind of the prior, depth or normals.
-        alignments: Candidate alignments of depth; None selects the default for the provider.
+        alignments: Candidate alignments of depth, or None for the default of the provider.
         options: Options of the calibration study.
     """
 

@@ -156,7 +156,7 @@ def _rounds(report: Mapping[str, Any]) -> Iterable[str]:
 
 
 def _plots(report: Mapping[str, Any]) -> tuple[str, bytes | None]:
-    """Return the plots as HTML text and as PNG bytes; None instead of PNG without matplotlib."""
+    """Return the plots as HTML text and PNG bytes (the PNG is None without matplotlib)."""
     try:
         from mpsfm_core.calibration.plots import draw_plots
     except ImportError:

@@ -8,7 +8,7 @@ factors ``theta_j``. The common scale of the factors is set such that 68.27 % of
 are within one std. All images have equal weight in the likelihood.
 
 The paper chose the factors of appendix C from calibration plots and the area under sensitivity
-curves. The likelihood rewards both the ranking and the size of the std.
+curves. The likelihood rewards a correct ranking and a correct size of the std.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ class StdFit:
     values: Float64
     """(m,) factors ``theta_j`` of the terms."""
     edge_ratio: float | None
-    """Minimum ratio of neighboring depths at a depth edge; None for a model without edges."""
+    """Minimum ratio of neighboring depths at a depth edge, or None for a model without edges."""
     edge_scale: float
     """Factor of the std at depth edges."""
     gross: float
@@ -75,7 +75,8 @@ def fit_std(
     Args:
         residuals: Errors and terms.
         names: Names of the fitted terms; all terms by default.
-        edge_ratio: Minimum ratio of neighboring depths at a depth edge; None fits no edge factor.
+        edge_ratio: Minimum ratio of neighboring depths at a depth edge, or None to fit no edge
+            factor.
     """
     problem = _Problem(residuals, tuple(names or residuals.names), edge_ratio)
     best = min((problem.solve(start) for start in problem.starts()), key=lambda found: found[1])
@@ -121,8 +122,8 @@ class _State:
 class _Problem:
     """Maximum-likelihood problem of the std fit, solved by L-BFGS.
 
-    The parameters are the logs of the factors, the log of the edge scale (with edges), and the
-    logit of the ratio of gross errors relative to its maximum.
+    The parameters are the logs of the term factors, the log of the edge factor (if any), and the
+    logit of the gross error ratio relative to ``MAX_GROSS``.
     """
 
     def __init__(

@@ -15,8 +15,8 @@ Int64 = NDArray[np.int64]
 UInt8 = NDArray[np.uint8]
 Bool = NDArray[np.bool_]
 Pose = tuple[Float64, Float64]
-"""Rotation (3, 3) and translation (3,) float64 of ``y = R x + t``; ``cam_from_world`` of an
-image."""
+"""Rigid transform ``y = R x + t``: rotation (3, 3) and translation (3,) float64, for example
+``cam_from_world`` of an image."""
 
 
 def require_array(owner: object, name: str, dtype: Any, shape: tuple[int | None, ...]) -> None:

@@ -71,8 +71,8 @@ class View:
     camera: PinholeCamera
     """Intrinsics of the view."""
     mask: Bool | None = None
-    """(H, W) bool, False at pixels outside the undistorted image or masked by the user; None for
-    all True."""
+    """(H, W) bool, False at pixels outside the undistorted image or masked by the user (None for
+    all True)."""
 
     def __post_init__(self) -> None:
         height, width = self.camera.height, self.camera.width

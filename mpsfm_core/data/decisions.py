@@ -31,7 +31,7 @@ class ReasonCode(Enum):
         return member
 
     def because(self, **values: Value) -> Reason:
-        """Build a reason with the code; ``values`` must have exactly the fields of the code."""
+        """Build a reason from the code and ``values`` for exactly the fields of the code."""
         return Reason(self, values)
 
 
@@ -55,13 +55,14 @@ class ImageReason(ReasonCode):
     """The depth of another image contradicts the pose at the ratio ``violation_ratio`` of
     pixels."""
     CONTRADICTS_DEPTH = ("contradicts-depth", "violation_ratio", "step")
-    """Share of pixels that contradict the depth of other images, in a check of all images.
+    """The ratio ``violation_ratio`` of pixels contradicts the depth of other images in a global
+    check.
 
-    ``step``: global-initialization or final-check.
+    The value of ``step`` is global-initialization or final-check.
     """
     CONTRADICTED_BY_IMAGES = ("contradicted-by-images", "num_images")
     MISREGISTERED = ("misregistered", "num_matches")
-    """More matches contradict the pose than support the pose; ``num_matches`` is the difference."""
+    """By ``num_matches``, more matches contradict the pose than support the pose."""
     CONNECTED_BY_DROPPED_IMAGE = ("connected-by-dropped-image", "step")
     COMPONENT_TOO_SMALL = ("component-too-small", "num_images", "min_images")
     COMPONENT_LIMIT = ("component-limit", "max_components")
@@ -107,7 +108,8 @@ class CameraReason(ReasonCode):
 
     TOO_FEW_IMAGES = ("too-few-images", "num_images", "min_images")
     NOT_OBSERVABLE = ("not-observable", "focal_length_std_ratio")
-    """The images do not constrain the focal length; the field is its relative std."""
+    """The images do not constrain the focal length, whose relative std is
+    ``focal_length_std_ratio``."""
     OUT_OF_RANGE = ("out-of-range", "focal_length_px")
     """The refined focal length is outside of the plausible range."""
 
@@ -128,7 +130,8 @@ class DoubtReason(ReasonCode):
     UNEXPLAINED_PAIRS = ("unexplained-pairs", "num_pairs", "image_a", "image_b", "num_matches")
     """Verified pairs whose images share hardly any point in the model."""
     DISCONNECTED = ("disconnected", "num_parts", "num_images")
-    """Parts of the model share no points; ``num_images`` are outside of the largest part."""
+    """Parts of the model share no points, and ``num_images`` images are outside the largest
+    part."""
     LOW_PARALLAX = ("low-parallax", "angle_deg")
     """The rays of most points are nearly parallel, so the depth priors alone give the depth."""
     FEW_POINTS = ("few-points", "num_images", "min_points")

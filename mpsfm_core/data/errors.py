@@ -40,19 +40,19 @@ class InputError(MpsfmError):
 
 
 class ConfigError(InputError):
-    """Wrong configuration key, value or name; the message gives file and YAML path."""
+    """Error for a wrong configuration key, value or name, with file and YAML path."""
 
 
 class ProviderError(InputError):
-    """Provider that cannot be found, imported or constructed."""
+    """Error for a provider that cannot be found, imported or constructed."""
 
 
 class WeightsError(InputError):
-    """Weights that are missing, cannot be downloaded, or do not have the expected hash."""
+    """Error for network weights that are missing, not downloadable, or have a wrong hash."""
 
 
 class DataError(MpsfmError, ValueError):
-    """Value that violates a rule of the data classes in :mod:`mpsfm_core.data`.
+    """Error for a value that violates a rule of the data classes in :mod:`mpsfm_core.data`.
 
     Attributes:
         field: Name of the invalid field.
@@ -66,7 +66,7 @@ class DataError(MpsfmError, ValueError):
 
 
 class ProviderOutputError(MpsfmError):
-    """Output of a provider that violates the provider contract.
+    """Error for provider output that violates the provider contract.
 
     Attributes:
         provider: Name of the provider.
@@ -84,18 +84,18 @@ class ProviderOutputError(MpsfmError):
 
 
 class ProviderRunError(MpsfmError):
-    """Exception that a provider raised on an image; ``__cause__`` is the original exception."""
+    """Exception of a provider on an image, chained to the original exception."""
 
 
 class OutputError(MpsfmError):
-    """Results that cannot be written because the disk is full or fails.
+    """Error for results that cannot be written because the disk is full or fails.
 
     The results of earlier runs are unchanged.
     """
 
 
 class ReconstructionError(MpsfmError):
-    """Failure to reconstruct a model from valid input.
+    """Error if valid input cannot be reconstructed.
 
     Attributes:
         summary: Content of `summary.json`, with the reasons for each image and pair.

@@ -39,7 +39,7 @@ SettingPath = tuple[str | int, ...]
 
 @dataclass(frozen=True)
 class SettingProblem:
-    """Wrong setting."""
+    """Problem of a wrong or missing setting."""
 
     path: SettingPath
     """Path of the setting, such as ``("depth", "options", "scale")``."""
@@ -53,7 +53,7 @@ class SettingProblem:
 
 
 class SettingsError(ConfigError):
-    """Settings that an options class rejects.
+    """Error for settings that an options class rejects.
 
     Attributes:
         problems: All wrong settings.

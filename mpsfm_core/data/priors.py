@@ -179,9 +179,9 @@ class MultiViewPrior:
     depth: tuple[DepthPrior, ...]
     """One depth prior for each of the n views, all in the same unit; meters if ``metric``."""
     poses: Float64 | None = None
-    """(n, 3, 4) float64 poses ``cam_from_group`` in the unit of depth; None if not predicted."""
+    """(n, 3, 4) float64 poses ``cam_from_group`` in the unit of depth, or None."""
     intrinsics: Float64 | None = None
-    """(n, 4) float64 fx, fy, cx, cy in COLMAP pixels of each view; None if not predicted."""
+    """(n, 4) float64 intrinsics fx, fy, cx, cy of each view in COLMAP pixels, or None."""
 
     def __post_init__(self) -> None:
         count = len(self.depth)

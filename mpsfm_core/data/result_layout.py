@@ -1,7 +1,7 @@
 """Names of the files and folders that a run writes into its output folder.
 
-Readers of images skip folders that contain :data:`SUMMARY`; ``results`` writes the files and
-``report`` reads them.
+Readers of image folders skip folders that contain :data:`SUMMARY`. The package ``results`` writes
+the files, and the package ``report`` reads the files.
 """
 
 SUMMARY = "summary.json"
@@ -23,7 +23,7 @@ DEPTH = "depth"
 MESH = ("mesh.ply", "mesh.glb")
 """Surface mesh, which ``mpsfm mesh`` extracts from the depth maps."""
 TRANSFORMS = "transforms.json"
-"""Cameras and poses for nerfstudio."""
+"""Cameras and poses in the format of nerfstudio."""
 VIEWS = "views"
 """Thumbnails, priors and matches that the HTML report displays."""
 REPORT = "report.html"

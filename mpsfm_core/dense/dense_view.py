@@ -42,8 +42,8 @@ class PosedGrid:
             source: Grid of the pixels (x, y) with z-depth d.
 
         Returns:
-            Matrix (3, 3) and offset (3,); ``d * matrix @ (x, y, 1) + offset`` is a homogeneous
-            pixel of this grid.
+            Matrix (3, 3) and offset (3,) such that ``d * matrix @ (x, y, 1) + offset`` is a
+            homogeneous pixel of the grid.
         """
         rotation = self.rotation @ source.rotation.T
         translation = self.translation - rotation @ source.translation
@@ -70,7 +70,7 @@ class DenseView(PosedGrid):
 
         Args:
             image: Registered image with pose and depth map.
-            view: Undistorted view of the image.
+            view: Undistorted view of the registered image.
             max_size: Maximum length of the grid's longer side in pixels.
         """
         rows, columns = view.image.shape[:2]
@@ -137,7 +137,7 @@ def resample_known_depth(depth: DepthPrior, width: int, height: int) -> tuple[Fl
 
 def _log_depth_and_std(depth: DepthPrior) -> tuple[Float32, Float32]:
     """Return log depth without holes and its std, both (h, w)."""
-    assert depth.variance is not None  # The mapper sets this variance.
+    assert depth.variance is not None  # The mapper sets the depth variance.
     valid = depth.valid
     if not valid.any():
         zero = np.zeros(depth.shape, np.float32)

@@ -1,6 +1,6 @@
 """Densification: replace refined depth maps by multi-view stereo depth where images overlap.
 
-The stages in the order of the data:
+Densification has five stages:
 
 1. Select source views (:mod:`~mpsfm_core.dense.view_selection`).
 2. Match each view by plane-sweep stereo (:mod:`~mpsfm_core.dense.stereo`).
@@ -75,7 +75,7 @@ class DenseReport:
     """Source views, confirmed ratios and stereo masks of all densified images."""
 
     sources: dict[str, list[str]]
-    """Image name -> names of the source images of its stereo depth."""
+    """Image name -> names of the source images for stereo."""
     confirmed: dict[str, float]
     """Image name -> ratio of pixels whose stereo depth another view confirms, in [0, 1]."""
     measured: dict[str, Bool]
@@ -105,7 +105,7 @@ class StereoCheckpoints(Protocol):
     def load(self, name: str) -> StereoDepth | None:
         """Return the stereo depth of an image, or None.
 
-        The stored depth must come from the same reconstruction, images and options.
+        The stored stereo depth must come from the same reconstruction, images and options.
         """
 
     def save(self, name: str, depth: StereoDepth) -> None:
@@ -135,7 +135,7 @@ def densify(
         progress: Called with the number of images with stereo depth and the number of all images.
         checkpoints: Stores stereo depth, so that an interrupted run can resume.
         store_array: Stores large maps, including the depth maps of the result; must be thread-safe.
-        poses_use_depth: True if depth priors of these images constrained the poses. The scales of
+        poses_use_depth: True if depth priors of the images constrained the poses. The scales of
             image pairs may then depend on the priors alone, which adds a scale variance.
 
     Returns:
@@ -345,7 +345,7 @@ def _replace_depth(
     scale_std: float,
     store_array: ArrayStore,
 ) -> RegisteredImage:
-    """Replace the depth map of an image; `scale_std` is the std of the map's log scale."""
+    """Replace the depth map of an image, whose log scale has the std `scale_std`."""
     depth = np.exp(posterior.log_depth)
     variance = (posterior.log_std**2 + np.float32(scale_std**2)) * depth**2
     prior = DepthPrior.from_arrays(depth, variance, view.usable, metric=image.depth.metric)

@@ -1,9 +1,9 @@
 """Depth completion: correct known depth at pixels without stereo measurement.
 
 Two assumptions constrain a pixel without measurement. The ratio of known to true depth is smooth
-and close to 1. Surfaces are planar, and inverse depth of a plane is linear in the image. Measured
-pixels estimate the variance of both assumptions. Both assumptions and the measurements are linear
-in the ratio, so completion is one sparse linear least-squares problem.
+and close to 1. Surfaces are planar, and inverse depth of a plane is linear in the image. The
+variances of the smoothness and the planarity assumption are estimated at measured pixels. Both
+assumptions are linear in the ratio, so completion is one sparse linear least-squares problem.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ def estimate_planarity(
 
     The std of a second difference is the std of measured second differences. If the known depth has
     an equally large second difference, an edge is likely and the weight is halved. Edges at the rim
-    of a hole cannot be detected, so the weight there is 0. Without measurements all weights are 0.
+    of a hole cannot be detected, so the weight at the rim is 0. Without measurements all weights
+    are 0.
 
     Args:
         log_depth: (h, w) known log depth; neighboring pixels fill holes.
@@ -76,9 +77,9 @@ def solve_depth_correction(
     """Solve for the correction of the known log depth at every pixel.
 
     Args:
-        field: Precisions of the Gaussian Markov random field of the ratio of known to true depth,
-            each (h, w): coupling with the east neighbor, with the south neighbor, and with 1.
-        planarity: Planarity prior of the image.
+        field: Precisions (h, w) of the Gaussian Markov random field of the ratio of known to true
+            depth: coupling with the east neighbor, the south neighbor, and 1.
+        planarity: Planarity prior of the image from :func:`estimate_planarity`.
         measured: Measured corrections.
 
     Returns:

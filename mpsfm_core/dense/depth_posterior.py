@@ -54,9 +54,9 @@ class LogDepthMap(NamedTuple):
 def fuse_known_depth(measured: LogDepthMap, known: LogDepthMap) -> LogDepthMap:
     """Fuse measured depth with known depth at the same pixels.
 
-    The variance of the known depth is estimated as its mean squared distance to the measured depth
-    minus the variance of the measured depth. The estimate may be far below the declared variance,
-    so that depth of a sensor keeps its accuracy. Holes of the known depth are ignored.
+    The variance of known depth is estimated as the mean squared distance to measured depth minus
+    the variance of measured depth. The estimated variance may be far below the declared variance,
+    so that sensor depth keeps its accuracy. Holes of the known depth are ignored.
     """
     compared = measured.known & (known.log_std < UNKNOWN_LOG_STD)
     if not compared.any():
@@ -146,7 +146,7 @@ def _random_field(std: Float32, length: float) -> tuple[Float32, Float32, Float3
 
     Args:
         std: (h, w) marginal std of the field.
-        length: Correlation length in pixels.
+        length: Correlation length of the field in pixels.
     """
     strength = (np.log(3 * length) / (2 * np.pi * std**2)).astype(np.float32)
     east, south = np.zeros_like(strength), np.zeros_like(strength)

@@ -19,10 +19,9 @@ from mpsfm_core.support.jit import kernel
 from mpsfm_core.support.threads import parallel_map
 
 _MAX_NEIGHBORS = 8
-"""Maximum number of images that vote on the points of one image, by overlap."""
+"""Maximum number of overlapping images that vote on the points of one image."""
 _MIN_PIXEL_RATIO = 0.25
-"""Ratio of the pixels with the lowest std that always pass; networks may declare large stds
-[ours]."""
+"""Minimum ratio of pixels that count as certain, because networks may declare large stds [ours]."""
 _DUPLICATE_DISTANCE = 0.02
 """Relative distance below which consistent points are duplicates at any std [ours]."""
 _DOMINANT_STD_RATIO = 0.5
@@ -72,7 +71,7 @@ def fuse_depth_maps(
     Args:
         reconstruction: Posed images with depth maps.
         view_of: Returns the undistorted view of an image name, for the colors.
-        options: Options of the results.
+        options: Options of the run's results, such as the point cloud size.
         seed: Seed of the random subsampling.
     """
     images = reconstruction.confirmed_images
@@ -122,7 +121,7 @@ def _vote_on_images(
 
     Args:
         images: Images with confirmed poses.
-        options: Options of the results.
+        options: Options of the run's results, such as the point cloud size.
         select: Called with the image's index, the flat indices of its certain pixels, and their
             votes.
     """
@@ -166,7 +165,7 @@ def _certain_pixels(image: RegisteredImage, max_relative_std: float) -> Bool:
 
 
 def _variance(image: RegisteredImage) -> Float32:
-    assert image.depth.variance is not None  # The mapper sets this variance.
+    assert image.depth.variance is not None  # The mapper sets the depth variance.
     return image.depth.variance
 
 
@@ -189,7 +188,7 @@ def _vote_on_points(
     """Count the images that confirm, contradict or duplicate the points of one image.
 
     Args:
-        points: (n, 3) world points.
+        points: (n, 3) points of the image, world frame.
         variance: (n,) variance of the points' depth.
         voters: Neighboring images, masks of their certain pixels, and True if the image wins at
             equal variance.
@@ -241,7 +240,7 @@ def _vote(
             continue
         difference, voter_variance = depth[row, column] - z, depth_variance[row, column]
         limit = sigmas * math.sqrt(variance[k] + voter_variance)
-        if difference > limit:  # the voter sees through the point
+        if difference > limit:  # The point is in front of the voter's surface.
             votes[k] -= 1
         if abs(difference) > limit:
             continue
@@ -261,7 +260,7 @@ def _compute_normals(image: RegisteredImage) -> Float32:
     local = unproject(camera, pixel_centers(width, height), image.depth.depth)
     normals = np.zeros((height, width, 3), np.float32)
     across, down = local[1:-1, 2:] - local[1:-1, :-2], local[2:, 1:-1] - local[:-2, 1:-1]
-    normal = np.cross(down, across)  # towards the camera: x right, y down, z forward
+    normal = np.cross(down, across)  # The cross product faces the camera.
     valid = image.depth.valid
     usable = valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1] & valid[:-2, 1:-1]
     length = np.linalg.norm(normal, axis=-1, keepdims=True)

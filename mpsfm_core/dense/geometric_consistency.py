@@ -41,8 +41,8 @@ class GeometricConsistency:
     mean_change: Float32
     """(h, w) mean of all consistent log depths minus the log depth of the map."""
     match_std_px: float
-    """Std of a stereo match in pixels, estimated from depth differences; NaN without consistent
-    pixels."""
+    """Std of a stereo match in pixels, estimated from depth differences (NaN without consistent
+    pixels)."""
     pose_std_px: float = 0.0
     """Std of a match from pose errors in pixels; depth differences do not contain this error."""
 
@@ -79,7 +79,7 @@ class DepthDifferences(NamedTuple):
     """Differences from a depth map to the depth map of another view."""
 
     log_depth: Float32
-    """(h, w) difference of log depth; NaN at inconsistent pixels and outside of the other view."""
+    """(h, w) difference of log depth, NaN at inconsistent pixels and outside of the second view."""
     near_miss: Bool
     """(h, w) mask of near misses, whose depths differ by one to two times the tolerance."""
 
@@ -107,7 +107,7 @@ class DepthDifferences(NamedTuple):
 
 
 def compare_depths(reference: PosedDepth, source: PosedDepth) -> DepthDifferences:
-    """Warp a depth map into a source view and compare the log depths there."""
+    """Warp a depth map into a source view and compare the log depths of both views."""
     differences = np.full(reference.log_depth.shape, np.nan, np.float32)
     near_miss = np.zeros(differences.shape, np.bool_)
     matrix, offset = source.grid.pixels_from(reference.grid)

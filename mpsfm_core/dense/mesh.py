@@ -84,7 +84,8 @@ class _WeightedDepth(NamedTuple):
         """Find the mesh vertices on the surface of the depth map.
 
         Behind the edge of an object the TSDF has a false surface, because only some images have
-        depth there. No depth map contains this false surface, so its vertices are rejected.
+        depth there. No depth map contains the false surface of the TSDF, so the vertices on the
+        false surface are rejected.
 
         Args:
             vertices: (n, 3) positions of the vertices, world frame.
@@ -187,7 +188,7 @@ def _import_libraries() -> tuple[Any, Any]:
 def _weight_depth(image: RegisteredImage, mask: Bool) -> _WeightedDepth:
     height, width = image.depth.shape
     variance = image.depth.variance
-    assert variance is not None  # The mapper sets this variance.
+    assert variance is not None  # The mapper sets the depth variance.
     min_variance = np.finfo(np.float32).tiny
     weight = np.where(mask, 1 / np.maximum(variance, min_variance), 0).astype(np.float32)
     depth = np.where(mask, image.depth.depth, 0).astype(np.float32)
@@ -235,7 +236,7 @@ def _extract_block_surface(
     try:
         # Triangles are counterclockwise as seen from positive distances, the side of the cameras.
         vertices, triangles, *_ = marching_cubes(field, 0.0, mask=observed)
-    except (ValueError, RuntimeError):  # There is no complete surface cell.
+    except (ValueError, RuntimeError):  # No observed cell contains a surface.
         return None
     return origin + voxel * vertices.astype(np.float64), triangles.astype(np.int64)
 
@@ -257,7 +258,7 @@ def _integrate(
 
     Args:
         origin: (3,) world position of the first voxel.
-        voxel: Voxel size, world units.
+        voxel: Side length of a voxel in world units.
         rotation: (3, 3) rotation of ``cam_from_world``.
         translation: (3,) of ``cam_from_world``.
         camera: (4,) intrinsics fx, fy, cx, cy in pixels of the depth map.
@@ -335,7 +336,7 @@ def _color_vertices(
     view_of: Callable[[str], View],
     tolerance: float,
 ) -> UInt8:
-    """Average the colors of a vertex over the images that see the vertex; gray without any."""
+    """Average the colors of a vertex over the images that see the vertex; gray if no image does."""
     total = np.zeros((len(vertices), 3))
     weight = np.zeros(len(vertices))
     for map_ in maps:

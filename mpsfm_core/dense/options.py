@@ -1,6 +1,6 @@
 """Options of densification and meshing.
 
-Defaults without a source tag are values of this project; `benchmarks.dense` evaluates the defaults.
+Default values without a source tag are choices of MP-SfM that `benchmarks.dense` evaluates.
 """
 
 from __future__ import annotations

@@ -3,9 +3,9 @@
 The depth of an image pair is known up to the length of its baseline. The log scales of pairs that
 share an image are linked by pixels that both pairs confirm, and by the known depth of the image.
 The declared std of known depth links the scale of each depth map to the world. The log scales of
-pairs, known depth maps and the world form a Gaussian network, in which a constraint equates two
-scales up to its variance. The reported std is the marginal std of a scale relative to the mean of
-all pairs.
+pairs, known depth maps and the world form a Gaussian network, in which a constraint limits the
+difference of two log scales. The reported std is the marginal std of a scale relative to the mean
+of all pairs.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ _MIN_CONSTRAINT_STD = 1e-6
 _SCALE_CORRELATION = 0.5
 """Correlation of the scale errors of known depth maps in one component.
 
-The depth maps come from one network and one scene; FastDepth reaches 0.1 to 0.7 on two scenes
-[ours]."""
+The scale errors are correlated because one network predicts all depth maps of the scene [ours]."""
 _BLOCK_COLUMNS = 256
 """Number of columns of the inverse precision matrix that are solved together; bounds the memory."""
 
@@ -56,10 +55,10 @@ def measure_scale_constraints(
 ) -> ScaleConstraints:
     """Measure the scale constraints between an image's pairs and its known depth.
 
-    All pairs that confirm a pixel have equal variance, and the common error of the image cancels.
-    The squared mean difference of shared pixels is a lower bound of the variance. The std of the
-    known depth in the region of a pair is its distance to the measured depth, because errors of a
-    depth map are correlated over the region.
+    All pairs that confirm a pixel have equal variance; the depth error that the pairs have in
+    common cancels. The squared mean difference of shared pixels is a lower bound of the variance.
+    Errors of known depth are correlated within the region of a pair. The std of the known depth is
+    therefore its distance to the measured depth in the region.
 
     Args:
         differences: Source image -> (h, w) differences from
@@ -138,7 +137,7 @@ def _world_precision(precision: csr_array, maps: list[int], stds: list[float]) -
     """Compute the precision of each unknown log scale relative to the world.
 
     The precision of image pairs is 0. Depth maps of one component have correlated scale errors,
-    which reduces their precision.
+    which reduces the precision of each map.
 
     Args:
         precision: (n, n) precision of the constraints between unknown log scales.

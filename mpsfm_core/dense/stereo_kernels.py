@@ -1,4 +1,4 @@
-"""Compiled loops of multi-view stereo: NCC costs along a surface, and semi-global matching.
+"""Compiled loops of multi-view stereo: costs along a surface and semi-global matching.
 
 Images and depth maps are float32 grids of one size. Stereo labels are offsets of log depth from a
 base surface.

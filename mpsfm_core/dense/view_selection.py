@@ -81,7 +81,7 @@ def _sample_views(images: Sequence[RegisteredImage]) -> _SampledViews:
         valid = sample_nearest(image.depth.valid, map_xy)
         depth = np.where(valid, depth, np.median(depth[valid]) if valid.any() else 1.0)
         variance = image.depth.variance
-        assert variance is not None  # The mapper sets this variance.
+        assert variance is not None  # The mapper sets the depth variance.
         if valid.any():
             relative_std = np.sqrt(sample_nearest(variance, map_xy)) / depth
             log_std[row] = np.median(relative_std[valid])

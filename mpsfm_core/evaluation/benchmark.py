@@ -1,4 +1,4 @@
-"""Benchmark of configurations and other mappers on the same verified matches.
+"""Benchmark of configurations and COLMAP mappers on the same verified matches.
 
 Priors, features and matches are computed once per scene and configuration and cached. Only image
 pairs within a test set are matched. Each finished run writes a record
@@ -54,7 +54,7 @@ class BenchmarkPlan:
     configs: tuple[str, ...] = ("benchmark",)
     """Names or file paths of the compared configurations."""
     buckets: tuple[str, ...] | None = None
-    """Buckets of test sets; None for all."""
+    """Buckets of test sets, or None for all buckets."""
     priors: tuple[str, ...] = ("config",)
     """Prior qualities (:mod:`~mpsfm_core.evaluation.prior_quality`) with which mpsfm runs."""
     peers: tuple[str, ...] = PEER_METHODS
@@ -187,7 +187,7 @@ def prepare_sets(
     loaded = resolve_providers(loaded, registry, stages).config
     image_list = work / "images.txt"
     write_file(image_list, "\n".join(names) + "\n")
-    inputs = loaded.inputs.model_copy(update={"strict": True})  # Each image must load.
+    inputs = loaded.inputs.model_copy(update={"strict": True})  # No image may be skipped.
     images = load_images(scene.images, scene.intrinsics, image_list, inputs)
     no_adjustment = loaded.adjustment.model_copy(update={"enabled": False})
     unadjusted = loaded.model_copy(update={"adjustment": no_adjustment})
@@ -309,7 +309,7 @@ def _label(method: str, prior: str) -> str:
 
 
 def _content_key(run: MethodRun) -> str:
-    """Hash everything that the result of a run depends on."""
+    """Compute a hash of all inputs that determine the result of a run."""
     parts: list[object] = [run.method, core_version(), pycolmap.__version__]
     if run.method == OURS:
         parts.append(run.options.model_dump(mode="json"))

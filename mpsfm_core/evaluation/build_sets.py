@@ -30,7 +30,7 @@ def build_test_sets(
         folder: Scene folder.
         source: Source of overlap: Source of overlap: ``depth`` (``gt_depth/``), ``model`` (points
             of ``gt/``) or ``auto`` (depth if available).
-        options: Options of the sampling.
+        options: Options for the sampling of test sets.
         replace: True to replace an existing ``testsets.yaml``.
 
     Returns:

@@ -77,7 +77,7 @@ def _chain_poses(
 def _estimate_pair(
     scene: Scene, pair: VerifiedPair, options: RegistrationOptions, seed: int
 ) -> _RelativePose | None:
-    """Estimate the relative pose of a pair from the depth of either image."""
+    """Estimate the relative pose of an image pair by PnP with the depth of either image."""
     a, b = (pair.matches + scene.graph.offsets[[pair.image_a, pair.image_b]]).T
     forward = _estimate_pnp(scene, a, pair.image_b, b, options, seed)
     backward = _estimate_pnp(scene, b, pair.image_a, a, options, seed)

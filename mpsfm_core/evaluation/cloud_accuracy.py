@@ -22,9 +22,9 @@ def cloud_accuracy(
 ) -> dict[str, Any]:
     """Compare a point cloud with a scan in the same frame.
 
-    Both clouds are subsampled to one point per cube with half the smallest tolerance as side, so
-    that all regions have equal weight. Points outside the scanned region count as errors; crop the
-    cloud first if the scan is partial.
+    The cloud and the scan are subsampled to one point per cube with half the smallest tolerance as
+    side. All regions then have equal weight. Points outside the scanned region count as errors;
+    crop the cloud first if the scan is partial.
 
     Args:
         points: (n, 3) points.
@@ -32,9 +32,9 @@ def cloud_accuracy(
         tolerances: Distance thresholds.
 
     Returns:
-        Plain data for JSON. ``accuracy`` maps a tolerance to the ratio of cloud points near the
-        scan, ``completeness`` to the ratio of scan points near the cloud, ``f1`` to the harmonic
-        mean of accuracy and completeness.
+        Accuracy as plain data for JSON. ``accuracy`` maps a tolerance to the ratio of cloud points
+        near the scan, ``completeness`` to the ratio of scan points near the cloud, ``f1`` to the
+        harmonic mean of accuracy and completeness.
 
     Raises:
         InputError: The point cloud or the scan is empty.

@@ -96,9 +96,9 @@ def compare_benchmarks(
     Args:
         first: Records of the first benchmark by method.
         second: Records of the second benchmark by method.
-        convention: Convention of the pose AUC.
+        convention: Convention of the pose AUC: pairs, sign of the translation, and integration.
         resamples: Number of resamples.
-        seed: Seed of the resampling.
+        seed: Seed of the random resampling.
 
     Raises:
         InputError: The benchmarks have no test set and method in common.

@@ -31,7 +31,7 @@ class DenseEvaluation:
     dense: DenseOptions
     """Options of densification."""
     results: ResultOptions
-    """Options of the fused cloud."""
+    """Options of the fused point cloud."""
     scene: SceneFolder
     """Scene folder with true depth maps."""
     distances: tuple[float, ...]

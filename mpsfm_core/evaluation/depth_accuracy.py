@@ -45,7 +45,8 @@ def depth_accuracy(
         depth: (h, w) predicted depth.
         valid: (h, w) mask of valid predicted depth.
         truth: (H, W) true depth, 0 where unknown.
-        scale: Factor that multiplies the predicted depth; None for the median of ``truth / depth``.
+        scale: Factor that multiplies the predicted depth, or None for the median of ``truth /
+            depth``.
 
     Returns:
         The accuracy, or None if no pixel can be compared.

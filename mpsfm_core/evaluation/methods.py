@@ -70,7 +70,7 @@ class MethodRun:
     dense: DenseEvaluation | None = None
     """Dense evaluation after mpsfm, or None to skip the evaluation."""
     threads: int = 1
-    """Maximum number of threads; COLMAP is not deterministic with several threads."""
+    """Maximum number of threads (with several threads COLMAP is not deterministic)."""
 
 
 def run_methods(
@@ -135,13 +135,13 @@ class _WorkerProcesses:
             return MethodResult(error="its process died")
 
     def close(self) -> None:
-        """Shut down all subprocesses."""
+        """Shut down all subprocesses of the pool."""
         for process in self._processes:
             process.shutdown(wait=True, cancel_futures=True)
 
     def _start_process(self) -> ProcessPoolExecutor:
-        # Subprocesses are not forked, because a fork copies locked locks but not the threads that
-        # release them.
+        # Subprocesses are not forked, because a fork copies held locks without the threads that
+        # release the locks.
         context = multiprocessing.get_context("spawn")
         process = ProcessPoolExecutor(1, mp_context=context, initializer=_initialize_process)
         self._local.process = process
@@ -151,7 +151,7 @@ class _WorkerProcesses:
 
 
 def _initialize_process() -> None:
-    """Silence COLMAP and load compiled kernels, so that the first run time excludes loading."""
+    """Silence COLMAP and load compiled kernels, which the run time should not include."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     camera = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
     problem = make_mapping_problem(room_scene(), camera, arc_poses(3, 8.0))

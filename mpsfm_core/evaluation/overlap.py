@@ -42,7 +42,7 @@ class Overlap:
     names: tuple[str, ...]
     """Names of the n views."""
     seen: tuple[UInt8, ...]
-    """Packed visibility of each view's units, (n, bytes) uint8; row j contains the bits of the
+    """Visibility of the units of each view, (n, bytes) uint8; row j has the packed bits of the
     units that view j sees."""
     counts: Float64
     """(n,) number of units (pixels or points) of each view."""

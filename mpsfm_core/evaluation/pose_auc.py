@@ -157,7 +157,7 @@ def pose_auc(
     Args:
         errors_deg: (pairs,) pose errors in degrees; concatenate the errors of several scenes to
             pool scenes.
-        convention: Convention of the integration.
+        convention: Convention that defines the integration of the recall curve.
         thresholds: Thresholds in degrees.
 
     Returns:

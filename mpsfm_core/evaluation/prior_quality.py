@@ -35,7 +35,7 @@ _MILLIMETER = 0.001
 
 
 def parse_error_seed(quality: str) -> int | None:
-    """Parse the error seed of a quality ``degraded-N``; None for other qualities."""
+    """Parse the error seed of a quality ``degraded-N``, or return None for other qualities."""
     match = re.fullmatch(r"degraded(?:-(\d+))?", quality)
     return int(match[1] or 0) if match else None
 
@@ -49,7 +49,7 @@ def prior_overrides(
         quality: Prior quality.
         scene: Scene folder.
         images: Names of the images.
-        work: Folder for degraded depth maps.
+        work: Folder to which degraded depth maps are written.
 
     Raises:
         InputError: The scene has no true depth.

@@ -34,9 +34,9 @@ class BenchmarkRecord:
     config: str
     """Name of the configuration."""
     bucket: str
-    """Bucket of the set."""
+    """Bucket of the test set."""
     set_name: str
-    """Name of the set."""
+    """Name of the test set."""
     label: str
     """Name of the method, with the prior quality for methods that use priors."""
     key: str
@@ -56,7 +56,8 @@ class BenchmarkRecord:
     others: Sequence[Mapping[str, Pose]] = ()
     """Poses ``cam_from_world`` by image name of each further model."""
     dense: Mapping[str, Any] | None = None
-    """Result of :func:`~mpsfm_core.evaluation.dense_geometry.evaluate_dense_geometry`, or None."""
+    """Dense evaluation from :func:`~mpsfm_core.evaluation.dense_geometry.evaluate_dense_geometry`,
+    or None."""
 
     def errors_deg(self, convention: PoseConvention) -> Float64:
         """Compute the relative pose errors of all image pairs of the test set in degrees."""

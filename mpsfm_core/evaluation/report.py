@@ -70,8 +70,8 @@ class BenchmarkRow:
     failed: int
     """Number of test sets on which the method failed."""
     dense: Mapping[str, Any] | None = None
-    """Means over the ``sets`` with dense evaluation, or None: ``abs_rel``, and a dictionary from
-    distance in meters to ratio for each of :data:`CLOUD_METRICS`."""
+    """Mean dense evaluation with ``sets`` (number of test sets), ``abs_rel``, and a dictionary from
+    distance in meters to ratio for each of :data:`CLOUD_METRICS`, or None."""
 
     @property
     def group(self) -> GroupKey:

@@ -50,7 +50,7 @@ class SamplingOptions:
     min_images: int = 5
     """Minimum number of images of a test set [paper]."""
     max_images: int | None = None
-    """Maximum number of images of a test set; None for no limit."""
+    """Maximum number of images of a test set, or None for no limit."""
     attempts: int = 20
     """Number of random starts per requested test set."""
     seed: int = 0

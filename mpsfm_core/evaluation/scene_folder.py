@@ -108,7 +108,8 @@ def read_scene(path: Path, *, with_sets: bool = True) -> SceneFolder:
 
     Args:
         path: Scene folder.
-        with_sets: Read ``testsets.yaml``; if False, the scene has one test set with all images.
+        with_sets: Read the test sets of ``testsets.yaml`` (if False, the scene has one test set
+            with all images).
 
     Raises:
         InputError: Images or true poses are missing, or a test set has an image without true pose.

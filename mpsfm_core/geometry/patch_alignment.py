@@ -1,6 +1,6 @@
 """Subpixel patch alignment by inverse compositional Lucas-Kanade.
 
-The method is that of Baker and Matthews, "Lucas-Kanade 20 Years On" (IJCV 2004). Image gradients
+The algorithm is from Baker and Matthews, "Lucas-Kanade 20 Years On" (IJCV 2004). Image gradients
 and the Hessian are computed once, from the template patch. A Gaussian window weights the pixels of
 the patch. The residual is invariant to brightness and gain. The warp model is a translation first,
 then affine.
@@ -60,7 +60,7 @@ def align_patches(
     radius: int,
     correlation_length: float,
 ) -> PatchAlignment:
-    """Align patches of one image to another.
+    """Align patches of a template image to a searched image.
 
     Args:
         template: (h, w) gray values of the image that contains the template patches.
@@ -197,9 +197,9 @@ def _derive(
     The derivatives are orthogonal to changes of mean and contrast.
 
     Args:
-        image: (h, w) gray values.
+        image: (h, w) gray values of the template image.
         at: (2,) center of the patch as array position.
-        radius: Radius of the patch.
+        radius: Radius of the template patch in pixels.
         offsets: (q, 2) samples.
         window: (q,) weights.
         basis: (q, 8), written.
@@ -267,7 +267,7 @@ def _compare(
         image: (h, w) gray values of the searched image.
         at: (2,) center of the patch as array position.
         warp: (2, 2) linear part of the affine warp from the template to the searched image.
-        radius: Radius of the template patch.
+        radius: Radius of the template patch in pixels.
         offsets: (q, 2) samples.
         basis: (q, 8) basis of the template, see :func:`_derive`.
         gradient: (6,) output, products of the template's derivatives with the searched patch.
@@ -341,7 +341,7 @@ def _solve(
 
 @helper()
 def _compose(warp: Float64, at: Float64, step: Float64) -> None:
-    """Compose a warp in place with the inverse of a Gauss-Newton step."""
+    """Update a warp by composition with the inverse of a Gauss-Newton step."""
     a, b, c, d = 1.0 + step[2], step[3], step[4], 1.0 + step[5]
     determinant = a * d - b * c
     w00 = (warp[0, 0] * d - warp[0, 1] * c) / determinant

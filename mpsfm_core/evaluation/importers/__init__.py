@@ -40,7 +40,7 @@ def import_scene(kind: str, source: Path, target: Path, every: int = 1) -> Scene
     Args:
         kind: Name of the dataset.
         source: Scene as distributed.
-        target: Scene folder to write.
+        target: Path of the scene folder that is written.
         every: Step between imported images; n imports every n-th image.
 
     Raises:

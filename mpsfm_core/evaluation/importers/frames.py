@@ -122,7 +122,7 @@ def require_path(path: Path, what: str) -> Path:
 def pinhole_camera(
     size: tuple[int, int], fx: float, fy: float, cx: float, cy: float
 ) -> pycolmap.Camera:
-    """Build a PINHOLE camera of an image size (width, height); ``cx, cy`` in COLMAP pixels."""
+    """Build a COLMAP PINHOLE camera from image size (width, height) and intrinsics."""
     return pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=[fx, fy, cx, cy])
 
 

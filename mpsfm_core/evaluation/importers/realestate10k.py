@@ -1,4 +1,4 @@
-"""Importer of RealEstate10K.
+"""Importer of videos of the RealEstate10K dataset.
 
 The source is a folder of extracted video frames, ``TIMESTAMP.png`` or ``.jpg``. The text file
 ``ID.txt`` of the video is in the folder, or next to the folder under the same name. A line of the

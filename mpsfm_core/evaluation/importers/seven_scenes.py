@@ -1,4 +1,4 @@
-"""Importer of 7-Scenes.
+"""Importer of scenes of the 7-Scenes dataset.
 
 The source is a scene (``chess/`` with ``seq-01/``, ...) or one sequence. A frame has
 ``frame-000000.color.png``, ``.depth.png`` (millimeters, 65535 and 0 unknown) and ``.pose.txt`` (4 x

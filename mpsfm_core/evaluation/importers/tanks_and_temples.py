@@ -1,4 +1,4 @@
-"""Importer of Tanks and Temples.
+"""Importer of scenes of the Tanks and Temples benchmark.
 
 The source is a folder with the images, or with the images in ``images/``. The ground truth is a
 COLMAP model in ``sparse/0``, whose points determine image overlap as in the paper, or the
