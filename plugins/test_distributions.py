@@ -1,4 +1,4 @@
-"""Tests of the packaging of all first-party plugins."""
+"""Tests of the packaging of all plugins in this repository."""
 
 from __future__ import annotations
 
@@ -19,14 +19,16 @@ else:
 
 PLUGINS = sorted(path.parent for path in Path(__file__).parent.glob("*/pyproject.toml"))
 DISTRIBUTIONS = {"cv2": "opencv-python-headless", "PIL": "pillow", "rerun": "rerun-sdk"}
-"""Distribution by import name, if they differ."""
+"""Name of a distribution by its import name, where both names differ."""
 WITH_THE_CORE = {"mpsfm_core", "pydantic"}
-"""Packages that come with the core; options are pydantic models."""
+"""Packages that plugins may import without declaring them, because the core requires them."""
 WITHOUT_THEIR_DEPENDENCIES = {"depth_anything_3", "vismatch"}
-"""Packages with conflicting dependencies; the specification states how to install them."""
+"""Packages with conflicting dependencies, which plugins do not declare.
+``ProviderSpec.install_hint`` gives their installation command.
+"""
 FOR_TESTS_ONLY = ("contract.py", "stand_in.py")
 BESIDE_THE_AUTHORS_CODE = ("export.py", "export_moge.py", "export_unidepth.py")
-"""Export scripts, which run with the packages of the authors' code."""
+"""Export scripts, which import the authors' code and its packages."""
 HEAVY = {"viser", "rerun", "torch", "transformers", "onnxruntime", "kornia", "cv2", "scipy", "onnx"}
 
 each_plugin = pytest.mark.parametrize("folder", PLUGINS, ids=lambda folder: folder.name)

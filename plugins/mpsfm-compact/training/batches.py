@@ -34,14 +34,12 @@ _ROLL_DEG = 6.0
 class Batch:
     """Network input and labels of one batch. Label maps have half the size of the input.
 
-    * ``image`` (n, 3, h, w) is RGB from 0 to 255.
-    * ``rays`` (n, 2, h / 32, w / 32) are ray slopes x / z and y / z at the centers of pixel blocks.
-    * ``log_depth`` (n, 1, h / 2, w / 2) is the log of depth at the canonical focal length.
-    * ``known`` (n, 1, h / 2, w / 2) is True where depth is known.
-    * ``normals`` (n, 3, h / 2, w / 2) are in the camera frame, 0 if unknown.
-    * ``kind`` (n, 1, h / 2, w / 2) has the values of ``Sample.kind``.
-    * ``log_focal`` (n, 1) is the log of the focal length relative to the image diagonal.
-    * ``metric`` (n,) is True if depth has metric scale.
+    ``image`` (n, 3, h, w) is RGB from 0 to 255. ``rays`` (n, 2, h / 32, w / 32) are ray slopes x /
+    z and y / z at the centers of pixel blocks. ``log_depth`` (n, 1, h / 2, w / 2) is the log of
+    depth at the canonical focal length. ``known`` (n, 1, h / 2, w / 2) is True where depth is
+    known. ``normals`` (n, 3, h / 2, w / 2) are in the camera frame, 0 if unknown. ``kind`` (n, 1, h
+    / 2, w / 2) has the values of ``Sample.kind``. ``log_focal`` (n, 1) is the log of the focal
+    length relative to the image diagonal. ``metric`` (n,) is True if depth has metric scale.
     """
 
     image: Tensor

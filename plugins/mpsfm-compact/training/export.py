@@ -24,14 +24,11 @@ class Exported(nn.Module):
     """Network with the input and output tensors of the exported ONNX file.
 
     The input ``image`` (1, 3, h, w) is RGB from 0 to 255. The input ``intrinsics`` (1, 3, 3) is the
-    calibration matrix K in pixels of ``image``. Output maps have the shape (1, c, h / 2, w / 2):
-
-    * ``depth`` and its ``std`` are in meters for the canonical focal length.
-    * ``normals`` are unit vectors in the camera frame.
-    * ``angle`` is the std of normals about each axis in rad.
-    * ``validity`` is the probability in 0..1 that a pixel shows a surface.
-
-    The output ``focal`` (1, 1) is the estimated focal length in input pixels.
+    calibration matrix K in pixels of ``image``. Output maps have the shape (1, c, h / 2, w / 2).
+    ``depth`` and its ``std`` are in meters for the canonical focal length. ``normals`` are unit
+    vectors in the camera frame. ``angle`` is the std of normals about each axis in rad.
+    ``validity`` is the probability in 0..1 that a pixel shows a surface. The output ``focal`` (1,
+    1) is the estimated focal length in input pixels.
     """
 
     def __init__(self, network: CompactNetwork) -> None:

@@ -36,16 +36,12 @@ class CompactNetwork(nn.Module):
     """Network that predicts depth, normals, their std, validity and focal length in one pass.
 
     The input ``image`` (n, 3, h, w) is RGB from 0 to 255. The input ``rays`` (n, 2, h / 32, w / 32)
-    are the slopes x / z and y / z of the rays through the centers of blocks of 32 x 32 pixels. The
-    output is a dictionary of maps (n, c, h / 2, w / 2):
-
-    * ``log_depth`` is the log of depth in meters for :data:`CANONICAL_FOCAL`.
-    * ``log_std`` is the log of the std of ``log_depth``.
-    * ``normals`` are unit vectors in the camera frame.
-    * ``log_angle`` is the log of the angular std of normals about each axis in rad.
-    * ``validity`` is the logit of the probability that a pixel shows a surface.
-
-    The output ``log_focal`` (n, 1) is the log of the focal length relative to the image diagonal,
+    are the ray slopes x / z and y / z at the centers of blocks of 32 x 32 pixels. The output is a
+    dictionary of maps (n, c, h / 2, w / 2). ``log_depth`` is the log of depth in meters for
+    :data:`CANONICAL_FOCAL`. ``log_std`` is the log of the std of ``log_depth``. ``normals`` are
+    unit vectors in the camera frame. ``log_angle`` is the log of the angular std of normals about
+    each axis in rad. ``validity`` is the logit of the probability that a pixel shows a surface. The
+    output ``log_focal`` (n, 1) is the log of the focal length relative to the image diagonal,
     estimated from the image only.
     """
 

@@ -17,9 +17,9 @@ def normals_of_depth(
 ) -> NDArray[np.float32]:
     """Compute unit normals (h, w, 3) in the camera frame from depth, 0 where it is not smooth.
 
-    A plane is linear in inverse depth, ``1 / z = (n . ray) / d``, and is fitted by least squares in
-    windows of 9 x 9 pixels. Normals face the camera. ``depth`` (h, w) is in meters, 0 if unknown,
-    and ``camera`` is (fx, fy, cx, cy) in pixels.
+    Inverse depth is linear on a plane, ``1 / z = (n . ray) / d``. Planes are fitted to inverse
+    depth by least squares in windows of 9 x 9 pixels. Normals face the camera. ``depth`` (h, w) is
+    in meters, 0 if unknown, and ``camera`` is (fx, fy, cx, cy) in pixels.
     """
     height, width = depth.shape
     known = depth > 0

@@ -141,8 +141,9 @@ def judge(
 ) -> dict[str, dict[str, float]]:
     """Compute accuracy metrics of the network on each shard, by the name of the shard.
 
-    Metrics: The metrics are AbsRel and delta < 1.25 after median scaling, the median angular error
-        of normals in degrees, and the median ratios of scale and focal length to the truth.
+    Depth metrics are AbsRel and delta < 1.25 after median scaling, and the median ratio of scale to
+    the truth. The other metrics are the median angular error of normals in degrees, and the median
+    ratio of the focal length to the truth.
     """
     was = network.training
     network.eval()

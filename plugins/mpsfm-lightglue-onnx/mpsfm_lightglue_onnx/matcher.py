@@ -16,12 +16,12 @@ _OUTPUTS = ("matches0", "mscores0")
 
 
 class LightGlue:
-    """Matcher of LightGlue-ONNX.
+    """LightGlue matcher in an ONNX file.
 
-    The ONNX file has the inputs ``kpts0``, ``kpts1`` (1, n, 2), which are normalized keypoints, and
-    ``desc0``, ``desc1`` (1, n, d). The outputs ``matches0`` and ``mscores0`` have one of two forms.
-    They are matches (m, 2) and scores (m,), or an index and a score (1, n) for every keypoint of
-    the first view, with index -1 for no match.
+    The inputs ``kpts0`` and ``kpts1`` (1, n, 2) are normalized keypoints, and ``desc0`` and
+    ``desc1`` (1, n, d) are descriptors. The outputs ``matches0`` and ``mscores0`` are either
+    matches (m, 2) and their scores (m,), or index and score (1, n) for every keypoint of the first
+    view. The index is -1 for keypoints without a match.
     """
 
     def __init__(self, options: LightGlueOptions, context: ProviderContext) -> None:

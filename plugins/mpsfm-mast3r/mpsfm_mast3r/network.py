@@ -26,10 +26,9 @@ _TENSORS = ("pts3d", "conf", "desc", "desc_conf")
 class ViewOutput:
     """Outputs of MASt3R for one view in one pass, on the network input of size (h, w).
 
-    * ``points`` (h, w, 3) are in the camera frame of the first view of the pass, in meters.
-    * ``certainty`` (h, w) >= 1 is the confidence of ``points``.
-    * ``descriptors`` (h * w, d) are unit vectors.
-    * ``match_certainty`` (h * w,) > 0 is the confidence of ``descriptors``.
+    ``points`` (h, w, 3) are in the camera frame of the first view of the pass, in meters.
+    ``certainty`` (h, w) >= 1 is the confidence of ``points``. ``descriptors`` (h * w, d) are unit
+    vectors. ``match_certainty`` (h * w,) > 0 is the confidence of ``descriptors``.
     """
 
     view: View

@@ -148,7 +148,7 @@ class _Graph:
         self._nodes.append(helper.make_node(kind, inputs, outputs, **attributes))
 
     def save(self, outputs: Sequence[str], intrinsics: str | None, path: Path) -> Path:
-        """Write the model to ``path``, with an unused input (1, 3, 3) if ``intrinsics`` is given."""
+        """Write the model, with an unused input (1, 3, 3) if ``intrinsics`` is given."""
         flat = TensorProto.FLOAT
         inputs = [helper.make_tensor_value_info(self.image, flat, [1, 3, "h", "w"])]
         if intrinsics is not None:

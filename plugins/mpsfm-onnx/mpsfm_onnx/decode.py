@@ -96,9 +96,9 @@ def _network_depth(
 def estimate_z_shift(points: Float64, xy: Float64, valid: Bool | None = None) -> float:
     """Estimate the unknown shift t of z for points (h, w, 3) on known rays ``(x, y, 1)``.
 
-    The shift minimizes the reprojection error ``sum |(x_i, y_i) / (z_i + t) - xy_i|^2`` over a grid
-    of 64 x 64 pixels (MoGe) by Gauss-Newton, where ``xy`` (h, w, 2) are the x and y of the rays.
-    The initial value minimizes the linear error ``sum |(x_i, y_i) - xy_i (z_i + t)|^2 / z_i^2``.
+    ``xy`` (h, w, 2) are x and y of the rays. The shift minimizes the reprojection error ``sum
+    |(x_i, y_i) / (z_i + t) - xy_i|^2`` on a grid of 64 x 64 pixels by Gauss-Newton, as in MoGe. The
+    initial value minimizes the linear error ``sum |(x_i, y_i) - xy_i (z_i + t)|^2 / z_i^2``.
     """
     usable = np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
     if valid is not None:

@@ -41,7 +41,7 @@ class SideSize(Options):
 
     mode: Literal["longest", "shortest"]
     side: int = Field(gt=0)
-    """Length in pixels of the longer or shorter side of the resized image, depending on ``mode``."""
+    """Length in pixels of the longer or shorter side of the resized image, as ``mode`` selects."""
     multiple_of: int = Field(1, gt=0)
     """Both sides of the network input are multiples of this number of pixels."""
     fit: Literal["stretch", "pad", "crop"] = "stretch"

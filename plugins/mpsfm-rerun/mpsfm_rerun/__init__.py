@@ -1,1 +1,1 @@
-"""Reconstructions as rerun recordings."""
+"""Reconstructions as recordings of the viewer rerun."""

@@ -1,4 +1,4 @@
-"""``mpsfm export DIR --to rerun``: a finished reconstruction as one recording."""
+"""Export of a finished reconstruction for ``mpsfm export DIR --to rerun``."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mpsfm_rerun.viewer import RerunViewer
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write ``scene.rrd``, with photos and depth maps if available."""
+    """Write the recording ``scene.rrd``, with images and depth maps if they are available."""
     scene, _ = scene_from_model(source.model)
     images = tuple(_with_depth(source, image) for image in scene.images)
     if source.summary or source.photos is None:
@@ -30,6 +30,6 @@ def write(source: ExportSource, folder: Path) -> None:
 
 
 def _with_depth(source: ExportSource, image: PosedImage) -> PosedImage:
-    """Add the refined depth of an image and the camera of its map."""
+    """Add the refined depth map of an image, and the camera of the depth map."""
     maps = source.maps(image.name)
     return image if maps is None else replace(image, camera=maps.camera, depth=maps.depth)

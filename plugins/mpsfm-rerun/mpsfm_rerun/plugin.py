@@ -1,4 +1,4 @@
-"""Registration of the viewer and the export format; imports rerun when it is used."""
+"""Registration of the rerun viewer and export format, without importing rerun."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ def mpsfm_viewers() -> Mapping[str, str]:
 
 @hookimpl
 def mpsfm_export_formats() -> Sequence[ExportFormat]:
-    """Register the format of ``mpsfm export DIR --to rerun``."""
+    """Register the format for ``mpsfm export DIR --to rerun``."""
     return [
         ExportFormat(
             "rerun",

@@ -22,9 +22,10 @@ TIMELINE = "step"
 
 
 class RerunViewer:
-    """Viewer that writes ``OUTPUT/scene.rrd``; each scene is a step of the timeline ``step``.
+    """Viewer that writes the recording ``OUTPUT/scene.rrd``.
 
-    ``z_is_up``: orientation of the world; otherwise y is down, as in the first camera.
+    Each scene is a step of the timeline ``step``. If ``z_is_up`` is set, the world is recorded with
+    z up. Without it, y is down, as in the camera frame.
     """
 
     def __init__(self, output: Path, pictures: Pictures, z_is_up: bool = False) -> None:
@@ -41,21 +42,21 @@ class RerunViewer:
 
     @hookimpl
     def mpsfm_scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """Record the scene as a step."""
+        """Record the current scene as a step of the timeline."""
         self.show(scene())
 
     @hookimpl
     def mpsfm_notice(self, text: str) -> None:
-        """Record a message in the log."""
+        """Record a message in the log of the recording."""
         self._recording.log("log", rerun.TextLog(text))
 
     @hookimpl
     def mpsfm_image_rejected(self, name: str, text: str) -> None:
-        """Record a rejected image in the log."""
+        """Record the rejection of an image in the log of the recording."""
         self._recording.log("log", rerun.TextLog(f"{name}: {text}", level=rerun.TextLogLevel.WARN))
 
     def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
-        """Record the next step, with depth as points, or as maps if there is a ``cloud``."""
+        """Record the next step. Depth maps become points unless a ``cloud`` is given."""
         self._step += 1
         self._recording.set_time(TIMELINE, sequence=self._step)
         names = {image.name for image in scene.images}
@@ -75,7 +76,7 @@ class RerunViewer:
         return f"open it with: rerun {self.path}"
 
     def wait(self) -> None:
-        """Print the path of the file; there is nothing to wait for."""
+        """Do nothing, because a recording has no window to wait for."""
 
     def _log_image(self, image: PosedImage, *, as_points: bool) -> None:
         place, camera = _place(image.name), image.camera
@@ -108,7 +109,7 @@ class RerunViewer:
 
 
 def _depth_image(depth: DepthPrior) -> rerun.DepthImage:
-    """Convert depth to 16 bits, 0 where it is uncertain."""
+    """Convert depth to a 16-bit image, with 0 where the variance is large."""
     shown = np.where(select_certain_pixels(depth), depth.depth, 0.0)
     steps = np.iinfo(np.uint16).max / max(float(shown.max()), 1e-12)
     return rerun.DepthImage(np.round(shown * steps).astype(np.uint16), meter=steps)
@@ -119,5 +120,5 @@ def _place(name: str) -> str:
 
 
 def _key(name: str) -> str:
-    """Convert an image name to one part of an entity path."""
+    """Convert an image name to one part of an entity path of rerun."""
     return str(rerun.escape_entity_path_part(name))

@@ -1,4 +1,4 @@
-"""Tests of recordings, read by rerun's own reader."""
+"""Tests of recordings, which are read with rerun's own reader."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def scene(count: int) -> SceneState:
 
 
 def recorded(path: Path) -> dict[str, int]:
-    """Return the number of rows by entity."""
+    """Return the number of rows of each entity in a recording."""
     rows: dict[str, int] = {}
     for chunk in RrdReader(str(path)).stream():
         rows[str(chunk.entity_path)] = rows.get(str(chunk.entity_path), 0) + chunk.num_rows
@@ -68,7 +68,7 @@ def test_a_finished_scene_is_recorded_with_its_cloud(tmp_path: Path) -> None:
 
 
 def values_of(path: Path, entity: str) -> dict[str, Any]:
-    """Return the values of the only row of an entity by component."""
+    """Return the values of each component in the only row of an entity."""
     return {
         name: column.to_pylist()[0]
         for chunk in RrdReader(str(path)).stream()
@@ -81,7 +81,7 @@ def values_of(path: Path, entity: str) -> dict[str, Any]:
 
 
 def test_a_model_is_exported(tmp_path: Path) -> None:
-    """Check photos, depth and gravity along -z."""
+    """Check exported images and depth maps, and gravity along -z."""
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig = 1, 1

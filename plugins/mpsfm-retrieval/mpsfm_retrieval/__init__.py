@@ -1,1 +1,1 @@
-"""Global image descriptors, from a network or without weights."""
+"""Global image descriptors from a network, or from local features and colors."""

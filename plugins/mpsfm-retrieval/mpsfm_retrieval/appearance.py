@@ -1,4 +1,4 @@
-"""Global descriptor without weights, from local features and colors."""
+"""Global image descriptor from SIFT features and colors, without learned weights."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from mpsfm_retrieval.options import AppearanceOptions
 
 _SIFT_DIMENSIONS = 128
 _BINS = (4, 16, 16)
-"""Number of bins of lightness, and of both color axes of CIELAB."""
+"""Number of histogram bins of lightness and of both color axes of CIELAB."""
 
 
 class Appearance:
-    """Mean of random Fourier features of the SIFT descriptors, and a color histogram.
+    """Global descriptor from random Fourier features of SIFT descriptors and a color histogram.
 
-    The dot product of two such means approximates the mean of ``exp(-sharpness |x - y|^2)`` over
-    all pairs of descriptors (Rahimi and Recht, 2007), without a vocabulary. The context's seed
-    determines the random features.
+    The dot product of two mean Fourier features approximates a kernel mean without a vocabulary
+    (Rahimi and Recht, 2007). The kernel mean is the mean of ``exp(-sharpness |x - y|^2)`` over all
+    pairs of SIFT descriptors x, y. The seed of the provider context determines the random features.
     """
 
     def __init__(self, options: AppearanceOptions, context: ProviderContext) -> None:
@@ -37,7 +37,7 @@ class Appearance:
         self._phases = rng.uniform(0, 2 * np.pi, options.dimensions)
 
     def describe(self, view: View) -> Float32:
-        """Compute a unit vector (dimensions + 1024,); shorter for a view without features."""
+        """Compute a descriptor (dimensions + 1024,) of unit norm, or less without keypoints."""
         colours = np.sqrt(self._color_share) * _colours(view)
         local = np.sqrt(1 - self._color_share) * self._local(view)
         return np.concatenate([local, colours]).astype(np.float32)

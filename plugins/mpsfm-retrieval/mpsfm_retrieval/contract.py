@@ -1,4 +1,4 @@
-"""Contract setup: a stand-in that describes the colors of a coarse grid."""
+"""Small ONNX network that averages colors, for the provider contract tests."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ coarse (float[b,3,h,w] image) => (float[b,d] descriptor) {
 
 
 def network(folder: Path) -> ContractSetup:
-    """Write a stand-in with a fixed input size, like EigenPlaces."""
+    """Write a network that averages colors, with a fixed input size like EigenPlaces."""
     model = save_model(_COARSE, folder / "coarse.onnx")
     return ContractSetup(
         options={"model": str(model), "network": "eigenplaces"}, truth_source="image"

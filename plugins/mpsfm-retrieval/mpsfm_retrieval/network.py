@@ -1,4 +1,4 @@
-"""Global descriptors from a network."""
+"""Global image descriptors from a network in an ONNX file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _INPUTS = {
         mean=_MEAN,
         std=_STD,
         interpolation="cubic",
-        # Classification uses the 224 x 224 center, which shows only a part of the view.
+        # Classification networks see the 224 x 224 center, which shows only a part of the image.
         size=SideSize(mode="longest", side=336, multiple_of=14),
     ),
     "eigenplaces": ImageInput(
@@ -34,8 +34,8 @@ _INPUTS = {
 class GlobalNetwork:
     """Network with one image as input and a descriptor as first output.
 
-    The output is a vector (1, d), tokens (1, t, d) of which the first is used, or a map (1, d, h,
-    w) that is averaged. The descriptor is normalized.
+    The output is a vector (1, d), tokens (1, t, d) whose first token is used, or a map (1, d, h, w)
+    that is averaged. The descriptor is normalized to unit length.
     """
 
     def __init__(self, options: NetworkOptions, context: ProviderContext) -> None:

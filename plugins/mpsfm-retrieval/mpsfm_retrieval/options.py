@@ -1,4 +1,4 @@
-"""Options and default weights; imports nothing heavy."""
+"""Options and default weights of the retrieval providers, importable without onnxruntime."""
 
 from __future__ import annotations
 
@@ -15,29 +15,30 @@ DINOV2 = WeightsFile(
 
 
 class NetworkOptions(Options):
-    """Options of a network in an ONNX file."""
+    """Options of a retrieval network in an ONNX file."""
 
     model: str = DINOV2.uri
-    """Path or URI; the default file is for ``dinov2``."""
+    """Path or URI of the ONNX file. The default file is DINOv2 and needs ``network: dinov2``."""
     network: Literal["dinov2", "eigenplaces", "netvlad"] = "dinov2"
-    """Preprocessing of the image, see the README."""
+    """Name of the preprocessing that the network requires (see the README)."""
     sha256: str | None = None
-    """Expected hash of ``model``."""
+    """Expected SHA-256 hash of the file ``model``."""
 
 
 class AppearanceOptions(Options):
-    """Options of the descriptor without weights.
+    """Options of the global descriptor from SIFT features and colors.
 
-    All defaults are tuned on two scenes, see the README. [ours]
+    All defaults were tuned on two scenes (see the README).
     """
 
     max_keypoints: int = Field(2000, gt=0)
-    """Number of SIFT features; the largest are kept."""
+    """Maximum number of SIFT keypoints, selected by scale."""
     resize: int = Field(640, ge=32)
-    """Longer side for detection in pixels, never enlarged."""
+    """Longer side of the resized image in pixels for SIFT. Images are never enlarged."""
     dimensions: int = Field(4096, ge=16)
-    """Number of random Fourier features."""
+    """Number of random Fourier features, the length of the local part of the descriptor."""
     sharpness: float = Field(15.0, gt=0)
-    """Parameter of the kernel ``exp(-sharpness |x - y|^2)`` of two unit descriptors."""
+    """Parameter of the kernel ``exp(-sharpness |x - y|^2)`` of two unit SIFT descriptors x, y."""
     color_share: float = Field(0.3, ge=0, lt=1)
-    """Weight of the color histogram; the local descriptors have the rest."""
+    """Weight of the color histogram in the similarity. The SIFT features have the remaining
+    weight."""

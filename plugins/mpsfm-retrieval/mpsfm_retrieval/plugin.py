@@ -1,4 +1,4 @@
-"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
+"""Registration of the retrieval providers, importing neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mpsfm_retrieval.options import DINOV2, AppearanceOptions, NetworkOptions
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register a network, and a descriptor without weights."""
+    """Register a retrieval network, and a descriptor from SIFT features and colors."""
     return [
         ProviderSpec(
             kind="retrieval",

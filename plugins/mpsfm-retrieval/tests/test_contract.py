@@ -1,4 +1,4 @@
-"""Contract tests: the network with a stand-in, and the descriptor without weights."""
+"""Provider contract tests of both retrieval providers, with a small network."""
 
 from mpsfm_core.testing import contract_tests
 

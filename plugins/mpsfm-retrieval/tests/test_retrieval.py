@@ -1,4 +1,4 @@
-"""Tests of both descriptors against independent computations and on a real scene."""
+"""Tests of global descriptors against independent computations and on a real scene."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def view_of(image, mask=None):
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("network", ["dinov2", "eigenplaces", "netvlad"])
 def test_forms_of_the_output(form, network, write_onnx, context):
-    """Check the mean color as vector, as first of two tokens, and as half of a map."""
+    """Check a mean color as vector, as first of two tokens, and as half of a map."""
     signature, body = FORMS[form]
     text = f"net (float[b,3,h,w] image) => ({signature}) {{"
     text += f" mean = GlobalAveragePool (image) {body} }}"
@@ -117,7 +117,7 @@ class TestAppearance:
         assert vector @ vector == pytest.approx(0.3)
 
     def test_neighbours_on_an_arc_of_photos(self, shared_data, context):
-        """Check that the most similar photos of the fountain are its neighbors on the arc."""
+        """Check that the most similar images of the fountain scene are neighbors on its arc."""
         folder = shared_data / "data" / "fountain" / "images"
         provider = Appearance(AppearanceOptions(), context)
         vectors = []

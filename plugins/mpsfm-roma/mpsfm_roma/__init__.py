@@ -1,1 +1,1 @@
-"""RoMa in an ONNX file: a dense warp as matches."""
+"""RoMa in an ONNX file, as a matcher that predicts a dense warp."""

@@ -1,4 +1,4 @@
-"""Contract setup: a stand-in that matches by patches on a coarse grid."""
+"""Small ONNX network that replaces RoMa in the contract tests by comparing patches."""
 
 from __future__ import annotations
 
@@ -49,14 +49,14 @@ roma (float[b,3,h,w] im_A, float[b,3,h,w] im_B) => (
 
 
 def dense(folder: Path) -> ContractSetup:
-    """Write a symmetric stand-in, and use every position of its grid."""
+    """Write a symmetric replacement network, and match every position of its coarse grid."""
     return ContractSetup(
         options={**_stand_in(folder), "cell": 1, "min_certainty": 0.5}, truth_source="image"
     )
 
 
 def sparse(folder: Path) -> ContractSetup:
-    """Write the same stand-in with a larger snap distance for its coarse grid."""
+    """Write the replacement network, with a snap distance that fits its coarse grid."""
     return ContractSetup(
         options={**_stand_in(folder), "snap_px": 3.0, "min_certainty": 0.5}, truth_source="image"
     )

@@ -1,4 +1,4 @@
-"""RoMa as a dense and a sparse matcher."""
+"""RoMa as a dense and as a sparse matcher."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from mpsfm_roma.options import DenseSearch, SparseSearch
 
 
 class DenseMatcher:
-    """Matcher that subsamples the certain parts of the warp."""
+    """Dense matcher that samples positions of the warp with a high certainty."""
 
     network: ClassVar[Callable[..., WarpNetwork]] = OnnxWarpNetwork
 
@@ -38,7 +38,7 @@ class DenseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Return matches from a to b and, for a symmetric model, from b to a."""
+        """Return matches from a to b and, for a symmetric model, also from b to a."""
         there, back = self._network.warps(view_a, view_b)
         xy_a, xy_b, scores = self._thinned(there)
         if back is not None:
@@ -48,7 +48,7 @@ class DenseMatcher:
         return PairMatches(dense=DenseMatches(xy_a, xy_b, scores))
 
     def _thinned(self, warp: Warp) -> tuple[Float64, Float64, Float32]:
-        """Select the best match of each cell: positions in both views, and scores."""
+        """Select the best match per grid cell, as positions in both views and scores."""
         rows, columns = _best_of_cells(warp.certainty, self._cell)
         scores = warp.certainty[rows, columns]
         sure = scores > self._min_certainty
@@ -57,7 +57,7 @@ class DenseMatcher:
 
 
 class SparseMatcher:
-    """Matcher of keypoints that the warp maps close to each other."""
+    """Sparse matcher of keypoints that the warp maps close to each other."""
 
     network: ClassVar[Callable[..., WarpNetwork]] = OnnxWarpNetwork
 
@@ -72,7 +72,7 @@ class SparseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match keypoints one-to-one, the most certain first."""
+        """Match keypoints one-to-one, in the order of decreasing certainty."""
         features_a, features_b = require_features(
             "roma-sparse matches keypoints", features_a, features_b
         )
@@ -88,7 +88,7 @@ class SparseMatcher:
     def _snapped(self, warp: Warp, xy: Float64, others: Float64) -> tuple[Int64, Float32]:
         """Find pairs (m, 2) of a keypoint and the nearest keypoint to its warped position.
 
-        A pair is kept if the distance is small and no other keypoint is warped closer.
+        A pair is accepted if their distance is small and no other keypoint is warped closer.
         """
         if not (len(xy) and len(others)):
             return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.float32)
@@ -103,7 +103,7 @@ class SparseMatcher:
 
 
 def _best_of_cells(certainty: Float32, cell: int) -> tuple[Int64, Int64]:
-    """Find row and column of the largest value of each square of ``cell`` x ``cell``."""
+    """Find row and column of the largest value in each square of ``cell`` x ``cell`` pixels."""
     height, width = certainty.shape
     down, across = -(-height // cell), -(-width // cell)
     padded = np.full((down * cell, across * cell), -1, dtype=np.float32)

@@ -1,4 +1,4 @@
-"""Dense warp between two views."""
+"""RoMa's network, which predicts a dense warp between two views."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ from mpsfm_roma.options import RomaOptions
 
 @dataclass(frozen=True)
 class Warp:
-    """Positions of the pixels of one view in the other view.
+    """Dense warp: the positions of the pixels of one view in the other view.
 
-    ``target``: (h, w, 2), pixels of the other view, on a grid that covers the view of ``size``.
-    ``certainty``: (h, w) in [0, 1], 0 if the target is outside the other view.
+    ``size`` is the ``(width, height)`` of the first view, which the (h, w) grid of the warp covers.
+    ``target`` (h, w, 2) are positions in pixels of the second view. ``certainty`` (h, w) is in [0,
+    1], and 0 if the target is outside of the second view.
     """
 
     size: tuple[int, int]
@@ -31,13 +32,13 @@ class Warp:
     certainty: Float32
 
     def source(self, rows: Int64, columns: Int64) -> Float64:
-        """Return pixels (n, 2) of the view for cells of the grid."""
+        """Convert rows and columns of the warp to pixels (n, 2) of the first view."""
         height, width = self.certainty.shape
         xy = np.stack([columns, rows], axis=-1).astype(np.float64) + 0.5
         return scale_pixels(xy, (width, height), self.size)
 
     def at(self, xy: Float64) -> tuple[Float64, Float64]:
-        """Interpolate target (n, 2) and certainty (n,) at pixels (n, 2) of the view."""
+        """Interpolate target (n, 2) and certainty (n,) at pixels (n, 2) of the first view."""
         height, width = self.certainty.shape
         grid = scale_pixels(xy, self.size, (width, height))
         everywhere: Bool = np.ones((height, width), dtype=np.bool_)
@@ -47,16 +48,17 @@ class Warp:
 
 
 class WarpNetwork(ABC):
-    """Interface of RoMa."""
+    """Interface of RoMa networks, in an ONNX file or in torch."""
 
     @abstractmethod
     def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
-        """Run the network on two images, as RoMa's ``match``.
+        """Run the network on two images, like RoMa's function ``match``.
 
         Returns:
-            The warp (h, w, 4) with positions ``x_a, y_a, x_b, y_b`` in [-1, 1], the first two on a
-            grid; its certainty (h, w); and if it is symmetric. A symmetric warp has the warp of the
-            second view in its right half, with the last two on the grid.
+            The warp (h, w, 4), its certainty (h, w), and True if the warp is symmetric. The warp
+            has positions ``x_a, y_a, x_b, y_b`` in [-1, 1], where the first two are on a regular
+            grid. A symmetric warp also has the warp of the second view in its right half, where the
+            last two are on a regular grid.
         """
 
     def warps(self, view_a: View, view_b: View) -> tuple[Warp, Warp | None]:
@@ -70,10 +72,11 @@ class WarpNetwork(ABC):
 
 
 class OnnxWarpNetwork(WarpNetwork):
-    """RoMa as an ONNX model.
+    """RoMa in an ONNX file.
 
-    Inputs: two images (1, 3, height, width), ImageNet-normalized. Outputs, with or without a batch
-    dimension: warp and certainty.
+    The inputs are two images (1, 3, height, width), normalized by the mean and std of ImageNet. The
+    outputs are warp and
+        certainty, with or without a batch dimension.
     """
 
     def __init__(self, options: RomaOptions, context: ProviderContext) -> None:
@@ -89,7 +92,7 @@ class OnnxWarpNetwork(WarpNetwork):
         )
 
     def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
-        """Run the ONNX model; see :class:`WarpNetwork`."""
+        """Run the ONNX model, see :class:`WarpNetwork`."""
         images = (
             Canvas.plan(self._rule.size, v.camera.size).paint(v.image, self._rule)
             for v in (view_a, view_b)

@@ -1,4 +1,4 @@
-"""Options of the matchers; imports nothing heavy. "reference" is the authors' implementation."""
+"""Options of the RoMa matchers, importable without onnxruntime."""
 
 from __future__ import annotations
 
@@ -8,45 +8,46 @@ from mpsfm_core import Options
 
 
 class RomaOptions(Options):
-    """Options of the network."""
+    """Options of RoMa's network."""
 
     model: str
-    """Path or URI of the ONNX file, see the README."""
+    """Path or URI of the ONNX file (see the README)."""
     sha256: str | None = None
-    """Expected hash of ``model``."""
+    """Expected SHA-256 hash of the file ``model``."""
     height: int = Field(672, ge=14, multiple_of=14)
-    """Rows of the network input; views are stretched. [reference: coarse resolution]"""
+    """Height of the network input in pixels. Images are stretched to the input size."""
     width: int = Field(672, ge=14, multiple_of=14)
-    """Columns of the network input."""
+    """Width of the network input in pixels."""
     inputs: tuple[str, str] = ("im_A", "im_B")
-    """Names of the image tensors."""
+    """Names of the two image tensors in the ONNX file."""
     outputs: tuple[str, str] = ("warp", "certainty")
-    """Names of the tensors of warp and certainty."""
+    """Names of the tensors of warp and certainty in the ONNX file."""
 
 
 class DenseSearch(Options):
-    """Options of dense matching."""
+    """Options of RoMa's dense matching."""
 
     cell: int = Field(4, ge=1)
-    """Side in warp pixels of the cells with one match each. The core keeps one match within 8
-    pixels of the view, so a smaller value only stores more.
+    """Side in warp pixels of the grid cells that yield one match each. The core merges matches
+    within 8 pixels of the image, so a smaller value only stores more matches.
     """
     min_certainty: float = Field(0.05, ge=0, lt=1)
-    """Minimum certainty of a match. [RoMa]"""
+    """Minimum certainty of a match."""
 
 
 class SparseSearch(Options):
-    """Options of matching at keypoints."""
+    """Options of RoMa's matching at given keypoints."""
 
     snap_px: float = Field(2.0, gt=0)
-    """Maximum distance in pixels between a keypoint and a warped keypoint. [reference]"""
+    """Maximum distance in pixels between a keypoint and the warped position of the other
+    keypoint."""
     min_certainty: float = Field(0.05, ge=0, lt=1)
-    """Minimum certainty of the warp at a keypoint. [RoMa]"""
+    """Minimum certainty of the warp at a keypoint."""
 
 
 class DenseOptions(RomaOptions, DenseSearch):
-    """Options of ``roma``."""
+    """Options of the provider ``roma``, the dense matcher."""
 
 
 class SparseOptions(RomaOptions, SparseSearch):
-    """Options of ``roma-sparse``."""
+    """Options of the provider ``roma-sparse``, which matches given keypoints."""

@@ -1,4 +1,4 @@
-"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
+"""Registration of the RoMa matchers, importing neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mpsfm_roma.options import DenseOptions, SparseOptions
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register the dense and the sparse matcher."""
+    """Register the dense and the sparse RoMa matcher."""
     return [
         _spec("roma", "dense", DenseOptions, "RoMa: dense matches of a warp"),
         _spec("roma-sparse", "sparse", SparseOptions, "RoMa's warp at keypoints of any detector"),

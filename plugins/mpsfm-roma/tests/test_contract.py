@@ -1,4 +1,4 @@
-"""Contract tests with a stand-in that matches patches on a coarse grid."""
+"""Provider contract tests with a small network that matches patches instead of RoMa."""
 
 from mpsfm_core.testing import contract_tests
 

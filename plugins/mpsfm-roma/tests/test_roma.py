@@ -1,4 +1,4 @@
-"""Tests of the matchers with stand-ins of known warp."""
+"""Tests of the matchers with small ONNX networks whose warp is known."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from mpsfm_core import Features, PinholeCamera, View
 from mpsfm_core.data.errors import ConfigError, ProviderError
 
 ROWS, COLUMNS = 28, 42
-"""Size of the network input and of the warp."""
+"""Height and width in pixels of the network input and of the warp."""
 SHIFT = np.array([0.2, -0.1])
-"""Shift of normalized positions from a to b; b has a scale of 0.8."""
+"""Shift of normalized positions from view a to view b, which is scaled by 0.8."""
 SCALE = 0.8
 
 CONSTANT = """
@@ -38,13 +38,13 @@ A, B = view_of(120, 80, "a.png"), view_of(60, 100, "b.png")
 
 
 def b_from_a(xy):
-    """Convert pixels of a to pixels of b."""
+    """Convert pixels of view a to pixels of view b by the known warp."""
     return ((xy / A.camera.size * 2 - 1) * SCALE + SHIFT + 1) / 2 * B.camera.size
 
 
 @pytest.fixture
 def options(write_onnx):
-    """Return a function of options for a model with the warp above."""
+    """Return a function that writes a model of the known warp and returns its options."""
 
     def make(symmetric=True, certainty=None, **more):
         there = np.concatenate([grid(), grid() * SCALE + SHIFT], axis=-1)
@@ -70,7 +70,7 @@ def test_dense_positions_in_pixels_of_views_of_other_sizes(options, symmetric, c
     matcher = DenseMatcher(DenseOptions(**options(symmetric, cell=1)), context)
     found = matcher.match(A, B).dense
     np.testing.assert_allclose(found.points_b, b_from_a(found.points_a), atol=1e-4)
-    # the grid of a has pixel centres; where b_from_a is outside of b there is no match
+    # The warp of view a is at pixel centers. Targets outside of view b yield no match.
     first = (pixel + 0.5 for pixel in (0, 0))
     np.testing.assert_allclose(found.points_a[0], np.array([*first]) * (120 / 42, 80 / 28))
     inside = (np.abs(grid() * SCALE + SHIFT) <= 1).all(axis=-1).sum()

@@ -1,1 +1,1 @@
-"""Sky masks, from a network or without weights."""
+"""Sky masks from a segmentation network, or from color rules."""

@@ -1,4 +1,4 @@
-"""Contract setups without weights."""
+"""Small ONNX sky network and textured test images, for the provider contract tests."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ sky (float[b,3,h,w] image) => (float[b,1,h,w] d0)
     d0 = Max (above, zero)
 }
 """
-"""1 where the red channel of a painted view (its depth) is 0."""
+"""Network that returns 1 where the red channel of a test image, which encodes depth, is 0."""
 
 
 def network(folder: Path) -> ContractSetup:
-    """Write a stand-in that masks pixels without painted depth."""
+    """Write a network that masks the pixels of test images without depth."""
     path = save_model(_PAINTED_SKY, folder / "sky.onnx")
     return ContractSetup(
         options={"model": str(path), "network": "skysegsmall"}, truth_source="painted"
@@ -29,5 +29,5 @@ def network(folder: Path) -> ContractSetup:
 
 
 def simple(folder: Path) -> ContractSetup:
-    """Use the blue sky of the textured views."""
+    """Test the rule-based mask on the blue sky of the textured test images."""
     return ContractSetup(truth_source="image")

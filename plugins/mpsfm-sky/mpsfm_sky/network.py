@@ -1,4 +1,4 @@
-"""Sky mask from a segmentation network."""
+"""Sky masks from a segmentation network in an ONNX file."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _INPUTS = {
 
 
 class SkyNetwork:
-    """Network with one image as input and the probability of sky as first output.
+    """Network with one image as input and the sky probability as first output.
 
-    The reference stretches each output to 0..1, which finds sky in images without sky; the
-    probability is used without stretching here.
+    The reference implementation stretches each output to 0..1, which finds sky in images without
+    sky. This provider uses the probability without stretching.
     """
 
     def __init__(self, options: SkyOptions, context: ProviderContext) -> None:
@@ -38,7 +38,7 @@ class SkyNetwork:
         self._threshold = options.threshold
 
     def mask(self, view: View) -> Bool:
-        """Predict a mask that is False on sky."""
+        """Predict a mask of the image size that is False on sky."""
         canvas = Canvas.plan(self._rule.size, view.camera.size)
         feed = {self._image: canvas.paint(view.image, self._rule)}
         sky = to_planes(self._model.run(feed, [self._sky])[0], "NCHW")[..., 0]

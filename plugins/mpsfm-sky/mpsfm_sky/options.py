@@ -1,4 +1,4 @@
-"""Options of the providers; imports nothing heavy."""
+"""Options of the sky mask providers, importable without onnxruntime."""
 
 from __future__ import annotations
 
@@ -9,36 +9,39 @@ from pydantic import Field
 from mpsfm_core import Options, WeightsFile
 
 SKYSEG = WeightsFile("hf://JianyuanWang/skyseg@main/skyseg.onnx", license="MIT")
-"""Network of the reference, from the source that VGGT's authors use; its hash is recorded."""
+"""Sky network of the reference implementation, from the source that VGGT's authors use."""
 
 
 class SkyOptions(Options):
     """Options of a sky segmentation network in an ONNX file."""
 
     model: str = SKYSEG.uri
-    """Path or URI."""
+    """Path or URI of the ONNX file of the sky network."""
     network: Literal["skyseg", "skysegsmall"] = "skyseg"
-    """Preprocessing: ``skyseg`` 320 x 320, normalized [reference]; ``skysegsmall`` 384 x 384, 0..1.
+    """Preprocessing of the image. ``skyseg`` resizes to 320 x 320 pixels and normalizes by the mean
+    and std of ImageNet [reference]. ``skysegsmall`` resizes to 384 x 384 pixels with values in
+    0..1.
     """
     sha256: str | None = None
-    """Expected hash of ``model``."""
+    """Expected SHA-256 hash of the file ``model``."""
     threshold: float = Field(0.5, gt=0, lt=1)
-    """Sky probability above which a pixel is masked. [reference]"""
+    """Sky probability above which a pixel is masked. Higher values mask fewer pixels."""
 
 
 class SimpleSkyOptions(Options):
-    """Options of the rule-based mask.
+    """Options of the rule-based sky mask, which needs no network.
 
-    All defaults are tuned on the photos of the README. [ours]
+    All defaults were tuned on the images of the README.
     """
 
     brightness: float = Field(0.6, ge=0, le=1)
-    """Minimum mean of the channels of bright sky."""
+    """Minimum mean of the RGB channels (0..1) of bright sky."""
     warmth: float = Field(0.05, ge=0, le=1)
-    """Maximum red minus blue of bright sky."""
+    """Maximum difference of red minus blue (0..1) of bright sky."""
     blueness: float = Field(0.1, ge=0, le=1)
-    """Minimum blue minus red of darker sky."""
+    """Minimum difference of blue minus red (0..1) of darker sky."""
     roughness: float = Field(0.02, gt=0)
-    """Maximum brightness step to a neighbor, in an image of 256 pixels."""
+    """Maximum difference in brightness (0..1) between adjacent sky pixels, in an image of 256
+    pixels."""
     min_share: float = Field(0.005, ge=0, le=1)
-    """Minimum area of a sky region as a share of the image."""
+    """Minimum area of a sky region relative to the area of the image."""

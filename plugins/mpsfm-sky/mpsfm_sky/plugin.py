@@ -1,4 +1,4 @@
-"""Registration of the providers; imports neither onnxruntime nor OpenCV."""
+"""Registration of the sky mask providers, importing neither onnxruntime nor OpenCV."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mpsfm_sky.options import SKYSEG, SimpleSkyOptions, SkyOptions
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register a network and a rule-based mask."""
+    """Register a sky segmentation network and a rule-based sky mask."""
     return [
         ProviderSpec(
             kind="mask",

@@ -1,4 +1,4 @@
-"""Sky mask without a network: smooth, bright or blue regions at the upper border."""
+"""Rule-based sky mask from smooth, bright or blue regions at the upper image border."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from mpsfm_sky.options import SimpleSkyOptions
 
 _LONGER_SIDE = 256
 _CLEARANCE = 3
-"""Kernel size of the erosion that separates sky from adjacent regions."""
+"""Kernel size in pixels of the erosion that separates sky from adjacent regions."""
 
 
 class SimpleSky:
-    """Mask of regions at the upper border that resemble sky; white walls do as well."""
+    """Mask of sky-like regions at the upper image border, which may include white walls."""
 
     def __init__(self, options: SimpleSkyOptions, context: ProviderContext) -> None:
         self._options = options
 
     def mask(self, view: View) -> Bool:
-        """Compute a mask that is False on sky."""
+        """Compute a mask of the image size that is False on sky."""
         factor = min(1.0, _LONGER_SIDE / max(view.camera.size))
         width, height = (max(1, round(side * factor)) for side in view.camera.size)
         likely = self._likely(resize_map(view.image, width, height))
@@ -33,12 +33,12 @@ class SimpleSky:
         above = np.intersect1d(large[large > 0], labels[0])
         core = np.isin(labels, above).astype(np.uint8)
         inner = cv2.dilate(core, kernel, iterations=2) & likely
-        sky = cv2.dilate(inner, kernel)  # pixels at the skyline are never smooth
+        sky = cv2.dilate(inner, kernel)  # the sky pixels next to the skyline are never smooth
         keep: Bool = resize_map(sky, *view.camera.size) <= 0.5
         return keep
 
     def _likely(self, rgb: Float32) -> UInt8:
-        """Compute 1 for pixels of an RGB image (0..255) that may be sky."""
+        """Compute an image (h, w) that is 1 where an RGB image (0..255) may show sky."""
         options = self._options
         red, _, blue = np.moveaxis(rgb / 255, -1, 0)
         gray = rgb.mean(axis=-1) / 255

@@ -1,4 +1,4 @@
-"""Contract tests: the network with a stand-in, and the rule-based mask."""
+"""Provider contract tests of a small sky network and of the rule-based mask."""
 
 from mpsfm_core.testing import contract_tests
 

@@ -1,4 +1,4 @@
-"""Tests of both masks on synthetic views, and of the network on a real photo."""
+"""Tests of both sky masks on synthetic images, and of the network on a real image."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BLUE = (
     "sky (float[1,3,h,w] image) => (float[1,1,h,w] d0) "
     "{ blue = Gather <axis = 1> (image, two) a = Mul (blue, std) d0 = Add (a, mean) }"
 )
-"""Network whose sky probability is the blue channel."""
+"""Network whose sky probability is the blue channel of the image."""
 NORMALISED = {"skyseg": (0.225, 0.406), "skysegsmall": (1.0, 0.0)}
 
 
@@ -27,7 +27,7 @@ def view_of(image):
 
 @pytest.fixture
 def landscape():
-    """Create (image, sky): a textured skyline below a blue gradient, with a door and a cloud."""
+    """Create an image with a blue gradient above a textured skyline, and its sky mask."""
     rng = np.random.default_rng(0)
     height, width = 240, 360
     skyline = (110 + 40 * np.sin(np.arange(width) / 30)).astype(int)
@@ -61,7 +61,7 @@ class TestNetwork:
             SkyNetwork(SkyOptions(model=str(write_onnx(text))), context)
 
     def test_real_photo(self, shared_data, context):
-        """Check the photo of the fountain with a wedge of sky at the upper right (0.8 %)."""
+        """Check an image of the fountain scene with sky at the upper right (0.8 % of pixels)."""
         model = shared_data / "models" / "skysegsmall_384.onnx"
         provider = SkyNetwork(SkyOptions(model=str(model), network="skysegsmall"), context)
         path = shared_data / "data" / "fountain" / "images" / "0010.jpg"
@@ -79,7 +79,7 @@ class TestSimple:
         before = image.copy()
         found = ~SimpleSky(SimpleSkyOptions(), context).mask(view_of(image))
         assert (found & sky).sum() / (found | sky).sum() > 0.93
-        assert not found[190:230, 100:140].any()  # the door is not open to above
+        assert not found[190:230, 100:140].any()  # sky seen through a door
         np.testing.assert_array_equal(image, before)
 
     @pytest.mark.parametrize("size", [(1, 1), (3, 200), (200, 3), (1000, 700)])

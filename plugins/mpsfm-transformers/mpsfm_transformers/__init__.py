@@ -1,1 +1,1 @@
-"""Models of the Hugging Face Hub that the library transformers runs."""
+"""Models of the Hugging Face Hub that the library transformers can run."""

@@ -1,6 +1,6 @@
-"""Contract setups: tiny models of the real families with random weights.
+"""Tiny models of the supported architectures for the provider contract tests.
 
-Their answers are valid but not accurate.
+The weights are random, so predictions are valid but not accurate.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from mpsfm_transformers import stand_in
 
 
 def transformers(folder: Path) -> ContractSetup:
-    """Write a tiny Depth Pro, which uses and estimates the focal length."""
+    """Write a tiny Depth Pro, which uses and also estimates the focal length."""
     return ContractSetup(
         options={"model": str(stand_in.depth_pro(folder / "depth_pro"))}, truth_source="none"
     )
 
 
 def prompt_depth_anything(folder: Path) -> ContractSetup:
-    """Write a tiny model, and coarse true depth maps as sensor data."""
+    """Write a tiny Prompt Depth Anything, and the true depth of test images as sensor depth."""
 
     def write_depth(example: Example) -> None:
         path = (folder / "sensor" / example.view.name).with_suffix(".npy")
@@ -36,33 +36,33 @@ def prompt_depth_anything(folder: Path) -> ContractSetup:
 
 
 def superpoint_hub(folder: Path) -> ContractSetup:
-    """Write a detector that finds keypoints everywhere."""
+    """Write a tiny SuperPoint that detects keypoints everywhere."""
     model = stand_in.superpoint(folder / "superpoint")
     return ContractSetup(options={"model": str(model), "max_keypoints": 300}, truth_source="none")
 
 
 def lightglue_superpoint_hub(folder: Path) -> ContractSetup:
-    """Write a matcher for descriptors of SuperPoint."""
+    """Write a tiny LightGlue for SuperPoint descriptors."""
     return ContractSetup(
         options={"model": str(stand_in.lightglue(folder / "lightglue"))}, truth_source="none"
     )
 
 
 def superglue(folder: Path) -> ContractSetup:
-    """Write a matcher for descriptors of SuperPoint."""
+    """Write a tiny SuperGlue for SuperPoint descriptors."""
     return ContractSetup(
         options={"model": str(stand_in.superglue(folder / "superglue"))}, truth_source="none"
     )
 
 
 def efficient_loftr(folder: Path) -> ContractSetup:
-    """Write a matcher for small images."""
+    """Write a tiny Efficient LoFTR for small images."""
     model = stand_in.efficient_loftr(folder / "efficient_loftr")
     return ContractSetup(options={"model": str(model), "resize": 128}, truth_source="none")
 
 
 def dino(folder: Path) -> ContractSetup:
-    """Write a few random layers, which suffice to distinguish two scenes."""
+    """Write a DINOv2 of a few random layers, which suffice to distinguish two scenes."""
     return ContractSetup(
         options={"model": str(stand_in.dino(folder / "dino"))}, truth_source="none"
     )

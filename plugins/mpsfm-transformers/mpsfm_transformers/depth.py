@@ -1,4 +1,4 @@
-"""Depth from any model that ``AutoModelForDepthEstimation`` loads."""
+"""Depth from any model that ``AutoModelForDepthEstimation`` of transformers loads."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ from mpsfm_transformers.placement import Preparation, preparation_for
 
 _PROMPTED = "prompt_depth_anything"
 _FARTHEST_M = 250.0
-"""Maximum depth of Depth Pro in meters. [reference]"""
+"""Maximum depth in meters that Depth Pro predicts."""
 _NO_SPREAD_M = 1e-6
-"""Offset that is added to one pixel of a constant prompt, which the library cannot normalize."""
+"""Offset of one pixel, in meters, in constant sensor depth, which the library cannot normalize."""
 
 _METRIC = ("glpn", "zoedepth", "tipsv2_dpt")
-"""Families of models that predict meters."""
+"""Values of ``model_type`` in ``config.json`` of models that predict meters."""
 
 
 class HubDepth:
-    """Provider of depth on the grid of the network."""
+    """Provider of depth at the resolution of the network output."""
 
     def __init__(self, options: DepthOptions, context: ProviderContext) -> None:
         self._model = LoadedModel(AutoModelForDepthEstimation, options, context)
@@ -45,7 +45,7 @@ class HubDepth:
         self._by_focal = config.model_type == "depth_pro"
 
     def predict(self, view: View) -> DepthPrior:
-        """Predict depth; Depth Pro uses the focal length of the view's camera."""
+        """Predict the depth of a view. Depth Pro also uses the focal length of the camera."""
         value, _ = self._run(view)
         if self._by_focal:
             inverse = value.astype(np.float64) * (view.camera.width / view.camera.fx)
@@ -55,7 +55,7 @@ class HubDepth:
         return DepthPrior.from_arrays(value, metric=self._metric)
 
     def estimate_focal(self, view: View) -> float | None:
-        """Estimate the horizontal focal length in pixels of the view; None except for Depth Pro."""
+        """Estimate the horizontal focal length in pixels with Depth Pro, else return None."""
         if not self._by_focal:
             return None
         angle = self._run(view)[1]
@@ -64,7 +64,7 @@ class HubDepth:
         return 0.5 * view.camera.width / float(np.tan(0.5 * np.radians(angle)))
 
     def _run(self, view: View) -> tuple[Float32, float | None]:
-        """Run the network on a view; return its map, and the angle of view in degrees or None."""
+        """Run the network, and return its depth map and its angle of view in degrees, if any."""
         prepared = self._preparation(view)
         with inference():
             prediction = self._model.network(pixel_values=prepared.pixels.to(self._model.device))
@@ -74,7 +74,7 @@ class HubDepth:
 
 
 class PromptDepth:
-    """Prompt Depth Anything: sensor depth with the detail of the photo."""
+    """Provider of sensor depth that Prompt Depth Anything refines by the image."""
 
     def __init__(self, options: PromptOptions, context: ProviderContext) -> None:
         self._model = LoadedModel(AutoModelForDepthEstimation, options, context)
@@ -85,13 +85,13 @@ class PromptDepth:
             directory=options.directory,
             suffix=options.suffix,
             scale=options.scale,
-            relative_std=1.0,  # warnings about unused maps
+            relative_std=1.0,  # avoids warnings about unused depth maps
         )
         self._sensor = DepthFiles(files, context)
         self._preparation: Preparation = preparation_for(self._model)
 
     def predict(self, view: View) -> DepthPrior:
-        """Predict metric depth; all pixels are invalid if the sensor has no depth."""
+        """Predict metric depth. All pixels are invalid if there is no sensor depth."""
         sensor = self._sensor.predict(view)
         if not sensor.valid.any():
             return sensor
@@ -104,12 +104,13 @@ class PromptDepth:
 
 
 def resolve_output(config: Any, options: DepthOptions) -> tuple[Output, bool]:
-    """Determine the output of a model and if it is metric.
+    """Return the kind of a model's output, and True if its depth is metric.
 
-    The options have priority over the table of known models and the model configuration.
+    The options of the user have priority over the table of known models, and the table over the
+    model configuration.
 
     Raises:
-        ConfigError: The model family does not predict depth.
+        ConfigError: The model does not predict depth.
     """
     family = config.model_type
     if family == "chmv2":
@@ -133,7 +134,7 @@ def _inverse(inverse: Float64, metric: bool, smallest: float = 0.0) -> DepthPrio
 
 
 def _without_holes(sensor: DepthPrior) -> Float32:
-    """Fill invalid pixels with the nearest valid value; the result is never constant."""
+    """Fill invalid pixels with the nearest valid depth, such that the result is not constant."""
     nearest = distance_transform_edt(~sensor.valid, return_distances=False, return_indices=True)
     filled: Float32 = sensor.depth[tuple(nearest)]
     if filled.min() == filled.max():

@@ -1,4 +1,4 @@
-"""SuperPoint as feature provider."""
+"""SuperPoint as a feature provider."""
 
 from __future__ import annotations
 
@@ -13,23 +13,24 @@ from mpsfm_transformers.hub import LoadedModel
 from mpsfm_transformers.options import SuperPointOptions
 
 _CELL = 8
-"""The network scores cells of 8 x 8 pixels."""
+"""Side in pixels of the cells in which SuperPoint scores keypoints."""
 
 
 class SuperPointFeatures:
-    """SuperPoint; its pixel centers are integers."""
+    """SuperPoint features. The library places pixel centers at integer coordinates."""
 
     def __init__(self, options: SuperPointOptions, context: ProviderContext) -> None:
-        config: dict[str, float] = {"max_keypoints": -1}  # a mask may remove some
+        config: dict[str, float] = {"max_keypoints": -1}  # the mask may remove some keypoints
         if options.detection_threshold is not None:
             config |= {"keypoint_threshold": options.detection_threshold}
         self._model = LoadedModel(SuperPointForKeypointDetection, options, context, **config)
         self._options = options
 
     def extract(self, view: View) -> Features:
-        """Extract the strongest keypoints inside the mask, best first.
+        """Extract the strongest keypoints inside the mask, by decreasing score.
 
-        ``std_px`` is 1, or the pixel size of the resized image if larger.
+        The keypoint noise ``std_px`` is 1 pixel of the view, or one pixel of the resized image if
+        that is larger.
         """
         size = network_size(view, self._options.resize, _CELL)
         with inference():

@@ -1,4 +1,4 @@
-"""Loading of models: safetensors and configuration only, no code of a repository."""
+"""Loading of Hub models from safetensors and configuration, without executing their code."""
 
 from __future__ import annotations
 
@@ -19,14 +19,15 @@ from mpsfm_transformers.options import CONFIG, FILES, PROCESSOR, WEIGHTS, HubOpt
 
 
 class LoadedModel:
-    """Model in evaluation mode on the context's device, in float32.
+    """Model in evaluation mode and float32, on the device of the provider context.
 
-    ``network``: the module of ``family.from_pretrained``. ``preprocessor``: the content of
-    ``preprocessor_config.json``. ``folder()``: the files in one folder.
+    ``network`` is the module that ``family.from_pretrained`` returns. ``preprocessor`` is the
+    content of ``preprocessor_config.json``. The context manager ``folder()`` provides all files in
+    one folder.
 
     Raises:
-        WeightsError: A file is missing or damaged, belongs to another family, or requires code of
-            its repository.
+        WeightsError: A file is missing or damaged, belongs to another architecture, or requires
+            code of its repository.
     """
 
     def __init__(
@@ -62,7 +63,7 @@ class LoadedModel:
 
     @contextmanager
     def folder(self) -> Iterator[Path]:
-        """Provide a folder in which the files have their original names."""
+        """Provide a folder in which the model files have their original names."""
         with ExitStack() as stack:
             folder = self._paths[0].parent
             if any(path != folder / name for path, name in zip(self._paths, FILES, strict=True)):
@@ -72,7 +73,7 @@ class LoadedModel:
             yield folder
 
     def processor(self, family: Any) -> Any:
-        """Return the image processor of the model, its PIL version (no torchvision)."""
+        """Return the model's image processor in its PIL version, which needs no torchvision."""
         with self.folder() as folder, _explained(self._name), quiet():
             return family.from_pretrained(
                 folder, local_files_only=True, backend="pil", trust_remote_code=False
@@ -81,10 +82,10 @@ class LoadedModel:
 
 @contextmanager
 def _explained(model: str) -> Iterator[None]:
-    """Convert errors of the library to one error of MP-SfM."""
+    """Convert all errors of the library transformers to :class:`WeightsError`."""
     try:
         yield
-    except Exception as error:  # errors of the library share no base class
+    except Exception as error:  # the errors of transformers share no base class
         reason = str(error).strip().splitlines() or [""]
         raise WeightsError(
             f"{model} cannot be loaded by transformers: {type(error).__name__}: {reason[0]}"
@@ -93,7 +94,7 @@ def _explained(model: str) -> Iterator[None]:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Disable progress bars and advice of the library."""
+    """Disable progress bars and warnings of the library transformers."""
     level, bars = hub_logging.get_verbosity(), hub_logging.is_progress_bar_enabled()
     hub_logging.set_verbosity_error()
     hub_logging.disable_progress_bar()

@@ -15,14 +15,14 @@ from mpsfm_transformers.options import EfficientLoftrOptions
 
 _MULTIPLE = 32
 _STD_NETWORK_PX = 0.5
-"""Keypoint noise in network pixels. [reference: half of the noise of sparse keypoints]"""
+"""Std of match positions in pixels of the network input."""
 
 
-class _Paired(EfficientLoFTRForKeypointMatching):  # type: ignore[misc]  # is untyped
+class _Paired(EfficientLoFTRForKeypointMatching):  # transformers is untyped
     """Efficient LoFTR with a corrected pairing of its matches.
 
-    The library (5.23) lists the matched cells of both images in different orders, and pairs them as
-    if the orders were the same. Here both lists follow the cells of the first image.
+    transformers 5.23 lists the matched cells of both images in different orders, but pairs them as
+    if the orders were equal. This class sorts both lists by the cells of the first image.
     """
 
     def _get_matches_from_scores(self, scores: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -34,7 +34,10 @@ class _Paired(EfficientLoFTRForKeypointMatching):  # type: ignore[misc]  # is un
 
 
 class EfficientLoftrMatcher:
-    """Matcher with positions in COLMAP's pixels; both views share one canvas, at its upper left."""
+    """Dense matcher with positions in COLMAP pixels.
+
+    Both views are placed at the upper left of images of one size.
+    """
 
     def __init__(self, options: EfficientLoftrOptions, context: ProviderContext) -> None:
         config = {}
@@ -50,7 +53,7 @@ class EfficientLoftrMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match cells of both views with subpixel refinement; the score is the coarse score."""
+        """Match two views at subpixel accuracy, with the coarse score as score."""
         views = (view_a, view_b)
         sizes = [network_size(view, self._longest, _MULTIPLE) for view in views]
         canvas = max(width for width, _ in sizes), max(height for _, height in sizes)
@@ -77,7 +80,7 @@ class EfficientLoftrMatcher:
     def _pair(
         self, views: tuple[View, View], sizes: list[tuple[int, int]], canvas: tuple[int, int]
     ) -> torch.Tensor:
-        """Stack both views to (1, 2, 3, h, w)."""
+        """Stack two views in one tensor (1, 2, 3, h, w), each at the upper left."""
         images = torch.zeros(1, 2, 3, canvas[1], canvas[0], device=self._model.device)
         for side, (view, (width, height)) in enumerate(zip(views, sizes, strict=True)):
             images[0, side, :, :height, :width] = gray_image(

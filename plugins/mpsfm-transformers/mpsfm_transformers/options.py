@@ -1,4 +1,4 @@
-"""Options and the table of known models; imports nothing heavy."""
+"""Options and table of known models, importable without torch."""
 
 from __future__ import annotations
 
@@ -18,20 +18,21 @@ FILES = (CONFIG, PROCESSOR, WEIGHTS)
 Output = Literal["depth", "disparity"]
 
 METRIC = DepthCalibration(std_scale=1.0, relative_std=0.079)
-"""Calibration of metric models. [reference, for Depth Anything V2 of size L on Virtual KITTI]"""
+"""Calibration of models that predict meters."""
 DEPTH_PRO = DepthCalibration(std_scale=1.0, relative_std=0.0875)
-"""Calibration of Depth Pro. [reference]"""
+"""Calibration of Depth Pro."""
 RELATIVE = DepthCalibration(std_scale=1.0, relative_std=0.16, shift_space="disparity")
-"""Calibration of relative models, twice that of metric ones because of the unknown shift. [assumed]
+"""Calibration of models with relative depth. The std is twice that of metric models because of the
+unknown shift.
 """
 
 
 @dataclass(frozen=True)
 class KnownModel:
-    """KnownModel properties of models whose name matches ``pattern``.
+    """Properties of all models whose name matches ``pattern``.
 
-    ``license``: license of the weights, from their model card. ``output``, ``metric``: only if the
-    model's ``config.json`` does not define them.
+    ``license`` is the license of the weights, from their model card. ``output`` and ``metric`` are
+    set only if the model's ``config.json`` does not define them.
     """
 
     pattern: str
@@ -60,45 +61,45 @@ KNOWN = (
     KnownModel("facebook/dinov2-*", "Apache-2.0"),
     KnownModel("facebook/dinov3-*", "DINOv3 License"),
 )
-"""Table of known models; the first match counts."""
+"""Table of known models. The first matching entry applies."""
 
 
 def look_up_model(model: str) -> KnownModel:
-    """Look up the known properties of a model by its name."""
+    """Return the known properties of a model by its name."""
     name = model.partition("@")[0]
     unknown = KnownModel("*", "of the chosen model, see its card", RELATIVE)
     return next((entry for entry in KNOWN if fnmatch(name, entry.pattern)), unknown)
 
 
 class HubOptions(Options):
-    """Options of a model of the Hub, or of a folder with a model.
+    """Options of a model on the Hugging Face Hub or in a local folder.
 
-    Only ``config.json``, ``preprocessor_config.json`` and safetensors are read; no code of a
-    repository is executed.
+    Only ``config.json``, ``preprocessor_config.json`` and safetensors are read, and no code of a
+    model repository is executed.
     """
 
     model: str
-    """``ORG/NAME@REVISION``, a folder, or ``ORG/NAME``. Without a revision the hash of the first
-    download is recorded, and another version is refused later.
+    """Name of the model: ``ORG/NAME@REVISION``, ``ORG/NAME``, or a folder. Without a revision, the
+    hash of the first download is recorded, and a file with another hash is rejected later.
     """
     sha256: str | None = None
-    """Expected hash of ``model.safetensors``."""
+    """Expected SHA-256 hash of the file ``model.safetensors``."""
 
     @property
     def folder(self) -> Path | None:
-        """Return the folder with the model, or None for a model of the Hub."""
+        """Return the local folder of the model, or None for a model on the Hub."""
         path = Path(self.model).expanduser()
         return path if path.is_dir() or self.model.startswith((".", "/", "~")) else None
 
     def uris(self) -> tuple[str, ...]:
-        """Return the addresses of :data:`FILES`."""
+        """Return the URIs of the model files :data:`FILES`."""
         if self.folder is not None:
             return tuple(str(self.folder / name) for name in FILES)
         repository, _, revision = self.model.partition("@")
         return tuple(f"hf://{repository}@{revision or 'main'}/{name}" for name in FILES)
 
     def files(self) -> tuple[WeightsFile, ...]:
-        """Return :data:`FILES` as weights to locate or download."""
+        """Return the model files :data:`FILES` with hash and license, for download."""
         license = look_up_model(self.model).license
         hashes = (None, None, self.sha256)
         return tuple(
@@ -108,13 +109,15 @@ class HubOptions(Options):
 
 
 class DepthOptions(HubOptions):
-    """Options of models for depth estimation."""
+    """Options of a depth estimation model."""
 
     model: str = "depth-anything/Depth-Anything-V2-Metric-Indoor-Small-hf"
     output: Output | None = None
-    """Output of the model; null: from ``config.json`` and the table of known models."""
+    """Quantity that the model predicts. null reads it from ``config.json`` or the table of known
+    models."""
     metric: bool | None = None
-    """True if the output is in meters; null: as for ``output``."""
+    """True if the output is in meters. null reads it from ``config.json`` or the table of known
+    models."""
 
 
 class PromptOptions(HubOptions):
@@ -122,68 +125,71 @@ class PromptOptions(HubOptions):
 
     model: str = "depth-anything/prompt-depth-anything-vits-hf"
     directory: Path
-    """Folder with the depth maps of the sensor, as for ``files``; holes are filled for the network.
+    """Folder with sensor depth maps, as for the provider ``files``. Holes are filled before
+    inference.
     """
     suffix: str | None = None
-    """Suffix of the file names, as for ``files``."""
+    """Suffix of the depth file names, as for the provider ``files``."""
     scale: float = Field(1.0, gt=0)
-    """Meters per stored unit: 0.001 for millimeters."""
+    """Meters per stored unit of depth, 0.001 for millimeters."""
 
 
 class SuperPointOptions(HubOptions):
-    """Options of SuperPoint (2018), 256 dimensions."""
+    """Options of the SuperPoint detector (2018), which has 256-dimensional descriptors."""
 
     model: str = "magic-leap-community/superpoint"
     max_keypoints: int = Field(6000, gt=0)
-    """Number of keypoints with the highest score to keep. [reference]"""
+    """Maximum number of keypoints, selected by score."""
     resize: int | None = Field(1600, ge=32)
-    """Longer side for detection in pixels, never enlarged; null: the size of the view. [reference]
+    """Longer side of the resized image in pixels for detection. Images are never enlarged, and null
+    keeps their size.
     """
     detection_threshold: float | None = Field(None, ge=0, lt=1)
-    """Minimum score; null: the threshold of the model (0.005 for the published one)."""
+    """Minimum score of a keypoint. null selects the threshold of the model (published: 0.005)."""
 
 
 class SparseOptions(HubOptions):
-    """Options of LightGlue and SuperGlue."""
+    """Options that LightGlue and SuperGlue share."""
 
     min_score: float | None = Field(None, ge=0, lt=1)
-    """Minimum score of a match; null: the threshold of the model."""
+    """Minimum score of a match. null selects the threshold of the model."""
 
 
 class LightGlueOptions(SparseOptions):
-    """Options of LightGlue (ICCV 2023)."""
+    """Options of the LightGlue matcher (ICCV 2023)."""
 
     model: str = "ETH-CVG/lightglue_superpoint"
     depth_confidence: float = Field(-1.0, le=1)
-    """Stop early above this share of confident points; -1: never. [reference]"""
+    """Share of keypoints with confident predictions at which LightGlue stops before its last layer.
+    -1 disables early stopping."""
     width_confidence: float = Field(-1.0, le=1)
-    """Drop points that are unmatchable with this confidence; -1: never. [reference]"""
+    """Confidence at which LightGlue drops a keypoint as unmatchable. -1 keeps all keypoints."""
 
 
 class SuperGlueOptions(SparseOptions):
-    """Options of SuperGlue (CVPR 2020)."""
+    """Options of the SuperGlue matcher (CVPR 2020)."""
 
     model: str = "magic-leap-community/superglue_outdoor"
 
 
 class EfficientLoftrOptions(HubOptions):
-    """Options of Efficient LoFTR (CVPR 2024)."""
+    """Options of the Efficient LoFTR matcher (CVPR 2024)."""
 
     model: str = "zju-community/efficientloftr"
     resize: int = Field(1184, ge=64)
-    """Longer side in pixels, never enlarged. [published evaluation on MegaDepth]"""
+    """Longer side of the resized images in pixels. Images are never enlarged."""
     min_score: float | None = Field(None, ge=0, lt=1)
-    """Minimum score of a coarse match; null: the threshold of the model."""
+    """Minimum score of a coarse match. null selects the threshold of the model."""
 
 
 class DinoOptions(HubOptions):
-    """Options of DINOv2, DINOv3 and models of the same architecture."""
+    """Options of DINOv2, DINOv3 and models of the same architecture, for image retrieval."""
 
     model: str = "facebook/dinov2-small"
     resize: int = Field(336, ge=32)
-    """Longer side in pixels; the whole view is used, not its center."""
+    """Longer side of the network input in pixels. The whole image is used, not only its center."""
 
 
 def hub_files(options: HubOptions) -> tuple[WeightsFile, ...]:
-    """Return the weights for ``ProviderSpec.weights``."""
+    """Return the model files that the options select, with hash and license."""
     return options.files()

@@ -1,8 +1,8 @@
 """Position of a view on the input of a depth network.
 
-The model's image processor prepares the view. If it pads, or aligns corner pixels when it resizes,
-the output covers more or less than the view; :meth:`Prepared.cut` returns the part that covers it
-exactly.
+The image processor of the model prepares the network input from a view. If the processor pads, or
+aligns corner pixels when resizing, the network output covers another area than the view.
+:meth:`Prepared.cut` returns the part that covers the view exactly.
 """
 
 from __future__ import annotations
@@ -21,24 +21,26 @@ from mpsfm_core.geometry import pixel_centers, resize_map, sample_bilinear
 from mpsfm_transformers.hub import LoadedModel
 
 _SMALLEST_SIDE = 32
-"""Minimum side in pixels; processors round sides down to multiples of up to 32."""
+"""Minimum side of an image in pixels, because image processors round sides down to multiples of up
+to 32."""
 _LARGEST_RATIO = 16
-"""Maximum aspect ratio; a thinner image could get a side of 0 pixels."""
+"""Maximum aspect ratio of an image. An image processor could give a thinner image a side of 0
+pixels."""
 
 
 @dataclass(frozen=True)
 class Prepared:
     """Network input and the position of the view on it.
 
-    ``pixels``: (1, 3, h, w). ``start``, ``extent``: position and size of the view, ``(x, y)`` in
-    input pixels (first pixel at 0.5).
+    ``pixels`` is the input tensor (1, 3, h, w). ``start`` and ``extent`` are the position and the
+    size ``(x, y)`` of the view in input pixels. The center of the first input pixel is at 0.5.
     """
 
     pixels: torch.Tensor
     start: Float64
     extent: Float64
     aligned: bool = False
-    """True if the output grid is aligned with the corner pixel centers of the input."""
+    """True if the outer output pixels are aligned with the centers of the outer input pixels."""
 
     def cut(self, value: Float32) -> Float32:
         """Cut the part of an output map (h, w) that covers the view."""
@@ -61,7 +63,7 @@ Preparation = Callable[[View], Prepared]
 
 
 def preparation_for(model: LoadedModel) -> Preparation:
-    """Return the preparation of views for a model."""
+    """Return a function that prepares network inputs from views for a model."""
     if model.network.config.model_type == "depth_pro":
         return _DepthProPreparation(model.preprocessor)
     processor = model.processor(AutoImageProcessor)
@@ -71,7 +73,7 @@ def preparation_for(model: LoadedModel) -> Preparation:
 
 
 class _ByProcessor:
-    """Preparation by stretching to the network size, with optional symmetric padding."""
+    """Preparation that stretches the view to the network size, with optional padding."""
 
     def __init__(self, processor: Any) -> None:
         self._processor = processor
@@ -108,7 +110,7 @@ class _ZoePreparation(_ByProcessor):
 
 
 class _DepthProPreparation:
-    """Preparation of Depth Pro without torchvision: normalize, then stretch without smoothing."""
+    """Preparation of Depth Pro without torchvision: normalization, then bilinear stretching."""
 
     def __init__(self, settings: dict[str, Any]) -> None:
         self._size = settings["size"]["height"], settings["size"]["width"]
@@ -125,7 +127,7 @@ class _DepthProPreparation:
 
 
 def _robust(view: View) -> Any:
-    """Enlarge an image that is too small or thin for an image processor."""
+    """Return the image of a view, enlarged if too small or thin for an image processor."""
     longest = max(view.camera.size)
     smallest = max(_SMALLEST_SIDE, -(-longest // _LARGEST_RATIO))
     size = tuple(max(side, smallest) for side in view.camera.size)

@@ -1,4 +1,4 @@
-"""Registration of the providers; imports neither torch nor transformers."""
+"""Registration of the Hub providers, importing neither torch nor transformers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _OF_THE_MODEL = "of the chosen model"
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register depth, features, matchers and retrieval."""
+    """Register providers of depth, features, matches and global descriptors."""
     return [
         _spec(
             "depth",
@@ -88,7 +88,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
 def mpsfm_calibration(
     kind: str, provider: str, options: BaseModel | None
 ) -> DepthCalibration | NormalCalibration | None:
-    """Return the calibration of the chosen model."""
+    """Return the calibration of the depth model that the options select."""
     if isinstance(options, opt.PromptOptions):
         return opt.METRIC
     if isinstance(options, opt.DepthOptions):

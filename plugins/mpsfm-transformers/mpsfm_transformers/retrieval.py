@@ -1,4 +1,4 @@
-"""DINOv2 and DINOv3 as global descriptors."""
+"""DINOv2 and DINOv3 as providers of global descriptors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mpsfm_transformers.options import DinoOptions
 
 
 class Dino:
-    """Provider of the normalized class token."""
+    """Provider that returns the normalized class token as global descriptor."""
 
     def __init__(self, options: DinoOptions, context: ProviderContext) -> None:
         self._model = LoadedModel(AutoModel, options, context)

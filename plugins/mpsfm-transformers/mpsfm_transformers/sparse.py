@@ -1,7 +1,7 @@
-"""LightGlue and SuperGlue as sparse matchers.
+"""LightGlue and SuperGlue as sparse matchers of given keypoints.
 
-The models of the library detect, describe and match in one pass. A module that returns given
-keypoints replaces their detector.
+The models of transformers detect, describe and match keypoints in one pass. A module that returns
+given keypoints therefore replaces the detector in these models.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from mpsfm_transformers.options import LightGlueOptions, SparseOptions, SuperGlu
 
 
 class _GivenKeypoints(nn.Module):
-    """Replacement of the detector that returns the given keypoints of two images."""
+    """Replacement of a keypoint detector that returns given keypoints of two images."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -34,7 +34,7 @@ class _GivenKeypoints(nn.Module):
 
 
 class GivenKeypointsMatcher:
-    """Matcher of given keypoints."""
+    """Base class of the matchers of given keypoints."""
 
     name = ""
 
@@ -53,10 +53,10 @@ class GivenKeypointsMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match features of two views; returns mutual matches with their confidence as score.
+        """Match the features of two views, and return mutual matches with confidence scores.
 
         Raises:
-            ProviderError: The descriptors do not have the dimension of this network.
+            ProviderError: The descriptors do not have the dimension that this network requires.
         """
         features = require_features(f"{self.name} matches features", features_a, features_b)
         for view, one in zip((view_a, view_b), features, strict=True):
@@ -73,7 +73,7 @@ class GivenKeypointsMatcher:
         size_only = torch.empty(1, device=self._model.device).expand(1, 2, 1, height, width)
         with inference():
             prediction = self._model.network(size_only)
-        # (1, 2, n), or (2, n) for a LightGlue without early stopping
+        # shape (1, 2, n), or (2, n) for LightGlue without early stopping
         partners, scores = (
             tensor.reshape(2, -1)[0, : len(features[0])].cpu().numpy()
             for tensor in (prediction.matches, prediction.matching_scores)
@@ -84,9 +84,9 @@ class GivenKeypointsMatcher:
     def _tensors(
         self, views: tuple[View, View], features: tuple[Features, Features]
     ) -> tuple[torch.Tensor, ...]:
-        """Create tensors of keypoints, scores, descriptors and mask.
+        """Create the detector output: keypoints, scores, descriptors and mask of two images.
 
-        Keypoints are relative to the size of the first view.
+        Keypoint coordinates are divided by the size of the first view.
         """
         count = max(map(len, features))
         keypoints = np.zeros((2, count, 2), dtype=np.float32)
@@ -106,7 +106,7 @@ class GivenKeypointsMatcher:
 
 
 class LightGlueMatcher(GivenKeypointsMatcher):
-    """LightGlue with given keypoints."""
+    """LightGlue matcher of given keypoints."""
 
     name = "LightGlue"
 
@@ -121,7 +121,7 @@ class LightGlueMatcher(GivenKeypointsMatcher):
 
 
 class SuperGlueMatcher(GivenKeypointsMatcher):
-    """SuperGlue with given keypoints."""
+    """SuperGlue matcher of given keypoints."""
 
     name = "SuperGlue"
 
@@ -133,10 +133,10 @@ class SuperGlueMatcher(GivenKeypointsMatcher):
 
 
 def _to_first_view_pixels(xy: Float64, view: View, first: View) -> Float64:
-    """Move pixels of a view such that normalization by the size of the first view is correct.
+    """Transform keypoints of a view for the normalization by the size of the first view.
 
-    The network uses one image size for both views, half of the longer side as unit, and integer
-    pixel centers.
+    The network normalizes the keypoints of both views by one image size, with half of the longer
+    side as unit and integer pixel centers.
     """
     view_size, first_size = np.array(view.camera.size), np.array(first.camera.size)
     moved: Float64 = (xy - 0.5 - view_size / 2) * (

@@ -1,4 +1,4 @@
-"""Tiny models of the real families with random weights, in the format of ``save_pretrained``."""
+"""Tiny models of the supported architectures with random weights, for tests."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _ANGLE_DEG = 60.0
 
 
 def dinov2(side: int = 56, **settings: Any) -> hf.Dinov2Config:
-    """Create a DINOv2 backbone of four layers."""
+    """Create the configuration of a DINOv2 backbone with four layers."""
     return hf.Dinov2Config(
         hidden_size=16,
         num_hidden_layers=4,
@@ -47,14 +47,14 @@ _STRETCHED = {
 
 
 def depth_anything(folder: Path, **settings: Any) -> Path:
-    """Save Depth Anything V2, metric up to 20 m by default."""
+    """Save a tiny Depth Anything V2, which is metric up to 20 m by default."""
     settings = {"depth_estimation_type": "metric", "max_depth": 20, **settings}
     config = hf.DepthAnythingConfig(backbone_config=_taps(), **_ANYTHING, **settings)
     return _save(hf.DepthAnythingForDepthEstimation, config, folder, _STRETCHED)
 
 
 def prompt_depth_anything(folder: Path) -> Path:
-    """Save Prompt Depth Anything."""
+    """Save a tiny Prompt Depth Anything."""
     config = hf.PromptDepthAnythingConfig(
         backbone_config=_taps(), depth_estimation_type="metric", max_depth=1, **_ANYTHING
     )
@@ -63,7 +63,7 @@ def prompt_depth_anything(folder: Path) -> Path:
 
 
 def dpt(folder: Path) -> Path:
-    """Save DPT with a plain transformer."""
+    """Save a tiny DPT with a plain vision transformer."""
     config = hf.DPTConfig(
         hidden_size=16,
         num_hidden_layers=4,
@@ -78,7 +78,7 @@ def dpt(folder: Path) -> Path:
 
 
 def dpt_dinov2(folder: Path) -> Path:
-    """Save DPT with DINOv2; its images are padded to multiples of 14."""
+    """Save a tiny DPT with DINOv2, whose images are padded to multiples of 14 pixels."""
     backbone = dinov2(out_indices=[1, 2, 3, 4], reshape_hidden_states=False)
     config = hf.DPTConfig(backbone_config=backbone, use_bias_in_fusion_residual=False, **_DPT_HEAD)
     processor = {
@@ -93,7 +93,7 @@ def dpt_dinov2(folder: Path) -> Path:
 
 
 def zoedepth(folder: Path) -> Path:
-    """Save ZoeDepth with BEiT."""
+    """Save a tiny ZoeDepth with a BEiT backbone."""
     backbone = hf.BeitConfig(
         hidden_size=16,
         num_hidden_layers=4,
@@ -123,7 +123,7 @@ def zoedepth(folder: Path) -> Path:
 
 
 def depth_pro(folder: Path) -> Path:
-    """Save Depth Pro with its head for the angle of view; images of 112 x 112."""
+    """Save a tiny Depth Pro with its angle-of-view head, for images of 112 x 112 pixels."""
     encoder = dinov2(28)
     config = hf.DepthProConfig(
         fusion_hidden_size=16,
@@ -149,7 +149,7 @@ def depth_pro(folder: Path) -> Path:
 
 
 def glpn(folder: Path) -> Path:
-    """Save GLPN, up to 10 m."""
+    """Save a tiny GLPN, whose maximum depth is 10 m."""
     config = hf.GLPNConfig(
         depths=[1, 1, 1, 1],
         hidden_sizes=[8, 8, 16, 16],
@@ -178,7 +178,7 @@ def superpoint(folder: Path, **settings: Any) -> Path:
 
 
 def lightglue(folder: Path, dimension: int = 32) -> Path:
-    """Save LightGlue for features of this dimension."""
+    """Save a tiny LightGlue for descriptors of the given dimension."""
     config = hf.LightGlueConfig(
         keypoint_detector_config=hf.SuperPointConfig(
             encoder_hidden_sizes=[8, 8, 8, 8],
@@ -196,7 +196,7 @@ def lightglue(folder: Path, dimension: int = 32) -> Path:
 
 
 def superglue(folder: Path, dimension: int = 32) -> Path:
-    """Save SuperGlue for features of this dimension."""
+    """Save a tiny SuperGlue for descriptors of the given dimension."""
     config = hf.SuperGlueConfig(
         keypoint_detector_config=hf.SuperPointConfig(
             encoder_hidden_sizes=[8, 8, 8, 8],
@@ -213,7 +213,7 @@ def superglue(folder: Path, dimension: int = 32) -> Path:
 
 
 def efficient_loftr(folder: Path) -> Path:
-    """Save Efficient LoFTR with a threshold that accepts all matches."""
+    """Save a tiny Efficient LoFTR whose threshold accepts all matches."""
     config = hf.EfficientLoFTRConfig(
         stage_num_blocks=[1, 1, 1, 1],
         out_features=[16, 16, 32, 64],
@@ -255,7 +255,7 @@ DEPTH: Mapping[str, Callable[[Path], Path]] = {
     "depth-pro": depth_pro,
     "glpn": glpn,
 }
-"""Families of depth models."""
+"""Functions that save a tiny depth model, by architecture."""
 
 
 def _save(
@@ -265,10 +265,10 @@ def _save(
     processor: dict[str, Any],
     noise: tuple[int, ...] | None = None,
 ) -> Path:
-    """Save random weights of a family in the published format.
+    """Save random weights of an architecture in the published file format.
 
-    ``noise``: shape of the input that initializes the batch normalization statistics, without which
-    the output of deep random layers is constant.
+    ``noise`` is the shape of a random input that initializes the batch normalization statistics.
+    Without it, deep random layers have a constant output.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with torch.random.fork_rng(), quiet():
@@ -279,7 +279,7 @@ def _save(
                 torch.nn.init.xavier_uniform_(parameter, 0.1 if len(parameter) == 1 else 1.0)
             elif parameter.numel() > 1:
                 torch.nn.init.uniform_(parameter, 0.0, 0.4)
-            else:  # bias of the last layer: depth in its unit, or angle of view in degrees
+            else:  # bias of the last layer: depth, or angle of view in degrees
                 torch.nn.init.constant_(parameter, _ANGLE_DEG if "fov" in name else 1.0)
         _see(model, noise)
         model.save_pretrained(folder)

@@ -1,4 +1,4 @@
-"""Photos, and models of the real families with random weights."""
+"""Test images, and tiny models of the supported architectures with random weights."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def photo() -> Callable[..., View]:
 
 @pytest.fixture(scope="session")
 def blocks() -> Callable[..., Any]:
-    """Create 256 x 192 pixels of random colors in blocks of 4 x 4."""
+    """Create a view of 256 x 192 pixels of random colors in blocks of 4 x 4 pixels."""
     rng = np.random.default_rng(0)
     small = rng.integers(0, 255, (48, 64, 3), dtype=np.uint8)
     return cv2.resize(small, (256, 192), interpolation=cv2.INTER_NEAREST)

@@ -1,4 +1,4 @@
-"""Contract tests of tiny models with random weights."""
+"""Provider contract tests of tiny models with random weights."""
 
 from mpsfm_core.testing import contract_tests
 

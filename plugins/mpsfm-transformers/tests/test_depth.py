@@ -1,4 +1,4 @@
-"""Comparison of depth of every family with the library's pipeline, and its position in the view."""
+"""Comparison of depth from every architecture with the pipeline of transformers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def models(tmp_path_factory):
 
 
 def of_the_library(folder, view):
-    """Run the library on an image; return network input and output."""
+    """Run the pipeline of transformers on an image, and return network input and output."""
     with quiet(), torch.inference_mode():
         processor = AutoImageProcessor.from_pretrained(folder, backend="pil")
         network = AutoModelForDepthEstimation.from_pretrained(folder).eval()
@@ -52,7 +52,7 @@ def test_the_map_of_the_library(models, context, photo, name, size):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_depth_pro_as_the_library_computes_it(models, context, photo, size):
-    """Compare with the steps of its processor, which needs torchvision."""
+    """Compare with the steps of Depth Pro's image processor, which needs torchvision."""
     view = photo(*size)
     provider = HubDepth(DepthOptions(model=str(models["depth-pro"])), context)
     with quiet(), torch.inference_mode():
@@ -72,7 +72,7 @@ def test_depth_pro_as_the_library_computes_it(models, context, photo, size):
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", stand_in.DEPTH)
 def test_cut_map_covers_the_image(models, context, photo, name, size):
-    """Check that cutting the prepared image restores the image."""
+    """Check that cutting the prepared image to the view restores the image."""
     gray = np.add.outer(np.arange(size[1]) * 0.5, np.arange(size[0])).astype(np.uint8)
     view = photo(*size)
     view = View(view.name, np.repeat(gray[..., None], 3, axis=2), view.camera)
@@ -84,8 +84,9 @@ def test_cut_map_covers_the_image(models, context, photo, name, size):
     std = loaded.preprocessor.get("image_std", [1.0])[0]
     seen = prepared.cut((prepared.pixels[0, 0].numpy() * std + mean) * 255)
     expected = resize_map(gray, seen.shape[1], seen.shape[0])
-    inner = np.s_[3:-3, 3:-3]  # filters differ at the border, and in what they round
-    wrapped = np.abs(seen - expected)[inner] > 60  # of the 8 bits of a ramp
+    # Resizing filters differ at the border, and in the rounding of a ramp of 8 bits.
+    inner = np.s_[3:-3, 3:-3]
+    wrapped = np.abs(seen - expected)[inner] > 60
     error = np.abs(seen - expected)[inner][~wrapped]
     assert wrapped.mean() < 0.1
     assert abs(np.median((seen - expected)[inner][~wrapped])) < 0.3
@@ -93,7 +94,7 @@ def test_cut_map_covers_the_image(models, context, photo, name, size):
 
 
 def test_zoedepth_as_the_library_cuts_it(models, context, photo):
-    """Compare with the library, which crops after resizing (half a network pixel apart)."""
+    """Compare with transformers, which crops after resizing (half a network pixel apart)."""
     view = photo(320, 240)
     _, outputs = of_the_library(models["zoedepth"], view)
     prior = HubDepth(DepthOptions(model=str(models["zoedepth"])), context).predict(view)
@@ -115,7 +116,7 @@ def test_what_a_model_predicts(models, context, tmp_path):
 
 
 def test_prompted_by_a_sensor(context, photo, tmp_path):
-    """Check that larger sensor depth gives larger depth."""
+    """Check that larger sensor depth results in larger predicted depth."""
     model = stand_in.prompt_depth_anything(tmp_path / "model")
     view = photo()
     depth = np.linspace(1000, 3000, 23 * 32).reshape(23, 32)[:, ::-1].copy()

@@ -1,4 +1,4 @@
-"""Tests of the files that are read of a model, and of error messages."""
+"""Tests of the model files that are read, and of error messages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def model(tmp_path_factory):
 
 @pytest.fixture
 def hub_cache(model, tmp_path, monkeypatch):
-    """Create the Hub's own cache with the model."""
+    """Create the cache folder of the Hugging Face Hub with the model files."""
     cache = tmp_path / "hub"
     folder = cache / "models--org--depth-model"
     snapshot = folder / "snapshots" / REVISION
@@ -45,7 +45,7 @@ def test_offline_from_the_cache_of_the_hub(hub_cache, context, photo, model, nam
 
 
 def test_files_of_two_caches(hub_cache, photo, tmp_path):
-    """Check that weights and configuration may be in different caches."""
+    """Check that weights and configuration may be in different cache folders."""
     store = WeightStore(tmp_path / "ours", offline=True)
     uri = f"hf://{REPOSITORY}@{REVISION}/model.safetensors"
     moved = store._cached_path(uri)

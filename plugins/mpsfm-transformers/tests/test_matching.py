@@ -1,4 +1,4 @@
-"""Comparison of features and matchers with the library's models with the same weights."""
+"""Comparison of features and matchers with the models of transformers on the same weights."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_superpoint_with_a_mask_and_a_limit(superpoint, tmp_path, context, block
 
 @pytest.mark.parametrize("name", MATCHERS)
 def test_given_keypoints_match_as_detected_ones(name, context, tmp_path, blocks, view_of):
-    """Check that given keypoints have the same matches as in the library's joint pass."""
+    """Check that given keypoints have the same matches as in the joint pass of transformers."""
     factory, options, family = MATCHERS[name]
     folder = getattr(stand_in, name)(tmp_path / name)
     views = view_of(blocks), view_of(np.roll(blocks, 24, axis=1))
@@ -97,7 +97,7 @@ def test_given_keypoints_match_as_detected_ones(name, context, tmp_path, blocks,
 
 @pytest.mark.parametrize("name", MATCHERS)
 def test_size_of_a_view_does_not_matter(name, context, tmp_path, view_of, blocks):
-    """Check that positions are relative to the size of each view."""
+    """Check that match positions are relative to the size of each view."""
     factory, options, _ = MATCHERS[name]
     matcher = factory(options(model=str(getattr(stand_in, name)(tmp_path / name))), context)
     rng = np.random.default_rng(1)
@@ -129,7 +129,7 @@ def test_features_of_another_family(name, context, tmp_path, view_of, blocks):
 
 
 def test_efficient_loftr_where_matches_cross(context, tmp_path, blocks, view_of):
-    """Check an image with exchanged halves, for which the library's pairs are wrong."""
+    """Check an image with exchanged halves, which transformers pairs incorrectly."""
     folder = stand_in.efficient_loftr(tmp_path / "loftr")
     matcher = EfficientLoftrMatcher(EfficientLoftrOptions(model=str(folder)), context)
     swapped = np.concatenate([blocks[:, 128:], blocks[:, :128]], axis=1)
@@ -142,7 +142,7 @@ def test_efficient_loftr_where_matches_cross(context, tmp_path, blocks, view_of)
 
 
 def test_efficient_loftr_of_different_sizes(context, tmp_path, blocks, view_of):
-    """Check that positions are in pixels of each view, although the views share a canvas."""
+    """Check that positions are in pixels of each view, although both share an input size."""
     folder = stand_in.efficient_loftr(tmp_path / "loftr")
     matcher = EfficientLoftrMatcher(EfficientLoftrOptions(model=str(folder)), context)
     dense = matcher.match(view_of(blocks), view_of(blocks[:, :192])).dense

@@ -1,1 +1,1 @@
-"""Reconstructions in the browser, with viser."""
+"""Viewer of reconstructions in the browser, with viser."""

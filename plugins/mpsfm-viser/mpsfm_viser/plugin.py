@@ -1,4 +1,4 @@
-"""Registration of the viewer; imports viser when it is used."""
+"""Registration of the viser viewer, without importing viser."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Page that shows the current scene, served on this machine."""
+"""Browser viewer of the current scene, served by this process."""
 
 from __future__ import annotations
 
@@ -19,18 +19,19 @@ from mpsfm_core.geometry import camera_center
 from mpsfm_core.report.viewing import ColoredPoints, Pictures, unproject_depth_map
 
 PORT_VARIABLE = "MPSFM_VIEWER_PORT"
-"""Environment variable with the port of the page; the next free port if it is taken."""
+"""Environment variable with the port of the page. If the port is taken, the next free one is
+used."""
 HOST_VARIABLE = "MPSFM_VIEWER_HOST"
-"""Environment variable with the host; 0.0.0.0 allows access from other machines."""
+"""Environment variable with the host address. 0.0.0.0 allows access from other machines."""
 _LEAST_SECONDS = 1.0
-"""Minimum seconds between two scenes during a run. [ours]"""
+"""Minimum time in seconds between two updates of the scene during a reconstruction."""
 _NEW, _OLD = (255, 122, 26), (31, 157, 107)
 
 
 class ViserViewer:
-    """Viewer of camera frustums with photos, depth maps as points, and sparse points.
+    """Viewer of camera frustums with images, depth maps as points, and sparse points.
 
-    ``output``: output folder of the run; nothing is written there.
+    The viewer does not write to ``output``, the output folder of the reconstruction.
     """
 
     def __init__(self, output: Path, pictures: Pictures) -> None:
@@ -56,12 +57,12 @@ class ViserViewer:
 
     @property
     def address(self) -> str:
-        """Return the address of the page."""
+        """Return the address of the page on this machine."""
         return f"http://localhost:{self.server.get_port()}"
 
     @hookimpl
     def mpsfm_scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """Show the scene, except if the last one is very recent."""
+        """Show the scene, unless the last update was less than a second ago."""
         now = time.monotonic()
         if now - self._last >= _LEAST_SECONDS:
             self._last = now
@@ -69,18 +70,18 @@ class ViserViewer:
 
     @hookimpl
     def mpsfm_stage_started(self, stage: str, total: int | None) -> None:
-        """Show the name of the stage until there is a scene."""
+        """Show the name of the current stage until the first scene is shown."""
         if not self._shown:
             self._state.content = f"{stage} ..."
 
     @hookimpl
     def mpsfm_stage_progress(self, stage: str, done: int, total: int) -> None:
-        """Show the progress of the stage."""
+        """Show the progress of the current stage until the first scene is shown."""
         if not self._shown:
             self._state.content = f"{stage}: {done} of {total}"
 
     def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
-        """Replace the scene; ``cloud`` is shown instead of the depth maps."""
+        """Replace the shown scene. A dense ``cloud`` replaces the points of the depth maps."""
         with self._lock, self.server.atomic():
             self._unit = _unit(scene)
             while self.clouds:
@@ -108,7 +109,7 @@ class ViserViewer:
             self._resize()
 
     def finish(self) -> str:
-        """Keep the page open until the program ends."""
+        """Return the address of the page, which stays open until the program ends."""
         return f"{self.address} shows it"
 
     def wait(self) -> None:
@@ -131,7 +132,7 @@ class ViserViewer:
 
         @handle.on_click
         def _(event: viser.SceneNodePointerEvent[viser.CameraFrustumHandle]) -> None:
-            """Move the viewer's camera to this frustum."""
+            """Move the viewer's camera to the pose of the clicked frustum."""
             event.client.camera.wxyz = handle.wxyz
             event.client.camera.position = handle.position
 
@@ -160,7 +161,7 @@ class ViserViewer:
 
 
 def _unit(scene: SceneState) -> float:
-    """Compute the size of the scene: median distance of its content from the center."""
+    """Compute the scale of the scene, the median distance of points and cameras from the center."""
     centers = [camera_center(image.rotation, image.translation) for image in scene.images]
     places = np.array([*scene.points[:: max(1, len(scene.points) // 2000)], *centers])
     if not len(places):
@@ -170,5 +171,5 @@ def _unit(scene: SceneState) -> float:
 
 
 def _key(name: str) -> str:
-    """Convert an image name to one level of the scene tree."""
+    """Convert an image name to one level of the scene tree of viser."""
     return quote(name, safe="")

@@ -1,4 +1,4 @@
-"""Tests of a real server: its page and its scene."""
+"""Tests of a running viser server: its web page and its scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Access to the networks of the collection by name."""
+"""Loading of the matching networks of vismatch by name."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from mpsfm_core.providers.torch_runtime import use_threads
 
 
 def load(name: str, context: ProviderContext, max_keypoints: int = 2048) -> Any:
-    """Load a matcher by name, or a class ``package.module:Class``, on the context's device.
+    """Load a vismatch matcher by name, or a class ``package.module:Class``.
 
-    The collection downloads weights to the caches of the Hub and of torch.
+    vismatch downloads weights to the cache folders of the Hugging Face Hub and of torch.
 
     Raises:
-        ConfigError: The name is unknown.
+        ConfigError: vismatch has no matcher of this name.
     """
     use_threads(context)
     if ":" in name:
@@ -33,7 +33,7 @@ def load(name: str, context: ProviderContext, max_keypoints: int = 2048) -> Any:
 
 
 def provide_imports(matcher: Any) -> AbstractContextManager[Any]:
-    """Provide the import path that the code of a matcher expects."""
+    """Return a context manager with the import path that the code of a matcher expects."""
     home = type(matcher).__module__
     if not home.startswith("vismatch."):
         return nullcontext()
@@ -44,7 +44,7 @@ def provide_imports(matcher: Any) -> AbstractContextManager[Any]:
 
 
 def get_inner_network(matcher: Any, name: str, *attributes: str) -> Any:
-    """Return the inner network of a matcher, whose attribute name differs between matchers."""
+    """Return the inner network of a matcher, from the first of ``attributes`` that exists."""
     for attribute in attributes:
         if hasattr(matcher, attribute):
             return getattr(matcher, attribute)

@@ -1,4 +1,4 @@
-"""Contract setups without weights."""
+"""Matchers without learned weights for the provider contract tests."""
 
 from __future__ import annotations
 
@@ -10,43 +10,43 @@ from mpsfm_core.testing import ContractSetup
 _REAL = "sift-nn"
 _STAND_IN = "mpsfm_vismatch.stand_in"
 _SMALL = {"network": f"{_STAND_IN}:Matching", "resize": 96}
-"""Small size, so that comparing all pixels is quick."""
+"""Options of a matcher with small images, where comparing all pixels is fast."""
 
 
 def vismatch(folder: Path) -> ContractSetup:
-    """Use a matcher of the collection without weights, or a stand-in if it is not installed."""
+    """Return vismatch's matcher ``sift-nn``, or a patch matcher if vismatch is not installed."""
     return ContractSetup(
         options={"network": _REAL} if find_spec("vismatch") else _SMALL, truth_source="image"
     )
 
 
 def vismatch_sparse(folder: Path) -> ContractSetup:
-    """Use the same matcher at keypoints of any detector."""
+    """Return the matcher ``sift-nn``, or a patch matcher, for given keypoints."""
     options = {"network": _REAL} if find_spec("vismatch") else _SMALL
     return ContractSetup(options={**options, "snap_px": 3.0}, truth_source="image")
 
 
 def vismatch_roma(folder: Path) -> ContractSetup:
-    """Use a symmetric stand-in with every position of a coarse grid."""
+    """Return a patch matcher with RoMa's symmetric warp, sampled at every grid position."""
     options = {"network": f"{_STAND_IN}:Warping", "cell": 1, "min_certainty": 0.5}
     return ContractSetup(options=options, truth_source="image")
 
 
 def vismatch_roma_sparse(folder: Path) -> ContractSetup:
-    """Use the same stand-in with a larger snap distance for its coarse grid."""
+    """Return a patch matcher with RoMa's warp for given keypoints and a large snap distance."""
     options = {"network": f"{_STAND_IN}:Warping", "snap_px": 3.0, "min_certainty": 0.5}
     return ContractSetup(options=options, truth_source="image")
 
 
 def vismatch_mast3r(folder: Path) -> ContractSetup:
-    """Use a small stand-in, so that comparing all pixels is quick."""
+    """Return a patch matcher with MASt3R's outputs, for small images."""
     return ContractSetup(
         options={"network": f"{_STAND_IN}:Pointing", "size": 128}, truth_source="image"
     )
 
 
 def vismatch_mast3r_sparse(folder: Path) -> ContractSetup:
-    """Use the same stand-in at keypoints of any detector."""
+    """Return a patch matcher with MASt3R's outputs, for given keypoints."""
     return ContractSetup(
         options={"network": f"{_STAND_IN}:Pointing", "size": 128}, truth_source="image"
     )

@@ -1,4 +1,4 @@
-"""MASt3R in torch instead of an ONNX file."""
+"""MASt3R matchers that run in torch instead of from an ONNX file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mpsfm_vismatch.collection import get_inner_network, load, provide_imports
 
 
 class TorchPairNetwork(PairNetwork):
-    """The authors' network, called with both views."""
+    """MASt3R network in torch, called with both views."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
         super().__init__(options.size)
@@ -24,7 +24,7 @@ class TorchPairNetwork(PairNetwork):
         self._device = context.device
 
     def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
-        """Run the network; see :class:`~mpsfm_mast3r.network.PairNetwork`."""
+        """Run the network, see :class:`~mpsfm_mast3r.network.PairNetwork`."""
         views = [
             {
                 "img": torch.from_numpy(image).to(self._device),
@@ -46,12 +46,12 @@ def _tensors(answer: dict[str, torch.Tensor], points: str) -> Tensors:
 
 
 class DenseMatcher(mast3r.DenseMatcher):
-    """Dense matcher; see :class:`mpsfm_mast3r.matcher.DenseMatcher`."""
+    """Dense matcher in torch, see :class:`mpsfm_mast3r.matcher.DenseMatcher`."""
 
     network = TorchPairNetwork
 
 
 class SparseMatcher(mast3r.SparseMatcher):
-    """Sparse matcher; see :class:`mpsfm_mast3r.matcher.SparseMatcher`."""
+    """Sparse matcher in torch, see :class:`mpsfm_mast3r.matcher.SparseMatcher`."""
 
     network = TorchPairNetwork

@@ -1,4 +1,4 @@
-"""Dense and sparse matchers with any network of the collection."""
+"""Dense and sparse matchers that run any network of vismatch."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ from mpsfm_vismatch.collection import load
 from mpsfm_vismatch.options import CollectionOptions, SnapOptions
 
 _STD_DETECTED_PX, _STD_DENSE_PX = 1.0, 0.5
-"""Keypoint noise in pixels of the resized image. [reference]"""
+"""Std of keypoints in pixels of the resized image, for detectors and for dense networks."""
 _OF_CORNERS = ("roma", "redimatch", "gim-dkm", "loftr", "xoftr", "aspanformer", "matchformer")
 _OF_CORNERS += ("topicfm", "edm", "matchanything", "dedode", "steerers", "loma")
-"""Name parts of networks with positions relative to image width and height, as COLMAP's pixels. All
-others have the first pixel at (0, 0).
+"""Parts of the names of networks whose positions are relative to the image size, as COLMAP's
+pixels. The pixels of all other networks have the center of the first pixel at (0, 0).
 """
 _OF_OPENCV = ("sift", "doghardnet-lightglue")
-"""Name parts of OpenCV's SIFT, which doubles the image: its positions are a quarter pixel too
-small.
+"""Parts of the names of matchers with OpenCV's SIFT. OpenCV doubles the image for SIFT, so
+positions are a quarter pixel too small.
 """
 
 
 class DenseMatcher:
-    """Matcher that returns all matches of the network, with score 1 if it has none."""
+    """Dense matcher that returns all matches of a network, with score 1 if it predicts none."""
 
     def __init__(self, options: CollectionOptions, context: ProviderContext) -> None:
         self._matcher = load(options.network, context, options.max_keypoints)
-        self._matcher.skip_ransac = True  # otherwise the network fits a homography
+        self._matcher.skip_ransac = True  # without this setting, vismatch fits a homography
         self._resize, self._seed = options.resize, context.seed
         self._first = _first_pixel(options.network)
 
@@ -50,12 +50,12 @@ class DenseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match two views without keypoints."""
+        """Match two views, without given keypoints."""
         return PairMatches(dense=self._matched(view_a, view_b))
 
     def _matched(self, *views: View) -> DenseMatches:
         images = [self._shown(view) for view in views]
-        np.random.seed(self._seed)  # some networks sample a warp, with one of these attributes
+        np.random.seed(self._seed)  # some networks sample matches randomly
         torch.manual_seed(self._seed)
         with inference():
             output = self._matcher(*images)
@@ -75,7 +75,7 @@ class DenseMatcher:
         )
 
     def _shown(self, view: View) -> torch.Tensor:
-        """Resize a view to (3, h, w) float32, RGB in [0, 1]."""
+        """Resize the image of a view to (3, h, w) float32, RGB in [0, 1]."""
         scale = min(1.0, (self._resize or np.inf) / max(view.camera.size))
         width, height = (max(1, round(side * scale)) for side in view.camera.size)
         image = resize_map(view.image, width, height) / np.float32(255)
@@ -87,7 +87,7 @@ class DenseMatcher:
 
 
 def _first_pixel(network: str) -> float:
-    """Compute the offset from the network's pixels to COLMAP's pixels."""
+    """Return the offset in pixels from a network's pixel positions to COLMAP's."""
     if any(part in network for part in _OF_OPENCV):
         return 0.25
     of_corners = any(part in network for part in _OF_CORNERS)
@@ -95,7 +95,7 @@ def _first_pixel(network: str) -> float:
 
 
 class SparseMatcher(DenseMatcher):
-    """Matcher of keypoints that are close to both positions of a match."""
+    """Sparse matcher of the keypoints that are close to both positions of a dense match."""
 
     def __init__(self, options: SnapOptions, context: ProviderContext) -> None:
         super().__init__(options, context)
@@ -108,7 +108,7 @@ class SparseMatcher(DenseMatcher):
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match keypoints one-to-one, the most certain first."""
+        """Match keypoints one-to-one, in the order of decreasing score."""
         given = require_features("vismatch-sparse matches keypoints", features_a, features_b)
         matches = self._matched(view_a, view_b)
         nearest = np.empty((len(matches), 2), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Options of the matchers; imports nothing heavy."""
+"""Options of the vismatch providers, importable without torch."""
 
 from __future__ import annotations
 
@@ -10,32 +10,33 @@ from mpsfm_core import Options
 
 
 class CollectionOptions(Options):
-    """Options of a network of the collection."""
+    """Options of a vismatch network."""
 
     network: str = "superpoint-lightglue"
-    """Name in the collection (``vismatch.available_models``), or a matcher class with the same
-    interface, ``package.module:Class``.
+    """Name of the network in vismatch (``vismatch.available_models``), or a matcher class
+    ``package.module:Class`` with the same interface.
     """
     max_keypoints: int = Field(2048, ge=1)
-    """Maximum number of keypoints, or of samples of a warp."""
+    """Maximum number of keypoints of a detector, or of matches that are sampled from a warp."""
     resize: int | None = Field(1024, ge=32)
-    """Longest side of the views in pixels, never enlarged; null: full size. Dense networks resize
-    again.
+    """Longer side of the resized images in pixels. Images are never enlarged, and null keeps their
+    size. Dense networks resize the images again.
     """
 
 
 class SnapOptions(CollectionOptions):
-    """Options of matching at keypoints."""
+    """Options of matching given keypoints by a vismatch network."""
 
     snap_px: float = Field(2.0, gt=0)
-    """Maximum distance in pixels between a keypoint and a matched position. [RoMa reference]"""
+    """Maximum distance in pixels between a keypoint and the position of a dense match."""
 
 
 class RomaNetwork(Options):
-    """Name of RoMa or a variant."""
+    """Option that selects RoMa or one of its variants."""
 
     network: str = "roma"
-    """``roma``, ``minima-roma``, ``redimatch``, ``redimatch-indoor``, or a matcher class."""
+    """Name of the network, ``roma``, ``minima-roma``, ``redimatch`` or ``redimatch-indoor``, or a
+    matcher class."""
 
 
 class RomaDenseOptions(RomaNetwork, roma.DenseSearch):
@@ -50,7 +51,7 @@ class Mast3rNetwork(Options):
     """Name of MASt3R."""
 
     network: str = "master"
-    """Name in the collection, or a matcher class."""
+    """Name of the network in vismatch, or a matcher class ``package.module:Class``."""
 
 
 class Mast3rDenseOptions(Mast3rNetwork, mast3r.DenseSearch):

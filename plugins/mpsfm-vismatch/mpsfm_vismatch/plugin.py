@@ -1,4 +1,4 @@
-"""Registration of the providers; imports neither torch nor vismatch."""
+"""Registration of the vismatch providers, importing neither torch nor vismatch."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from mpsfm_vismatch import options as opt
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register matchers of any network, of RoMa and of MASt3R."""
+    """Register vismatch matchers of any network, of RoMa and of MASt3R."""
     unknown, roma, mast3r = "of the chosen network", "MIT", "CC-BY-NC-SA-4.0"
     return [
         _spec("vismatch", "matcher", opt.CollectionOptions, "any matcher of vismatch", unknown),

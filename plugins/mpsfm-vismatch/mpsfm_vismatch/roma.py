@@ -1,4 +1,4 @@
-"""RoMa in torch instead of an ONNX file."""
+"""RoMa matchers that run in torch instead of from an ONNX file."""
 
 from __future__ import annotations
 
@@ -19,9 +19,10 @@ from mpsfm_vismatch.options import RomaNetwork
 
 
 class TorchWarpNetwork(WarpNetwork):
-    """The authors' ``match``, with its resizing and both passes.
+    """RoMa network in torch, called by the authors' function ``match``.
 
-    The images are written to files, because it opens them again for the second pass.
+    The function ``match`` resizes the images and runs both passes. The images are written to files,
+    because RoMa opens them again for the second pass.
     """
 
     def __init__(self, options: RomaNetwork, context: ProviderContext) -> None:
@@ -32,7 +33,7 @@ class TorchWarpNetwork(WarpNetwork):
         self._device = context.device
 
     def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
-        """Run the network; see :class:`~mpsfm_roma.network.WarpNetwork`."""
+        """Run the network, see :class:`~mpsfm_roma.network.WarpNetwork`."""
         with tempfile.TemporaryDirectory(prefix="mpsfm-") as folder, inference():
             paths = []
             for side, view in zip("ab", (view_a, view_b), strict=True):
@@ -45,12 +46,12 @@ class TorchWarpNetwork(WarpNetwork):
 
 
 class DenseMatcher(roma.DenseMatcher):
-    """Dense matcher; see :class:`mpsfm_roma.matcher.DenseMatcher`."""
+    """Dense matcher in torch, see :class:`mpsfm_roma.matcher.DenseMatcher`."""
 
     network = TorchWarpNetwork
 
 
 class SparseMatcher(roma.SparseMatcher):
-    """Sparse matcher; see :class:`mpsfm_roma.matcher.SparseMatcher`."""
+    """Sparse matcher in torch, see :class:`mpsfm_roma.matcher.SparseMatcher`."""
 
     network = TorchWarpNetwork

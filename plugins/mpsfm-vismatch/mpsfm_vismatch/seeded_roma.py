@@ -1,4 +1,4 @@
-"""RoMa's architecture with seeded random weights, for comparisons without published weights."""
+"""RoMa with seeded random weights, for comparisons without published weights."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ import torch
 from mpsfm_vismatch.collection import provide_imports
 
 COARSE, FINE = 560, 280
-"""Sides of the images of both passes; the published ones are 560 and 864. For a first pass other
-than 560, versions of the authors' code differ in the refinement radius.
+"""Image sides in pixels of RoMa's first and second pass. Published RoMa uses 560 and 864. If the
+first pass has another size than 560, versions of the authors' code differ in the refinement radius.
 """
 
 
 def network(roma_outdoor: Callable[..., Any], device: str = "cpu") -> Any:
-    """Create the authors' network with weights that are drawn by the name of each tensor."""
+    """Create the RoMa network, with random weights that are seeded by the tensor names."""
     options = {"coarse_res": COARSE, "upsample_res": FINE, "use_custom_corr": False}
     known = inspect.signature(roma_outdoor).parameters
-    with patch.object(torch.nn.Module, "load_state_dict"):  # no weights to load
+    with patch.object(torch.nn.Module, "load_state_dict"):  # there are no weights
         made = roma_outdoor(
             device=device,
             weights={},
@@ -41,7 +41,7 @@ def network(roma_outdoor: Callable[..., Any], device: str = "cpu") -> Any:
 
 
 class Matcher:
-    """Matcher with the interface of the collection, which runs its copy of the authors' code."""
+    """Matcher with the interface of vismatch that runs vismatch's copy of the RoMa code."""
 
     __module__ = "vismatch.im_models.roma"
 

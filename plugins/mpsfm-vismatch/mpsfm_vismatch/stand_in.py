@@ -1,4 +1,4 @@
-"""Small matchers with the interface of the collection, without weights: they compare patches."""
+"""Small matchers that compare patches and replace vismatch networks in the contract tests."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from torch.nn.functional import normalize, unfold
 
 _SIDE, _REACH = 5, 3
 _STEP = 3
-"""Step of the positions of :class:`Matching`; odd, because even ones round to one side in a
-half-size image.
+"""Step in pixels between the positions that :class:`Matching` matches. An odd step avoids a bias of
+positions in half-size images.
 """
 _GRID = (42, 56)
-"""Rows and columns of the warp."""
+"""Rows and columns of the warp that :class:`Warping` returns."""
 _FLAT = 0.05
-"""Contrast at which noise and texture are equal."""
+"""Contrast at which a patch counts half as noise and half as texture."""
 
 
 def _described(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Compute patch descriptors (h * w, d) of an image (1, 3, h, w), and their contrast (h * w,).
+    """Compute patch descriptors (h * w, d) and contrast (h * w,) of an image (1, 3, h, w).
 
     Descriptors are unit vectors, and shorter in flat regions.
     """
@@ -32,7 +32,7 @@ def _described(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class Warping:
-    """Stand-in for RoMa's matcher, which is its own network."""
+    """Replacement of vismatch's RoMa matcher, which is also its own inner network."""
 
     symmetric = True
 
@@ -40,7 +40,7 @@ class Warping:
         self.roma_model = self
 
     def match(self, path_a: str, path_b: str, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute warp and certainty of a coarse grid in both directions."""
+        """Compute the warp and its certainty on a coarse grid in both directions."""
         height, width = _GRID
         a, b = (_described(_opened(path, (width, height)))[0] for path in (path_a, path_b))
         similarity = a @ b.T
@@ -56,7 +56,7 @@ class Warping:
 
 
 class Pointing:
-    """Stand-in for MASt3R's matcher; points are colors, moved in front of the camera."""
+    """Replacement of vismatch's MASt3R matcher. Its points are colors in front of the camera."""
 
     def __init__(self, device: str = "cpu", max_num_keypoints: int = 2048) -> None:
         self.model = torch.nn.Module()
@@ -81,13 +81,13 @@ class Pointing:
 
 
 class Matching:
-    """Stand-in for any matcher: mutual nearest neighbors on a grid, first pixel at (0, 0)."""
+    """Replacement of any vismatch matcher, by mutual nearest neighbors of patches on a grid."""
 
     def __init__(self, device: str = "cpu", max_num_keypoints: int = 2048) -> None:
         self._most = max_num_keypoints
 
     def __call__(self, image_a: torch.Tensor, image_b: torch.Tensor) -> dict[str, Any]:
-        """Match two images; return the dictionary of the collection."""
+        """Match two images, and return matches in a dictionary of vismatch's format."""
         a, b = (_described(image[None])[0] for image in (image_a, image_b))
         width = image_a.shape[2]
         columns, rows = torch.meshgrid(

@@ -1,4 +1,4 @@
-"""Contract tests with stand-ins, and with the collection if it is installed."""
+"""Provider contract tests with patch matchers, and with vismatch if it is installed."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Tests of the conversion of network outputs with networks of known output."""
+"""Tests of the vismatch providers with networks whose output is known."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ B = np.array([[4.0, 3.0], [14.0, 8.0], [199.0, 20.0]])
 
 
 class Known:
-    """Network that returns the positions above, and records its input."""
+    """Network that returns the matches ``A`` and ``B``, and records its input images."""
 
     confidences: Any = np.array([0.25, 1.5, 0.5], dtype=np.float32)
     shown: tuple[Any, ...] = ()
@@ -72,7 +72,7 @@ def test_positions_in_pixels_of_views_of_other_sizes(context: ProviderContext) -
     found = matcher.DenseMatcher(options, context).match(view(200, 60), view(100, 40)).dense
     assert [tuple(image.shape) for image in Known.shown] == [(3, 30, 100), (3, 40, 100)]
     assert 0 <= Known.shown[0].min() <= Known.shown[0].max() <= 1
-    # pixels are counted from the centre of the first; what is outside of the second is left out
+    # Pixel centers are at integers, and matches outside of the second view are dropped.
     np.testing.assert_allclose(found.points_a, (A[:2] + 0.5) * 2, atol=4e-3)
     np.testing.assert_allclose(found.points_b, B[:2] + 0.5)
     assert found.scores.tolist() == [0.25, 1.0] and found.std_px == 1.0

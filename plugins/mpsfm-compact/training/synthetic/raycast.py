@@ -242,11 +242,11 @@ def _shade(scene, i, axis, point, direction, distance, pixel, normal, colour):
 def draw(scene, shows, sky, origin, rotation, focal, width, height, image, depth, normals, kind):
     """Render color, depth, normals and surface kind of a scene.
 
-    The tuple ``scene`` has solids (kinds (n,), inverses (n, 3, 4), centers (n, 3), radii (n,)),
-    half sizes (n, 3), looks (n, 9), and textures (levels, t, s, s, 3). It continues with shadow
-    casters (solid indices, and centers and radii of bounding spheres of :data:`GROUP` solids each),
-    lights (m, 7), and ambient light (2, 3) from above and below. ``shows`` (n,) is PLAIN, MIRROR or
-    WINDOW for each solid, and ``rotation`` is world_from_camera.
+    ``scene`` starts with the solids: kinds (n,), inverses (n, 3, 4), centers (n, 3) and radii (n,).
+    Then follow half sizes (n, 3), looks (n, 9), and textures (levels, t, s, s, 3). The shadow
+    casters are solid indices, and bounding spheres of :data:`GROUP` solids each. The last elements
+    are lights (m, 7) and the ambient light (2, 3) from above and below. ``shows`` (n,) is PLAIN,
+    MIRROR or WINDOW for each solid, and ``rotation`` is world_from_camera.
 
     The function fills ``image`` (h, w, 3) in linear light, ``depth`` (h, w) along z, ``normals``
     (h, w, 3) in the camera frame, and ``kind`` (h, w) uint8. In ``kind``, 0 is sky, 1 is a surface,
