@@ -1,4 +1,4 @@
-"""The built-in providers keep the contract."""
+"""Contract tests of the built-in providers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What first-party plugins download is known by its hash, or at least by the commit it is of."""
+"""Check that the weights of first-party plugins have a known hash or a fixed commit."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from mpsfm_core.providers.first_party import PLUGIN_PROVIDERS
 from mpsfm_core.providers.registry import Registry
 
 NOT_PINNED = {
-    # releases whose files nobody has given us a hash of: the first download is remembered
+    # These releases publish no hash, so the hash of the first download is recorded.
     *("dedode", "lightglue-dedode"),
     *("superpoint", "disk-onnx", "lightglue-superpoint", "lightglue-disk-onnx"),
-    # the newest version of a repository
+    # The URI denotes the newest version of a repository.
     *("sky", "transformers", "superpoint-hub", "lightglue-superpoint-hub", "superglue"),
     *("efficient-loftr", "dino", "depth-anything-3"),
 }
-"""Providers that are still to be pinned; none is added."""
+"""Providers whose weights have no known hash yet; the list must not grow."""
 
 
 def test_what_is_downloaded_is_pinned() -> None:
@@ -32,7 +32,7 @@ def test_what_is_downloaded_is_pinned() -> None:
         try:
             options = registry.default_options(line.kind, line.name)
             files = registry.weights(line.kind, line.name, options)
-        except InputError:  # the user has to name a file
+        except InputError:  # The user has to name the weights file.
             continue
         for file in files:
             remote = file.uri.startswith(("https://", "hf://"))

@@ -1,5 +1,4 @@
-"""Everything that can be wrong with installed plugins, at once: nobody else is affected, and the
-list says what is wrong with each and what to do."""
+"""Tests that broken plugins are listed with reason and repair, and healthy plugins work."""
 
 from __future__ import annotations
 
@@ -80,15 +79,14 @@ EXPECTED = {
 
 @pytest.fixture
 def silent_server() -> Iterator[tuple[str, int]]:
-    """Address of a server that accepts connections and never answers."""
+    """Return the address of a server that accepts connections and never answers."""
     with socket.create_server(("127.0.0.1", 0)) as server:
         yield server.getsockname()
 
 
 @pytest.fixture
 def environment(install_plugin: InstallPlugin, monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
-    """All of them installed, for processes and for us, with a limit that no load of the machine
-    makes a healthy plugin exceed."""
+    """Install all broken plugins and set a time limit that healthy plugins always meet."""
     for name, source in BROKEN.items():
         install_plugin(name, source)
     install_plugin("mpsfm-healthy", HEALTHY)
@@ -113,7 +111,8 @@ def test_the_list_says_what_is_wrong_and_what_to_do(environment: dict[str, str])
         assert reason in lines[name]["reason"], name
         assert hint in lines[name]["install_hint"], name
     assert lines["mpsfm-healthy"]["available"]
-    assert "Welcome to mpsfm-talks!" in ended.stderr  # and not in between the JSON
+    # The warnings must not appear inside the JSON output.
+    assert "Welcome to mpsfm-talks!" in ended.stderr
 
     table = mpsfm(environment, "plugins", "list").stdout.splitlines()
     for name, (reason, hint) in EXPECTED.items():
@@ -124,7 +123,7 @@ def test_the_list_says_what_is_wrong_and_what_to_do(environment: dict[str, str])
 def test_a_plugin_that_waits_for_the_network_is_given_up(
     install_plugin: InstallPlugin, silent_server: tuple[str, int]
 ) -> None:
-    """The server never answers, so that the command ends at all is the limit's doing."""
+    """Check that the command ends although the server never answers, because of the time limit."""
     waiting = "import socket\nwith socket.create_connection({!r}) as server: server.recv(1)"
     install_plugin("mpsfm-waits", waiting.format(silent_server))
     path = os.pathsep.join([sys.path[0], str(ROOT), *sys.path])

@@ -1,4 +1,5 @@
-"""Discovery is guarded, names are clear, and errors say what to do."""
+"""Tests of the registry: isolated discovery, unique names, and error messages with the next
+step."""
 
 from __future__ import annotations
 

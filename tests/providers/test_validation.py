@@ -1,4 +1,4 @@
-"""Each rule of the validator, and the errors of providers that fail."""
+"""Tests of each rule of the validator and of the errors of providers that fail."""
 
 from __future__ import annotations
 
@@ -62,7 +62,8 @@ def normals(variance: float | None = None) -> NormalPrior:
 
 
 def turned(n_x: float, n_z: float) -> NormalPrior:
-    """Normals (n_x, 0, n_z) at two of six pixels, in the last column; the others face the axis."""
+    """Return normals (n_x, 0, n_z) at two of six pixels, in the last column; the rest face the
+    optical axis."""
     values = np.tile(np.array([0, 0, -1], np.float32), (2, 3, 1))
     values[:, 2] = n_x, 0, n_z
     return NormalPrior(values, None, np.ones((2, 3), bool))
@@ -84,7 +85,7 @@ def dense(a: tuple[float, float], b: tuple[float, float]) -> PairMatches:
 
 
 class Provider:
-    """Answers every call with what the given function makes."""
+    """Provider that answers every call with the return value of a given function."""
 
     def __init__(self, make: Callable[[], Any]) -> None:
         self.make = make
@@ -190,7 +191,7 @@ def test_sparse_matches_without_features() -> None:
 
 
 def test_right_answers_pass_unchanged() -> None:
-    """An answer may have more than what the specification promises, never less."""
+    """Check that a provider may return more fields than its capabilities promise, but not fewer."""
     prior = run_depth(spec("depth"), Provider(lambda: depth(metric=True)), VIEW)
     assert prior.metric and np.array_equal(prior.depth, np.ones((2, 3)))
     joint = run_joint(spec("depth", "variance"), Provider(_joint), VIEW)
@@ -215,7 +216,8 @@ def _joint() -> tuple[DepthPrior, NormalPrior]:
 
 
 def test_a_normal_faces_the_camera_along_its_ray() -> None:
-    """The ray of the last column is (0.4, 0, 1): n_z may be positive there, or negative in vain."""
+    """Check normals at the last column, whose ray is (0.4, 0, 1): the sign of n_z alone does not
+    decide."""
     assert run_normals(spec("normals"), Provider(lambda: turned(-0.96, 0.28)), VIEW).valid.all()
     with pytest.raises(ProviderOutputError, match="face the camera"):
         run_normals(spec("normals"), Provider(lambda: turned(0.96, -0.28)), VIEW)

@@ -1,4 +1,4 @@
-"""The weight store, against a file server of this process."""
+"""Tests of the weight store against a local file server."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_resumes_in_the_next_run(tmp_path: Path, server: Server, uri: str) -> No
 
 
 def _partial(cache: Path, server: Server, uri: str) -> Path:
-    """Leaves 1000 bytes of a download behind, as a killed process does."""
+    """Leave 1000 bytes of a partial download, as a killed process does."""
     server.cut_after = 0
     with pytest.raises(WeightsError, match="continues after"):
         WeightStore(cache).resolve(uri)
@@ -230,7 +230,8 @@ def test_companions_lie_side_by_side(tmp_path: Path, server: Server, uri: str) -
 
 
 def test_hub_file(tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    """At the pinned revision; the user's token stays with the hub when it redirects."""
+    """Check the pinned revision, and that the user's token is not sent to the host of a
+    redirect."""
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", server.url)
     template = server.url + "/{repo_id}/resolve/{revision}/{filename}"
     monkeypatch.setattr("huggingface_hub.constants.HUGGINGFACE_CO_URL_TEMPLATE", template)
@@ -313,7 +314,7 @@ def test_cache_below_a_file(tmp_path: Path, server: Server, uri: str) -> None:
 
 
 class Evil:
-    """Creates a file when unpickled."""
+    """Create a file when unpickled."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -351,7 +352,7 @@ def test_safetensors_and_files_without_tensors(tmp_path: Path) -> None:
 
 
 class Answer:
-    """What a redirect handler needs of an answer."""
+    """Response with the fields that a redirect handler reads."""
 
     def read(self) -> bytes:
         return b""

@@ -1,4 +1,4 @@
-"""A file server of this process, which can be cut off, made to fail, or given other files."""
+"""Local file server that can cut connections, return errors, or serve other files."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 @dataclass
 class Server:
-    """What a test wants of the server, and what the server has seen."""
+    """Settings of the file server and a record of its requests."""
 
     url: str
     files: dict[str, bytes] = field(default_factory=dict)
     etag: str | None = '"v1"'
     cut_after: int | None = None
-    """Bytes after which a connection is cut, each time."""
+    """Number of bytes after which the server cuts each connection."""
     redirects: dict[str, str] = field(default_factory=dict)
     status: int | None = None
-    """Answer of every request, if it is an error."""
+    """HTTP status of every response, if it is an error."""
     requests: list[tuple[str, dict[str, str]]] = field(default_factory=list)
-    """Path and headers of each."""
+    """Path and headers of each request."""
 
     def ranges(self) -> list[str | None]:
-        """Which part of a file each request asked for."""
+        """Return the requested byte range of each request."""
         return [headers.get("Range") for _, headers in self.requests]
 
 
@@ -33,7 +33,7 @@ class _Handler(BaseHTTPRequestHandler):
     server_state: Server
 
     def do_GET(self) -> None:
-        """Serve a file, or do what the test wants instead."""
+        """Serve a file, or respond as the settings of the server define."""
         state = self.server_state
         state.requests.append((self.path, dict(self.headers)))
         if state.status:
@@ -63,12 +63,12 @@ class _Handler(BaseHTTPRequestHandler):
         self.wfile.write(content[start:stop])
 
     def log_message(self, *args: object) -> None:
-        """Nothing: a test's output is its own."""
+        """Log nothing, because requests would clutter the output of the test."""
 
 
 @contextmanager
 def serving() -> Iterator[Server]:
-    """A server while the block runs."""
+    """Run a file server for a block of code."""
 
     class OwnHandler(_Handler):
         pass

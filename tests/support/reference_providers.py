@@ -1,6 +1,6 @@
-"""A correct provider of every kind, without weights: what the kit's own tests break on purpose.
+"""Correct providers of every kind without weights, for the tests of the contract kit.
 
-Depth, normals and masks are read from painted views, as a stand-in network would.
+Some tests derive faulty providers from these classes. Depth, normals and masks are decoded from painted views, as a tiny test network would do.
 """
 
 from __future__ import annotations
@@ -38,54 +38,54 @@ _GRID_PX = 12
 
 
 class PaintedDepth:
-    """Depth with variance on the grid of the view, and normals of the same pass."""
+    """Depth provider with variance on the grid of the view, and with joint normals."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
         self.options = options
 
     def predict(self, view: View) -> DepthPrior:
-        """What is painted in the view."""
+        """Return the depth that is painted into the view."""
         return depth_prior(read_depth(view.image))
 
     def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
-        """Both that is painted in the view."""
+        """Return the depth and normals that are painted into the view."""
         return self.predict(view), normal_prior(read_normals(view.image), view)
 
     def estimate_focal(self, view: View) -> float:
-        """That of the painted examples, whatever the camera says."""
+        """Return the focal length of the painted views, independent of the camera of the view."""
         return 0.75 * view.camera.width
 
 
 class PaintedNormals:
-    """Normals with variance on the grid of the view."""
+    """Normals provider with variance on the grid of the view."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
         self.options = options
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """What is painted in the view."""
+        """Return the normals that are painted into the view."""
         return normal_prior(read_normals(view.image), view)
 
 
 class PaintedMask:
-    """Allows what has a surface."""
+    """Mask provider that accepts pixels with a surface."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
         self.options = options
 
     def mask(self, view: View) -> Bool:
-        """Where depth is painted."""
+        """Return True where a depth is painted."""
         return np.asarray(read_depth(view.image) > 0)
 
 
 class Thumbnail:
-    """Describes a view by a reduced image of itself, less its mean, of length one."""
+    """Retrieval provider that describes a view by a thumbnail without its mean, of unit length."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
         self.options = options
 
     def describe(self, view: View) -> Float32:
-        """Thumbnail as a vector; of a view without content the zero vector."""
+        """Return the thumbnail as a vector, or the zero vector for a view without content."""
         small = resize_map(view.image, _THUMBNAIL, _THUMBNAIL).ravel()
         small = small - small.mean()
         vector: Float32 = small / max(float(np.linalg.norm(small)), 1.0)
@@ -93,20 +93,21 @@ class Thumbnail:
 
 
 class ToldOptions(Options):
-    """Where the truth is."""
+    """Options with the folder of the prepared ground truth."""
 
     folder: Path
-    """With what :func:`tell` writes."""
+    """Folder to which :func:`tell` writes the ground truth."""
 
 
 def tell(folder: Path, example: Example) -> None:
-    """Write down an indoor example for :class:`ToldMatcher`."""
+    """Write the ground truth of an indoor view for :class:`ToldMatcher`."""
     name = _name(example.view)
     np.savez(folder / name, pose=example.pose, camera=astuple(example.camera))
 
 
 class ToldMatcher:
-    """Dense matches and depth of both views, of indoor examples that it is told."""
+    """Dense matcher with depth of both views, which reads the prepared ground truth of indoor
+    views."""
 
     def __init__(self, options: ToldOptions, context: ProviderContext) -> None:
         self.options = options
@@ -118,7 +119,8 @@ class ToldMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Exact matches of a grid of pixels; none between views it was not told of."""
+        """Return exact matches of a grid of pixels, or no match for views without prepared
+        truth."""
         a, b = self.recall(view_a), self.recall(view_b)
         if a is None or b is None:
             nothing = DenseMatches(np.empty((0, 2)), np.empty((0, 2)), np.empty(0, np.float32))
@@ -129,7 +131,7 @@ class ToldMatcher:
         return PairMatches(dense=self.matches(points, true), depth=self.depths(a, b))
 
     def recall(self, view: View) -> Example | None:
-        """The example of a view, None for one that it was not told of."""
+        """Return the synthetic view with prepared truth, or None."""
         path = self.options.folder / f"{_name(view)}.npz"
         if not path.exists():
             return None
@@ -139,16 +141,16 @@ class ToldMatcher:
             return replace(indoor_example("textured"), pose=stored["pose"], camera=camera)
 
     def matches(self, points_a: Float64, points_b: Float64) -> DenseMatches:
-        """Matches between exact positions."""
+        """Return matches between exact positions."""
         return DenseMatches(points_a, points_b, np.ones(len(points_a), np.float32))
 
     def depths(self, a: Example, b: Example) -> PairDepth:
-        """Depth of both examples."""
+        """Return the depth of both views."""
         return PairDepth(*(depth_prior(example.truth().depth) for example in (a, b)))
 
 
 def tell_group(folder: Path, example: Example) -> None:
-    """Write down an example for :class:`ToldGroup`."""
+    """Write the ground truth of a synthetic view for :class:`ToldGroup`."""
     truth = example.truth()
     np.savez(
         folder / f"group-{_name(example.view)}.npz",
@@ -159,20 +161,21 @@ def tell_group(folder: Path, example: Example) -> None:
 
 
 class ToldGroup:
-    """Depth, poses and intrinsics of views that it is told."""
+    """Multi-view provider that reads prepared depth, poses and intrinsics."""
 
     def __init__(self, options: ToldOptions, context: ProviderContext) -> None:
         self.options = options
 
     def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
-        """The truth; a plane one metre before the origin for views it was not told of."""
+        """Return the ground truth, or a plane one meter in front of the origin without prepared
+        truth."""
         depth, poses, intrinsics = zip(*(self.recall(view) for view in views), strict=True)
         return MultiViewPrior(
             tuple(depth_prior(values) for values in depth), np.array(poses), np.array(intrinsics)
         )
 
     def recall(self, view: View) -> tuple[Float64, Float64, Float64]:
-        """Depth (H, W), pose (3, 4) and intrinsics (4,) of a view."""
+        """Return depth (H, W), pose (3, 4) and intrinsics (4,) of a view."""
         path = self.options.folder / f"group-{_name(view)}.npz"
         if not path.exists():
             return np.ones(view.image.shape[:2]), np.eye(3, 4), view.camera.params
@@ -181,23 +184,23 @@ class ToldGroup:
 
 
 class Wrapper:
-    """Hands everything on as it is."""
+    """Wrapper that returns the output of the wrapped provider unchanged."""
 
     def __init__(self, inner: Any, options: Any, context: ProviderContext) -> None:
         self.inner = inner
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
-        """What the provider inside says."""
+        """Return the output of the wrapped provider."""
         return self.inner.predict(view) if depth is None else self.inner.predict(view, depth)
 
 
 def depth_prior(depth: Float64) -> DepthPrior:
-    """Metric depth with the std that the kit expects of a stand-in."""
+    """Metric depth provider with the std that the contract kit expects of test networks."""
     return DepthPrior.from_arrays(depth, (RELATIVE_STD * depth) ** 2)
 
 
 def normal_prior(normals: Float64, view: View) -> NormalPrior:
-    """Normals with the std that the kit expects of a stand-in."""
+    """Normals provider with the std that the contract kit expects of test networks."""
     variance = np.full(normals.shape[:2], NORMALS_STD**2)
     return NormalPrior.from_arrays(normals, variance, camera=view.camera)
 

@@ -1,4 +1,4 @@
-"""What a result folder holds, so that two runs can be compared."""
+"""Hashes of the files in a result folder, to compare two runs."""
 
 from __future__ import annotations
 
@@ -7,12 +7,14 @@ import json
 from pathlib import Path
 
 _SAME_AGAIN = ("status", "reconstructions", "pairs", "images")
-"""Parts of the summary that do not tell the time, nor what came from the cache."""
+"""Parts of the summary that depend neither on run time nor on the cache."""
 
 
 def content(folder: Path) -> dict[str, str]:
-    """SHA-256 of each file by its path; of the summary only what is the same in every run, of the
-    report nothing, which tells the time and is made of the other files."""
+    """Return the SHA-256 of each result file by path.
+
+    Of the summary only reproducible parts count. The report is skipped, because it contains times.
+    """
     found = {}
     for path in sorted(folder.rglob("*")):
         name = path.relative_to(folder).as_posix()

@@ -1,4 +1,4 @@
-"""Limits of containers, read from folders that look like /sys/fs/cgroup."""
+"""Tests of container memory limits, read from folders that look like /sys/fs/cgroup."""
 
 from __future__ import annotations
 

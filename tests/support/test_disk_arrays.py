@@ -1,4 +1,4 @@
-"""Arrays in memory up to a limit, then on disk."""
+"""Tests of arrays that are in memory up to a limit and on disk beyond."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ def test_the_first_stay_in_memory_and_the_rest_is_on_disk(tmp_path: Path) -> Non
     arrays = [array(seed) for seed in range(4)]
     kept = [disk.store(each) for each in arrays]
     assert [a is b for a, b in zip(arrays, kept, strict=True)] == [True, True, False, False]
-    assert not list((tmp_path / "made").iterdir())  # their file has no name
+    # The files of the arrays are unlinked and have no name.
+    assert not list((tmp_path / "made").iterdir())
     for seed, each in enumerate(kept):
         np.testing.assert_array_equal(each, array(seed))
 
@@ -31,7 +32,8 @@ def test_the_first_stay_in_memory_and_the_rest_is_on_disk(tmp_path: Path) -> Non
 def test_values_outlive_the_memory_that_they_were_in(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each array fills a file, and a new file takes back the memory of those before."""
+    """Check that each array fills a file, and that a new file frees the memory of earlier
+    arrays."""
     monkeypatch.setattr(mpsfm_core.support.disk_arrays, "_MIN_FILE_BYTES", SIZE)
     with ThreadPoolExecutor(4) as pool:
         kept = list(pool.map(DiskArrays(tmp_path, in_memory=0).store, map(array, range(12))))

@@ -1,4 +1,4 @@
-"""Results are replaced as a whole or not at all."""
+"""Tests that results are replaced completely or not at all."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ENTRIES = ("sparse", "points.ply", "summary.json")
 
 @pytest.fixture
 def output(tmp_path: Path) -> Path:
-    """A folder with earlier results and a file of the user's own."""
+    """Return a folder with earlier results and a file of the user."""
     folder = tmp_path / "out"
     (folder / "sparse").mkdir(parents=True)
     (folder / "sparse" / "images.bin").write_text("old model")
@@ -129,7 +129,7 @@ def test_a_folder_without_permission_is_wrong_input(output: Path) -> None:
 
 
 def killed_while(output: Path, step: int) -> bool:
-    """Replace the results in a process that is killed before its ``step``-th rename of ours."""
+    """Replace the results in a process that is killed before its ``step``-th rename."""
     child = os.fork()
     if child:
         return os.WIFSIGNALED(os.waitpid(child, 0)[1])
@@ -222,8 +222,8 @@ def test_unfinished_files_of_the_dead_are_taken_away(tmp_path: Path) -> None:
 
 PLAIN_WRITERS = {"files.py", "weights.py", "stages.py", "results", "testing", "builtin"}
 PLAIN_WRITERS |= {"importers", "channel.py", "process.py"}
-"""Besides the one place: downloads that go on where they were cut, the kernel's counter of memory,
-what writes into a scratch folder, logs and pipes of other processes, and what tests write."""
+"""Modules that may write without the atomic writer: partial downloads, the kernel's memory counter,
+scratch folders, logs, pipes of other processes, and test data."""
 
 
 def test_every_write_goes_through_one_place() -> None:
@@ -235,7 +235,7 @@ def test_every_write_goes_through_one_place() -> None:
         if writes.search(path.read_text(encoding="utf-8"))
         and not PLAIN_WRITERS & {*path.relative_to(package).parts}
     ]
-    # into environments that are not yet at their place, and scratch folders of results and frames
+    # These modules write to unfinished environments and to scratch folders of results and frames.
     assert sorted(found) == [
         "providers/environments/store.py",
         "inputs/nerfstudio.py",

@@ -1,4 +1,4 @@
-"""Cached kernels of an earlier version of the code."""
+"""Tests of the kernel cache with kernels of an earlier version of the code."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Arrays come back from files as they were."""
+"""Tests that arrays are restored from files without changes."""
 
 from __future__ import annotations
 

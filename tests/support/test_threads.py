@@ -1,4 +1,4 @@
-"""No run keeps more threads busy than it was given, whichever library they are of."""
+"""Tests that no run keeps more threads busy than the thread limit, in any library."""
 
 from __future__ import annotations
 
@@ -28,8 +28,10 @@ TASKS = Path("/proc/self/task")
 
 
 class Busy:
-    """Counts, every few milliseconds, the threads that compute or would if a core were free: what
-    else the machine does changes nothing."""
+    """Counter of threads that compute or wait for a core, sampled every few milliseconds.
+
+    The count does not depend on the load of the machine.
+    """
 
     def __init__(self) -> None:
         self.counts: list[int] = []
@@ -59,7 +61,7 @@ class Busy:
             return ""
 
     def share_above(self, count: int) -> float:
-        """Of the moments with so many busy threads and more."""
+        """Return the ratio of samples with more than ``count`` busy threads."""
         return float(np.mean(np.array(self.counts) > count))
 
 
@@ -72,7 +74,7 @@ def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 class Watcher:
-    """A depth provider that notes how many threads libraries may use below it."""
+    """Depth provider that records the thread limit of libraries in its process."""
 
     def __init__(self) -> None:
         self.seen: list[set[int]] = []
@@ -103,7 +105,7 @@ def test_a_run_keeps_its_workers_busy_and_no_more(
     )
     with busy.watching():
         reconstruct(photos, None, config, registry=registry)
-    # Two are awake when one hands over to another, for long where the machine is busy.
+    # Two threads are awake during a hand-over, for long if the machine is busy.
     assert busy.share_above(workers) < 0.2 and max(busy.counts) > 0
     assert watcher.seen == [{1}] * 3
 
@@ -126,7 +128,7 @@ def test_each_gives_results_in_order_from_as_many_threads_as_are_allowed() -> No
     together = threading.Barrier(2, timeout=10)
 
     def halved(number: int) -> tuple[float, int]:
-        together.wait()  # passes only when both are at work
+        together.wait()  # The barrier opens only if both threads work.
         return number / 2, threading.get_ident()
 
     with limit_threads(2):

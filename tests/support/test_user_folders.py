@@ -1,4 +1,4 @@
-"""Accounts of containers: no passwd entry, no home, a home that cannot be written."""
+"""Tests with container accounts: no passwd entry, no home, or a home without write access."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mpsfm_core.support.user_folders import user_cache_folder, user_data_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 UID = "54321"
-"""A user id without a passwd entry."""
+"""Return a user id without a passwd entry."""
 IMPORT_KERNELS = (
     "import mpsfm_core.dense.stereo_kernels, mpsfm_core.optimize.bundle_kernels, numba;"
     "print(numba.config.CACHE_DIR)"
@@ -27,7 +27,7 @@ needs_root = pytest.mark.skipif(
 
 
 def run_without_account(*command: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run Python as a user id without a passwd entry, in this environment only."""
+    """Run Python as a user id without a passwd entry, with only the given environment variables."""
     change_user = ["setpriv", f"--reuid={UID}", f"--regid={UID}", "--clear-groups"]
     return subprocess.run(
         [*change_user, sys.executable, *command],
@@ -40,7 +40,7 @@ def run_without_account(*command: str, **environment: str) -> subprocess.Complet
 
 
 def make_writable(folder: Path) -> Path:
-    """Let every user reach and write a folder."""
+    """Allow every user to read and write a folder."""
     folder.mkdir(exist_ok=True)
     folder.chmod(0o777)
     for parent in folder.parents:

@@ -1,4 +1,4 @@
-"""Providers that are wrong on purpose, and the check that has to say so."""
+"""Fixtures that require that faulty providers fail the contract check for their fault."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Caught = Callable[..., None]
 
 @pytest.fixture
 def named() -> Callable[..., set[str]]:
-    """The checks that the cases of parametrised tests name, in their second column."""
+    """Return the checks that the cases of parametrized tests name in their second column."""
 
     def checks(*tests: Any) -> set[str]:
         marks = [mark for test in tests for mark in test.pytestmark if mark.name == "parametrize"]
@@ -30,7 +30,7 @@ def named() -> Callable[..., set[str]]:
 
 @pytest.fixture
 def caught() -> Caught:
-    """Asserts that a check fails for a provider, with a message that matches.
+    """Assert that a check fails for a provider, with a message that matches.
 
     ``caught("depth", RayLength, "depth-is-z", "length of the ray", setup, "metric")``
     """

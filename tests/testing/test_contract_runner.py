@@ -1,4 +1,4 @@
-"""How results come about: expected failures, gates, setups, and finding providers by name."""
+"""Tests of the contract runner: expected failures, required checks, provider names."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""The simulated errors of depth have the declared size and reach, and repeat."""
+"""Tests that simulated depth errors have the declared std and correlation length, and are
+repeatable."""
 
 from __future__ import annotations
 
@@ -31,7 +32,7 @@ def test_errors_have_the_stated_size() -> None:
 
 
 def test_the_declared_std_is_that_after_the_best_scale_of_each_image() -> None:
-    """The scale is free in the mapper: however wrong it is, the declaration says nothing of it."""
+    """Check that the declared std excludes the scale, which the mapper estimates per image."""
     for scale in (0.0, 0.05, 0.5):
         errors = DepthErrors(scale=scale, field=0.05)
         assert errors.std == 0.05
@@ -45,7 +46,7 @@ def test_errors_are_correlated_over_the_stated_lengths() -> None:
     width = FLAT.shape[1]
     for shift in (width // 30, width // 8):
         together = (field[..., shift:] * field[..., :-shift]).mean() / (field**2).mean()
-        # White noise blurred with std s has the autocorrelation exp(-d^2 / (4 s^2)).
+        # White noise that is blurred with std s has the autocorrelation exp(-d^2 / (4 s^2)).
         shares = zip((0.64, 0.36), (width / 8, width / 30), strict=True)
         expected = sum(w * np.exp(-(shift**2) / (4 * s**2)) for w, s in shares)
         assert together == pytest.approx(expected, abs=0.08)

@@ -1,4 +1,4 @@
-"""Halls: matches are of the same points, priors are off as told, and all is the same each time."""
+"""Tests of synthetic halls: true matches, declared prior errors, repeatability."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def hall(errors: PriorErrors = EXACT_PRIORS) -> HallProblem:
 
 
 def log_errors(errors: PriorErrors) -> list[np.ndarray]:
-    """Of each view's depth."""
+    """Return the relative depth errors of each view."""
     pairs = zip(hall(errors).problem.images, hall().problem.images, strict=True)
     return [np.log(image.depth.depth / true.depth.depth) for image, true in pairs]
 
@@ -45,7 +45,8 @@ def test_most_matches_join_what_is_the_same_point() -> None:
         numbers = points[pair.image_a], points[pair.image_b]
         same.append(numbers[0][pair.matches[:, 0]] == numbers[1][pair.matches[:, 1]])
     assert 0.94 < np.concatenate(same).mean() < 0.96
-    assert 0.85 < np.concatenate(near).mean() < 0.97  # 5 % are wrong, edges take a few more
+    # 5 % of the matches are wrong, and depth edges cause a few more.
+    assert 0.85 < np.concatenate(near).mean() < 0.97
 
 
 def test_relative_poses_are_estimated_and_good() -> None:

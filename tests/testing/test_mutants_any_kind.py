@@ -1,4 +1,4 @@
-"""Faults that a provider of any kind can have, here in a depth provider."""
+"""Faults that a provider of any kind can have, shown with a depth provider."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PAINTED = ContractSetup(truth_source="painted")
 
 
 class Changed(PaintedDepth):
-    """Depth of a correct provider, changed by :meth:`change`."""
+    """Depth of a correct provider, modified by :meth:`change`."""
 
     def predict(self, view: View) -> DepthPrior:
         return depth_prior(self.change(read_depth(view.image), view))
@@ -56,7 +56,7 @@ class Random(Changed):
 
 
 class RandomWeights(Changed):
-    """Each instance is another one: weights that were never loaded."""
+    """Fault: each instance has other random weights, because the weights are never loaded."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
         super().__init__(options, context)
@@ -67,7 +67,7 @@ class RandomWeights(Changed):
 
 
 class Smoothed(Changed):
-    """A filter over time, as in video."""
+    """Fault: depth is filtered over time, as for a video."""
 
     scale = 1.0
 
@@ -95,7 +95,7 @@ class SecretlyCanonical(Changed):
 
 
 class SharedBuffer(Changed):
-    """All instances work in one array of the class."""
+    """Fault: all instances write to one array of the class."""
 
     buffer = np.zeros((0, 0))
 
@@ -106,7 +106,7 @@ class SharedBuffer(Changed):
 
 
 class LocalPrior(PaintedDepth):
-    """Answers with a type of its own that nobody can import."""
+    """Fault: the output has a local type that cannot be imported."""
 
     def predict(self, view: View) -> DepthPrior:
         class Mine(DepthPrior):
@@ -123,7 +123,7 @@ class AsksTheNetwork(Changed):
 
 
 class TriesTheNetwork(Changed):
-    """Survives without, but tells somebody about every view."""
+    """Fault: works offline, but reports every view to a server."""
 
     def change(self, depth: np.ndarray, view: View) -> np.ndarray:
         with contextlib.suppress(OSError):
@@ -149,7 +149,7 @@ class LandscapeOnly(Changed):
 
 
 class LeavesPadding(PaintedDepth):
-    """Pads to multiples of 16 for its network and does not cut the padding off."""
+    """Fault: pads the image to multiples of 16 and does not crop the depth map."""
 
     def predict(self, view: View) -> DepthPrior:
         height, width = view.image.shape[:2]
@@ -286,6 +286,6 @@ def test_light_import_measures_time_and_ignores_output(
 
 
 def test_every_common_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
-    """But for the one that cannot fail."""
+    """The check ``speed`` is excluded, because it cannot fail."""
     caught = named(test_caught) | {"specification", "construction", "light-import"}
     assert {check_id(check) for check in (*COMMON, *STANDALONE)} - caught == {"speed"}

@@ -1,4 +1,4 @@
-"""Depth and normals providers and wrappers with one fault each."""
+"""Depth providers, normals providers and wrappers with one fault each."""
 
 from __future__ import annotations
 
@@ -38,7 +38,8 @@ def shifted(image: np.ndarray, pixels: float) -> np.ndarray:
 
 
 def halved_by_corners(image: np.ndarray) -> np.ndarray:
-    """Half the size with the centres of the corner pixels kept in place (align_corners=True)."""
+    """Fault: resizes to half the size with the centers of the corner pixels fixed
+    (align_corners=True)."""
     rows, columns = (max(side // 2, 2) for side in image.shape[:2])
     x = np.linspace(0, image.shape[1] - 1, columns, dtype=np.float32)
     y = np.linspace(0, image.shape[0] - 1, rows, dtype=np.float32)
@@ -56,7 +57,7 @@ class Millimetres(PaintedDepth):
 
 
 class Disparity(PaintedDepth):
-    """Hands on what the network says, which is inverse depth."""
+    """Fault: returns inverse depth instead of depth."""
 
     def predict(self, view: View) -> DepthPrior:
         depth = read_depth(view.image)
@@ -79,7 +80,7 @@ class AlignedCorners(PaintedDepth):
 
 
 class CentreCrop(PaintedDepth):
-    """Cuts the border off, as training does, and forgets that the view has one."""
+    """Fault: crops the border, as in training, so that the map does not cover the view."""
 
     def predict(self, view: View) -> DepthPrior:
         rows, columns = (side // 32 for side in view.image.shape[:2])
@@ -98,7 +99,7 @@ class UpsideDown(PaintedDepth):
 
 
 class FarSky(PaintedDepth):
-    """Ignores validity: what has no depth is 100 m away."""
+    """Fault: marks every pixel as valid, with a depth of 100 m for the sky."""
 
     def predict(self, view: View) -> DepthPrior:
         depth = read_depth(view.image)
@@ -113,7 +114,7 @@ class NothingIsSure(PaintedDepth):
 
 
 class Tilted(PaintedDepth):
-    """What lies to the right is taken to be farther away."""
+    """Fault: depth increases to the right."""
 
     def predict(self, view: View) -> DepthPrior:
         slope = np.linspace(0.9, 1.1, view.camera.width)
@@ -121,7 +122,7 @@ class Tilted(PaintedDepth):
 
 
 class OldIntrinsics(PaintedDepth):
-    """Resizes the image to its network's size, and uses the focal length of the original."""
+    """Fault: resizes the image to the network's size, but uses the focal length of the original."""
 
     def predict(self, view: View) -> DepthPrior:
         image = cv2.resize(view.image, (192, 144), interpolation=cv2.INTER_AREA)
@@ -140,7 +141,7 @@ class StdForVariance(PaintedDepth):
 
 
 class RelativeVariance(PaintedDepth):
-    """The square of the relative std, without the depth."""
+    """Fault: the variance is the square of the relative std, without the depth."""
 
     def predict(self, view: View) -> DepthPrior:
         depth = read_depth(view.image)
@@ -154,7 +155,7 @@ class HugeVariance(PaintedDepth):
 
 
 class TinyVariance(PaintedDepth):
-    """In kilometres squared: nothing is left of it beside what the calibration declares."""
+    """Fault: the variance is in square kilometers and vanishes compared with the calibrated std."""
 
     def predict(self, view: View) -> DepthPrior:
         prior = super().predict(view)
@@ -221,7 +222,7 @@ class Away(PaintedNormals):
 
 
 class AwayAndDropped(PaintedNormals):
-    """Turned away, and all of them dropped for it."""
+    """Fault: normals face away from the camera, so all of them are dropped."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         return normal_prior(-read_normals(view.image), view)
@@ -273,14 +274,14 @@ class Degrees(PaintedNormals):
 
 
 class Leaning(PaintedNormals):
-    """What it sees leans a little to the left."""
+    """Fault: normals lean a little to the left."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         return normal_prior(read_normals(view.image) - (0.2, 0, 0), view)
 
 
 class Stretched(PaintedNormals):
-    """Goes by the number of columns instead of by angles."""
+    """Fault: normals depend on the number of columns instead of angles."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         return normal_prior(read_normals(view.image) * (1, 192 / view.camera.width, 1), view)
@@ -331,7 +332,7 @@ class AlwaysMetric(Wrapper):
 
 
 class OfItsOwn(Wrapper):
-    """Scales to a mean depth that it thinks right."""
+    """Fault: scales depth to a fixed mean depth."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
         prior = super().predict(view, depth)
@@ -344,7 +345,7 @@ class KeepsDepth(Wrapper):
 
 
 class MirrorNotUndone(Wrapper):
-    """A second pass in the mirror that is averaged as it comes."""
+    """Fault: averages the depth of the mirrored image without mirroring it back."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
         image = np.ascontiguousarray(view.image[:, ::-1])
@@ -353,7 +354,7 @@ class MirrorNotUndone(Wrapper):
 
 
 class MirroredNormals(Wrapper):
-    """A second pass in the mirror whose x components keep their sign."""
+    """Fault: mirrors the normals of the mirrored image back without negating x."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
         second = self.inner.predict(replace(view, image=np.ascontiguousarray(view.image[:, ::-1])))
@@ -361,7 +362,7 @@ class MirroredNormals(Wrapper):
 
 
 class FillsHoles(Wrapper):
-    """Calls everything valid, the sky too."""
+    """Fault: marks every pixel as valid, including the sky."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
         prior = super().predict(view, depth)
@@ -370,7 +371,7 @@ class FillsHoles(Wrapper):
 
 
 class DoublesIntrinsics(Wrapper):
-    """Reduces large views and forgets that depth has a unit."""
+    """Fault: reduces large views and scales metric depth with them."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
         prior = super().predict(view, depth)

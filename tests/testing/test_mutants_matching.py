@@ -1,4 +1,4 @@
-"""Features, matchers, retrieval and masks with one fault each."""
+"""Features, matchers, retrieval and mask providers with one fault each."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class Outside(Detector):
 
 
 class SortedAgain(Detector):
-    """Sorts keypoints by where they are and leaves the descriptors as they were."""
+    """Fault: sorts keypoints by position without sorting the descriptors."""
 
     def extract(self, view: View) -> Features:
         found = super().extract(view)
@@ -113,7 +113,7 @@ class ColumnsSwapped(Nearest):
 
 
 class SortsViews(Nearest):
-    """Puts the larger name second and forgets to turn the matches back."""
+    """Fault: swaps the views by name without swapping the columns of the matches."""
 
     def match(self, a: View, b: View, fa: Features, fb: Features) -> PairMatches:
         return super().match(*((b, a, fb, fa) if a.name < b.name else (a, b, fa, fb)))
@@ -138,7 +138,8 @@ class Percent(Nearest):
 
 
 class Distances(Nearest):
-    """Half of the matches are random; the score is a distance, small for good ones."""
+    """Fault: half of the matches are random, and the score is a distance instead of a
+    similarity."""
 
     def change(self, found: SparseMatches, *arguments: Any) -> SparseMatches:
         half = len(found) // 2
@@ -237,7 +238,7 @@ class Infinite(Thumbnail):
 
 
 class Rows(Thumbnail):
-    """A profile of the view, as long as the view is high."""
+    """Fault: the descriptor is a profile whose length is the height of the view."""
 
     def describe(self, view: View) -> np.ndarray:
         profile = view.image.mean(axis=(1, 2)).astype(np.float32)
@@ -250,7 +251,7 @@ class NotNormalised(Thumbnail):
 
 
 class Hash(Thumbnail):
-    """Says whether two views are the same, and nothing about whether they overlap."""
+    """Fault: the similarity only detects identical views, not overlap."""
 
     def describe(self, view: View) -> np.ndarray:
         digest = hashlib.sha512(view.image.tobytes() + b"5").digest()
@@ -320,7 +321,7 @@ def test_masks(caught: Callable[..., None], factory: type, check: str, message: 
 
 
 class NotScaledBack(Sift):
-    """Reduces views above 640 pixels and returns keypoints of the reduced image."""
+    """Fault: reduces views above 640 pixels and returns keypoints of the reduced image."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
         super().__init__(SiftOptions(resize=640), context)

@@ -30,7 +30,7 @@ def told(folder: Path) -> ContractSetup:
 
 
 class Changed(ToldGroup):
-    """The truth, changed in one way."""
+    """Ground truth with one modification."""
 
     def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
         return self.change(super().predict_group(views), views)
@@ -63,7 +63,7 @@ class LastFirst(Changed):
 
 
 class EachItsOwn(Changed):
-    """Normalises each map by itself."""
+    """Fault: normalizes the unit of each depth map separately."""
 
     def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         means = [3 / max(float(np.median(p.depth[p.valid])), 1e-6) for p in group.depth]
@@ -72,7 +72,7 @@ class EachItsOwn(Changed):
 
 
 class AlongTheFirst(Changed):
-    """Hands on the z of point maps, which are in the frame of the first view."""
+    """Fault: returns the z of point maps in the frame of the first view."""
 
     def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         first, depth = group.poses[0], []
@@ -91,7 +91,7 @@ class GroupFromCamera(Changed):
 
 
 class OpenGL(Changed):
-    """Cameras that look along -z with y up."""
+    """Fault: cameras look along -z with y up."""
 
     def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         return replace(group, poses=np.diag([1.0, -1.0, -1.0]) @ group.poses)
@@ -105,14 +105,14 @@ class CentersForTranslations(Changed):
 
 
 class UnitSteps(Changed):
-    """Poses normalised by themselves, depth left in metres."""
+    """Fault: normalizes the poses, but leaves depth in meters."""
 
     def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         return replace(group, poses=group.poses * (1, 1, 1, 5))
 
 
 class OwnGrid(Changed):
-    """The focal length on the network's grid of 518 pixels."""
+    """Fault: the focal length is in pixels of the network's grid of 518 pixels."""
 
     def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         widths = np.array([[view.camera.width] for view in views])
@@ -120,7 +120,7 @@ class OwnGrid(Changed):
 
 
 class RowsFirst(Changed):
-    """The principal point as row and column."""
+    """Fault: the principal point has row and column swapped."""
 
     def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         return replace(group, intrinsics=group.intrinsics[:, [0, 1, 3, 2]])
@@ -142,7 +142,7 @@ class OneSize(Changed):
 
 
 class CropsToTheSmallest(Changed):
-    """As the authors' own loaders do: the borders of larger views are lost."""
+    """Fault: crops larger views, as the authors' image loaders do."""
 
     def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         rows = min(view.camera.height for view in views)
@@ -167,7 +167,7 @@ class NoPoses(Changed):
 
 
 class Sheared(Changed):
-    """A matrix as a network gives it, which nobody made a rotation."""
+    """Fault: the predicted matrix is not orthonormalized to a rotation."""
 
     def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
         return replace(group, poses=1.1 * group.poses)
@@ -185,7 +185,7 @@ class SomeInMetres(Changed):
 
 
 class Chains(Changed):
-    """Goes on in the frame of the group before, as a stream of video would."""
+    """Fault: uses the frame of the previous group, as for a video stream."""
 
     seen = 0
 

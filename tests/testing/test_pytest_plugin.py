@@ -1,4 +1,5 @@
-"""The contract under pytest: by option, in a test file of one's own, and from the command line."""
+"""Tests of the contract under pytest: by option, in a plugin's test file, and on the command
+line."""
 
 from __future__ import annotations
 
@@ -43,7 +44,7 @@ SOURCE = """
 
 @pytest.fixture
 def site(install_plugin: Callable[..., str], monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with the installed plugin ``mpsfm-here``, on the path of child processes too."""
+    """Return a folder with the installed plugin ``mpsfm-here``, which child processes find too."""
     install_plugin("mpsfm-here", SOURCE)
     folder = Path(sys.path[0])
     paths = (str(folder), str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")]))
@@ -66,7 +67,7 @@ def test_by_option(site: Path, tmp_path: Path) -> None:
     assert "depth/here::depth-flip PASSED" in output
     assert "depth/here::flat FAILED" in output
     assert "passes, and was expected to fail: is too honest to pass" in output
-    assert "test_other" not in output  # no path was named
+    assert "test_other" not in output  # No path was given on the command line.
     named = ("--mpsfm-plugin", "here", "--collect-only", "-q", "test_other.py")
     code, output = run_pytest(tmp_path, *named)
     assert "test_other.py::test_other" in output and "depth/here::depth-is-z" in output
@@ -98,7 +99,7 @@ def test_in_a_file_of_ones_own(site: Path, tmp_path: Path) -> None:
 
 
 def test_others_pay_nothing(tmp_path: Path) -> None:
-    """Without the option nothing of ours is imported but the one small module."""
+    """Check that pytest without the option imports only the module mpsfm_pytest."""
     (tmp_path / "test_other.py").write_text(
         "import sys\n"
         "def test_other():\n"

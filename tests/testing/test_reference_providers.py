@@ -1,4 +1,4 @@
-"""A correct provider of every kind passes all checks, and none is skipped without a reason."""
+"""Tests that correct providers of every kind pass all checks, and skip only with a reason."""
 
 from __future__ import annotations
 

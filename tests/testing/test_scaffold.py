@@ -1,4 +1,4 @@
-"""``mpsfm plugins new`` writes packages that pass their contract as they are."""
+"""Tests that ``mpsfm plugins new`` writes packages that pass the contract."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def mpsfm(*arguments: object) -> tuple[int, str]:
 def written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Callable[[Kind], tuple[Registry, Path]]]:
-    """Writes a plugin ``brand-new-KIND`` and registers it with all that is installed."""
+    """Write a plugin ``brand-new-KIND`` and register it together with all installed plugins."""
 
     def write(kind: Kind) -> tuple[Registry, Path]:
         name = f"brand-new-{kind}"
@@ -108,7 +108,7 @@ def test_names_that_are_no_good(name: str, message: str, tmp_path: Path) -> None
 
 @pytest.mark.slow
 def test_installed_it_is_checked_by_name_and_by_its_own_tests(tmp_path: Path) -> None:
-    """From the command to the tests of the installed package, without network."""
+    """Check the path from the command to the tests of the installed package, without network."""
     write_plugin("brand-new-depth", "depth", tmp_path)
     site = tmp_path / "site"
     install = ("install", "--no-deps", "--no-index", "--no-build-isolation", "--quiet")

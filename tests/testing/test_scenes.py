@@ -1,4 +1,4 @@
-"""The analytic scenes are exact: geometry, normals, correspondences and colours agree."""
+"""Tests that analytic scenes are exact: geometry, normals, correspondences and colors agree."""
 
 import numpy as np
 import pytest
@@ -85,7 +85,7 @@ def test_correspondences_are_mutual_and_see_the_same_colour():
     xy_b = there.xy_b[there.visible]
     back = scene.correspondences(CAMERA, pose_b, CAMERA, pose_a, xy_b)
     assert 0.5 < there.visible.mean() < 1.0
-    assert back.visible.mean() > 0.99  # image borders are inclusive on one side only
+    assert back.visible.mean() > 0.99  # Image borders are inclusive on one side only.
     np.testing.assert_allclose(back.xy_b[back.visible], xy[there.visible][back.visible], atol=1e-6)
     size = np.full(len(xy), 0.03)
     a = scene.sample(CAMERA, pose_a, xy)

@@ -1,4 +1,4 @@
-"""The two rooms that look alike."""
+"""Tests of the synthetic mapping problem with two similar rooms."""
 
 from __future__ import annotations
 
@@ -18,6 +18,6 @@ def test_nobody_stands_inside_the_furniture(seed: int) -> None:
     centers = np.array([camera_center(pose[:, :3], pose[:, 3]) for pose in poses])
     for low, high in (WARDROBE, BOOKSHELF):
         assert not ((centers > low) & (centers < high)).all(axis=1).any()
-    # and whoever had to step back still is in the room
+    # Cameras that are moved out of furniture are still inside the room.
     inside = (centers[:, 1] > 0) & (centers[:, 1] < 4)
     assert inside[np.array(room) >= 0].all()

@@ -1,4 +1,4 @@
-"""What providers get from the core."""
+"""Fixtures for tests of built-in providers: views and the provider context."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Depth, normals and masks from files of every format."""
+"""Tests of depth, normals and masks that are read from files of every format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SIFT against COLMAP's extractor object, mutual nearest neighbours against brute force."""
+"""Tests of SIFT against COLMAP's extractor and of the matcher against brute force."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def as_view(image: np.ndarray, name: str = "a") -> View:
 
 @pytest.fixture(scope="module")
 def views() -> tuple[View, View]:
-    """Two views of the analytic room, 8 degrees apart."""
+    """Return two views of the analytic room scene, 8 degrees apart."""
     poses = arc_poses(2, 8.0)
     images = [room_scene().render(CAMERA, pose).rgb for pose in poses]
     return View("a", images[0], CAMERA), View("b", images[1], CAMERA)
@@ -48,7 +48,7 @@ def test_sift_is_colmaps(views, context: ProviderContext) -> None:
 
 
 def test_sift_pixel_convention(context: ProviderContext) -> None:
-    """A blob at the centre of pixel (row 40, column 70) is found at (70.5, 40.5)."""
+    """Check that a blob at the center of pixel (row 40, column 70) is detected at (70.5, 40.5)."""
     rows, columns = np.mgrid[0:100, 0:140]
     blob = np.exp(-((rows - 40) ** 2 + (columns - 70) ** 2) / (2 * 4.0**2))
     gray = np.round(40 + 180 * blob).astype(np.uint8)
@@ -60,7 +60,8 @@ def test_sift_pixel_convention(context: ProviderContext) -> None:
 def test_sift_options(views, context: ProviderContext) -> None:
     full = Sift(SiftOptions(), context).extract(views[0])
     few = Sift(SiftOptions(max_keypoints=50), context).extract(views[0])
-    assert 50 <= len(few) < 70 < len(full)  # orientations come on top
+    # Several orientations may add keypoints at the same position.
+    assert 50 <= len(few) < 70 < len(full)
     upright = Sift(SiftOptions(upright=True), context).extract(views[0])
     assert len(upright) < len(full)
     plain = Sift(SiftOptions(root=False), context).extract(views[0])
@@ -69,7 +70,7 @@ def test_sift_options(views, context: ProviderContext) -> None:
 
 
 def test_sift_resized(views, context: ProviderContext) -> None:
-    """Detection at half the size gives keypoints and scales of the view, less sharply located."""
+    """Check that SIFT at half the size returns keypoints and scales in pixels of the view."""
     found = Sift(SiftOptions(resize=160), context).extract(views[0])
     assert found.std_px == 2.0
     assert found.keypoints[:, 0].max() > 200 and found.keypoints[:, 1].max() > 150
@@ -143,7 +144,8 @@ def test_equal_descriptors_match_once(context: ProviderContext, views) -> None:
     sparse = MutualNearest(options, context).match(*views, doubled, b).sparse
     assert len(np.unique(sparse.indices[:, 1])) == len(sparse) <= 20
     tested = MutualNearest(MutualNearestOptions(), context).match(*views, doubled, b).sparse
-    assert len(tested) == 0  # neither of two equal ones is distinct
+    # If the nearest and second nearest distances are equal, there is no distinctive match.
+    assert len(tested) == 0
 
 
 def test_max_distance(context: ProviderContext, views) -> None:

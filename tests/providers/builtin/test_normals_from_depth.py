@@ -1,4 +1,4 @@
-"""Normals from depth: exact on planes, honest about errors, silent at edges."""
+"""Tests of normals from depth: exact on planes, calibrated std, invalid at depth edges."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_planes_are_exact(normal, context: ProviderContext) -> None:
 
 
 def test_smaller_grid(context: ProviderContext) -> None:
-    """A map of another size sees the same plane."""
+    """Check that a depth map of another size yields the same normal."""
     small = CAMERA.resized(160, 120)
     normal = np.array([0.5, -0.3, -0.8]) / np.linalg.norm([0.5, -0.3, -0.8])
     depth = -2.0 / (rays(small, pixel_centers(160, 120)) @ normal)
@@ -59,7 +59,7 @@ def test_smaller_grid(context: ProviderContext) -> None:
 
 
 def test_analytic_scene(context: ProviderContext) -> None:
-    """Planes and spheres with occlusions; creases between walls are smoothed over."""
+    """Check normals of planes and spheres with occlusions; creases between walls are smoothed."""
     rendering = room_scene().render(CAMERA, arc_poses(1, 0.0)[0])
     found = predict(prior(rendering.depth), context)
     errors = errors_deg(found, rendering.normals)
@@ -73,7 +73,8 @@ def test_edges_are_invalid(context: ProviderContext) -> None:
     found = predict(prior(depth), context)
     assert not found.valid[:, 159:161].any()
     assert found.valid[20:-20, 100:150].all() and found.valid[20:-20, 170:220].all()
-    assert errors_deg(found, np.array([0, 0, -1.0])).max() < 0.01  # none leans over the edge
+    # No normal at a depth edge leans over the edge.
+    assert errors_deg(found, np.array([0, 0, -1.0])).max() < 0.01
 
 
 def test_holes(context: ProviderContext) -> None:
@@ -90,26 +91,28 @@ def test_variance_follows_the_depth(context: ProviderContext) -> None:
     one = predict(prior(depth, 0.01), context)
     two = predict(prior(depth, 0.02), context)
     assert np.allclose(two.variance[two.valid], 4 * one.variance[one.valid], rtol=1e-3)
-    # Head-on, the angle is the slope of the relative error.
+    # On a surface perpendicular to the ray, the angular error is the slope of the relative depth
+    # error.
     middle = np.sqrt(one.variance[118, 165])
     assert middle == pytest.approx(NormalsFromDepthOptions().slope_std * 0.01, rel=1e-3)
 
 
 def test_independent_noise_is_propagated(context: ProviderContext) -> None:
-    """With noise of single pixels alone the stated std is that of the errors."""
+    """Check that the reported std matches the errors for independent noise of each pixel."""
     rng = np.random.default_rng(0)
     depth = plane((0.4, 0.2, -0.9)) * np.exp(0.003 * rng.normal(size=(240, 320)))
     found = predict(prior(depth, 0.003), context, slope_std=0.0)
     truth = np.array([0.4, 0.2, -0.9]) / np.linalg.norm([0.4, 0.2, -0.9])
     errors = np.radians(errors_deg(found, truth))
     assert found.valid.mean() > 0.85
-    # The angle's square is the sum over two tangent directions.
+    # The squared angular error is the sum over two tangent directions.
     ratio = np.median(errors**2 / (2 * found.variance[found.valid])) / np.log(2)
     assert 0.6 < ratio < 1.6
 
 
 def test_smooth_errors_are_covered(context: ProviderContext) -> None:
-    """Errors that bend surfaces over a quarter of a radian, as the default supposes."""
+    """Check the std for depth errors that bend surfaces over a quarter radian, the default of
+    ``slope_std``."""
     rng = np.random.default_rng(0)
     smooth = cv2.GaussianBlur(rng.normal(size=(240, 320)), (0, 0), 0.25 * 280)
     depth = plane((0.2, 0.1, -1.0)) * np.exp(0.05 * smooth / smooth.std())

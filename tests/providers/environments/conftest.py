@@ -1,4 +1,4 @@
-"""Another Python environment, with a plugin that is not installed here."""
+"""Fixtures with another Python environment whose plugin is not installed in this one."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from mpsfm_core.testing.examples import outdoor_example
 
 @pytest.fixture(scope="session")
 def far(tmp_path_factory: pytest.TempPathFactory) -> Environment:
-    """The environment ``far``. What is installed here is lent to it: nothing is downloaded."""
+    """The environment ``far``. The environment links to the packages of the test environment, so
+    nothing is downloaded."""
     root = tmp_path_factory.mktemp("environments")
     environment = Environment(root / "far")
     venv.create(environment.folder / "venv", with_pip=False, symlinks=True)
@@ -53,7 +54,7 @@ def painted() -> View:
 
 @pytest.fixture
 def named(painted: View):
-    """The painted view under a name that the far plugin fails at."""
+    """Return the painted view with a name at which the remote test plugin fails."""
 
     def named(name: str) -> View:
         camera: PinholeCamera = painted.camera

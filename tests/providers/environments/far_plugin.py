@@ -1,4 +1,4 @@
-"""A plugin that is installed in another environment only; the tests put it there."""
+"""Test plugin that is installed only in another Python environment."""
 
 import os
 import signal
@@ -21,7 +21,7 @@ class FarOptions(Options):
 
 
 class Far:
-    """Reads painted views, or fails in one of the ways in which networks fail."""
+    """Depth provider for painted views that can fail in the typical ways of networks."""
 
     def __init__(self, options, context):
         self._mode, self._bias = options.mode, options.bias
@@ -54,7 +54,7 @@ class Far:
 
 
 class FarMatcher:
-    """Pixels at the same place."""
+    """Matcher that matches equal pixel positions."""
 
     def __init__(self, options, context):
         pass

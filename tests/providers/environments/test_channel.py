@@ -1,4 +1,4 @@
-"""Messages between two ends in one process."""
+"""Tests of the message channel with both ends in one process."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mpsfm_core.providers.environments.channel import Channel
 
 @pytest.fixture
 def ends(tmp_path):
-    """One that asks, whose answers are lent, and one that answers."""
+    """Return a client end, whose received arrays are views of shared memory, and a server end."""
     there, back, modes = os.pipe(), os.pipe(), ("rb", "wb")
     with ExitStack() as stack:
         (answer_in, ask_out), (ask_in, answer_out) = (
@@ -43,7 +43,8 @@ def test_memory_is_lent_and_used_again(ends, tmp_path):
     assert first.base is not None
     for size in (10, 20_000, 10):
         part = exchange(ends, np.arange(float(size)))[:2]
-        assert part.tolist() == [0, 1]  # keeps its message as the whole array does
+        # A slice of the array keeps the message alive, as the whole array does.
+        assert part.tolist() == [0, 1]
     del part
     exchange(ends, np.arange(3))
     assert first.tolist() == np.arange(10.0).tolist()

@@ -1,4 +1,4 @@
-"""What passes between processes, and what does not."""
+"""Tests of the message codec: types that can and cannot be sent between processes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Providers of another environment, used as if they were here; and what goes wrong there."""
+"""Tests of providers in other Python environments, with crashes, hangs, wrong versions."""
 
 from __future__ import annotations
 
@@ -167,7 +167,8 @@ def test_names(monkeypatch, tmp_path):
 
 
 def test_it_is_there_as_a_whole_or_not_at_all(monkeypatch, tmp_path):
-    """It is made beside its place: others do not see one that is being made."""
+    """Check that an environment is created next to its final folder, invisible to other
+    processes."""
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     seen = []
 

@@ -1,4 +1,4 @@
-"""Files of networks, made by their authors' code in a process of its own."""
+"""Tests of the export of networks to ONNX by their authors' code in another process."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ job.export(net, [one, other], ["axes"], {{"image": axes, "axes": found}})
 
 @pytest.fixture
 def code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A checkout with a commit."""
+    """Return a source checkout with one git commit."""
     monkeypatch.setenv("MPSFM_EXPORTS", str(tmp_path / "exports"))
     folder = tmp_path / "checkout"
     folder.mkdir()

@@ -1,4 +1,4 @@
-"""The uncertainty model against values worked out by hand."""
+"""Tests of the uncertainty model against values computed by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Calibration files: written, read, shipped, refused."""
+"""Tests of calibration files: writing, reading, packaging, and rejected files."""
 
 from __future__ import annotations
 
