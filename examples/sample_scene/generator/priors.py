@@ -59,7 +59,8 @@ def degrade_normals(
 ) -> Prior:
     """Degrade exact normals by edge blur, and by smooth rotations about both tangent axes.
 
-    ``rays``: (h, w, 3) directions of the pixels; normals that do not face the camera are invalid.
+    ``rays`` (h, w, 3) are the viewing rays of the pixels. Normals that do not face the camera are
+    invalid.
     """
     valid = truth.depth > 0
     shape = truth.depth.shape
