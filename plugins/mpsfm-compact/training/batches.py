@@ -26,7 +26,7 @@ _SIZES = ((256, 192), (256, 192), (256, 192), (192, 256), (224, 224))
 """Width and height of the network input, drawn per batch. Every size has about 49 000 pixels."""
 _ZOOM = 1.6
 """Maximum zoom of the augmentation. Small zooms are more frequent, because inference uses none.
-Small zooms are more frequent, as inference uses whole images."""
+"""
 _ROLL_DEG = 6.0
 
 
@@ -70,7 +70,7 @@ class Sampler:
         self._weights = np.array(weights) / np.sum(weights)
 
     def draw(self, rng: np.random.Generator) -> dict[str, np.ndarray]:
-        """Draw a random stored sample."""
+        """Draw a random sample from the stored shards."""
         shard = self._shards[rng.choice(len(self._shards), p=self._weights)]
         return shard[int(rng.integers(len(shard)))]
 

@@ -121,7 +121,9 @@ class CompactNetwork(nn.Module):
         strangers = [key for key in missing if key.startswith(("stem", "stages"))]
         strangers = [key for key in strangers if not key.endswith("num_batches_tracked")]
         if strangers or unexpected:
-            raise ValueError(f"not the weights of EfficientNet-lite0: {strangers + unexpected}")
+            raise ValueError(
+                f"the weights are not those of EfficientNet-lite0: {strangers + unexpected}"
+            )
 
     def freeze_depthwise(self) -> None:
         """Freeze the encoder's depthwise convolutions, which dominate the time on a CPU."""

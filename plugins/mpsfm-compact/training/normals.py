@@ -18,8 +18,8 @@ def normals_of_depth(
     """Compute unit normals (h, w, 3) in the camera frame from depth, 0 where it is not smooth.
 
     Inverse depth is linear on a plane, ``1 / z = (n . ray) / d``. Planes are fitted to inverse
-    depth by least squares in windows of 9 x 9 pixels. Normals face the camera. ``depth`` (h, w) is
-    in meters, 0 if unknown, and ``camera`` is (fx, fy, cx, cy) in pixels.
+    depth by least squares in windows of 9 x 9 pixels. The returned normals face the camera.
+    ``depth`` (h, w) is in meters, 0 if unknown, and ``camera`` is (fx, fy, cx, cy) in pixels.
     """
     height, width = depth.shape
     known = depth > 0

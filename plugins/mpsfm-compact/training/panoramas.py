@@ -27,7 +27,8 @@ _TRIPOD = 1.45
 _UPWARDS = 0.95
 """Minimum cosine between the predicted normal of a floor pixel and the up direction."""
 _BELOW = 0.12
-"""Minimum sine of the angle of floor rays below the horizon. It limits floor distance to 12 m."""
+"""Minimum sine of the angle of floor rays below the horizon. This minimum limits the distance of
+floor pixels to 12 m."""
 _SAME = 0.35
 """Maximum difference of the log camera height among floor pixels. Table tops differ by more."""
 _ENOUGH = 0.04

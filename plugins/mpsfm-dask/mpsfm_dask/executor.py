@@ -13,8 +13,8 @@ from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.data.options import Options, SettingsError, parse_settings
 
 MAX_TASKS = 50_000
-"""Maximum number of Dask tasks per extraction step. Further items are grouped, because the
-scheduler keeps all tasks of a step in memory.
+"""Maximum number of Dask tasks per extraction step. If a step has more items, several items share a
+task, because the scheduler keeps all tasks in memory.
 """
 
 

@@ -41,10 +41,12 @@ class DepthAnything3:
         try:
             load_model(as_published(self._network), path)
         except (SafetensorError, OSError) as error:
-            raise WeightsError(f"{path} is no safetensors file: {error}") from error
+            raise WeightsError(f"{path} is not a safetensors file: {error}") from error
         except RuntimeError as error:
             reason = str(error).splitlines()[1].strip()
-            raise WeightsError(f"{path} is not of {options.network}: {reason}") from error
+            raise WeightsError(
+                f"{path} does not fit the network {options.network}: {reason}"
+            ) from error
         self._network.to(self._device)
 
     def predict_group(self, views: Sequence[View]) -> MultiViewPrior:

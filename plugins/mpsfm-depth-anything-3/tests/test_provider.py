@@ -99,7 +99,10 @@ def test_only_the_nested_network_is_metric(
 
 @pytest.mark.parametrize(
     ("content", "message"),
-    [(b"no tensors", "is no safetensors file"), (None, "is not of da3-base: size mismatch")],
+    [
+        (b"no tensors", "is not a safetensors file"),
+        (None, "does not fit the network da3-base: size mismatch"),
+    ],
 )
 def test_other_files(
     content: bytes | None, message: str, file: Path, tmp_path: Path, context: ProviderContext

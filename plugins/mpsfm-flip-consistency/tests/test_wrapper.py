@@ -20,7 +20,7 @@ VIEW = View("a.png", RAMP, CAMERA, np.arange(1200).reshape(30, 40) % 7 > 0)
 
 
 class Plane:
-    """Provider of the exact depth of the plane ``n . X = -2``, which recognizes mirrored images."""
+    """Provider of the exact depth of a plane, which recognizes mirrored images."""
 
     def predict(self, view: View) -> DepthPrior:
         mirrored = view.image[0, 0, 0] > view.image[0, -1, 0]
@@ -74,7 +74,7 @@ def test_disagreement_is_the_sample_variance():
 def test_fused_variance_is_the_larger_of_both():
     depth, variance = np.array([[2.0, 2.0, 3.0, 2.0]]), np.array([[0.5, 0.1, 0.1, 0.5]])
     fused = flip(Biased(depth, variance)).predict(VIEW)
-    # Both passes agree outside, with network variance 0.5. Inside they predict 2 and 3 with
+    # Both passes agree outside, with network variance 0.5. Inside, both passes predict 2 and 3 with
     # variance 0.1, so (0.5^2 + 0.5^2) is the larger variance.
     np.testing.assert_allclose(fused.depth, [[2.0, 2.5, 2.5, 2.0]])
     np.testing.assert_allclose(fused.variance, [[0.5, 0.5, 0.5, 0.5]], rtol=1e-6)

@@ -40,7 +40,8 @@ class AdalamMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match features with local affine support. Each feature has at most one match."""
+        """Match features with local affine support. Each feature of an image has at most one
+        match."""
         features_a, features_b = require_features("adalam matches features", features_a, features_b)
         if features_a.descriptors.shape[1] != features_b.descriptors.shape[1]:
             raise ProviderError(
@@ -77,7 +78,7 @@ class AdalamMatcher:
             "scale_rate_threshold": options.scale_ratio if use_scales else None,
             "device": torch.device(self._device),
         }
-        return AdalamFilter(config)  # type: ignore[arg-type]  # None switches off, as documented
+        return AdalamFilter(config)  # kornia documents None as "disabled"
 
     def _tensors(self, features: Features) -> tuple[torch.Tensor, ...]:
         arrays = (features.keypoints, features.descriptors, features.scales)

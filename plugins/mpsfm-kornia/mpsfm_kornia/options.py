@@ -71,7 +71,7 @@ KNOWN_HASHES = {
         LOFTR,
     )
 }
-"""SHA-256 hash of each default weights file. Other files need no hash."""
+"""SHA-256 hash of each default weights file. Weights files of users need no hash."""
 
 
 class FeatureOptions(Options):
@@ -213,7 +213,7 @@ class AdalamOptions(Options):
     """Minimum ratio of a neighborhood's inlier density to the density expected by chance."""
     scale_ratio: float | None = Field(1.5, gt=1)
     """Maximum ratio of the scale changes of two matches in a neighborhood. null sets no limit.
-    Ignored for features without a scale.
+    The ratio is ignored for features without a scale.
     """
 
 

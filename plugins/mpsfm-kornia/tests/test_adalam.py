@@ -54,7 +54,7 @@ def test_matches_of_inconsistent_scale_are_dropped(blocks, moved, context):
         for ratio in (1.5, None)
     ]
     kept = [np.isin(np.arange(COUNT), f.indices[:, 0]) for f in found]
-    assert kept[1][100:].mean() > 0.95  # all features move alike
+    assert kept[1][100:].mean() > 0.95
     # A neighborhood only accepts matches with the scale change of its seed.
     assert kept[0][100:].sum() < kept[1][100:].sum()
 

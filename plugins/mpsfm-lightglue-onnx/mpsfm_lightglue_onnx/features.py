@@ -77,7 +77,7 @@ class SuperPoint(OnnxFeatures):
 
 
 class Disk(OnnxFeatures):
-    """DISK features. The network halves its input four times."""
+    """DISK features. DISK's network halves its input four times."""
 
     multiple = 16
 

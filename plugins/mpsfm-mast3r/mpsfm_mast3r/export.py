@@ -40,8 +40,8 @@ _NARROW = {
 MASt3R, which need 12 decoder blocks.
 """
 _POSITIONS = 256
-"""Number of patches along an image side for which rotary embeddings are stored in the file. It
-limits images to 4096 pixels."""
+"""Number of patches along an image side for which rotary embeddings are stored in the file. This
+number limits images to 4096 pixels."""
 _SIDES = (((96, 128), (128, 64)), ((64, 160), (64, 160)))
 _KEYS = ("pts3d", "conf", "desc", "desc_conf")
 _OUTPUTS = [f"{key}_{side}" for side in (1, 2) for key in _KEYS]
@@ -99,7 +99,7 @@ def arguments(constructor_call: str) -> dict[str, Any]:
     """Parse the constructor call that a MASt3R checkpoint stores, without executing it."""
     call = ast.parse(constructor_call.replace("inf", _INFINITE), mode="eval").body
     if not (isinstance(call, ast.Call) and ast.unparse(call.func) == AsymmetricMASt3R.__name__):
-        raise SystemExit(f"the checkpoint is of another network: {constructor_call}")
+        raise SystemExit(f"the checkpoint is not of MASt3R but of {constructor_call}")
     given = {str(word.arg): ast.literal_eval(word.value) for word in call.keywords}
     return {**given, "patch_embed_cls": "PatchEmbedDust3R", "landscape_only": False}
 

@@ -21,7 +21,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
 
 @hookimpl
 def mpsfm_exports() -> dict[str, ModelExport]:
-    """Register the ONNX export that runs MASt3R's code and checkpoint."""
+    """Register the ONNX export that runs the code and checkpoint of MASt3R's authors."""
     return {
         "mast3r": ModelExport(
             script="mpsfm_mast3r.export",

@@ -23,8 +23,8 @@ class Canvas:
     """Position of the resized image on the network input, in pixels.
 
     ``size`` is the ``(width, height)`` of the network input, and ``image`` that of the resized
-    image. ``offset`` (x, y) is the upper left corner of the resized image on the network input. It
-    is negative where the network input crops the image.
+    image. ``offset`` (x, y) is the upper left corner of the resized image on the network input.
+    ``offset`` is negative where the network input crops the image.
     """
 
     size: tuple[int, int]

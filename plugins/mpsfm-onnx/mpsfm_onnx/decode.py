@@ -166,9 +166,9 @@ def compute_expected_angle(kappa: Float64) -> Float64:
 
     The density of normals over the sphere is ``(k^2 + 1) exp(-k a) / (2 pi (1 + exp(-k pi)))``,
     where a is the angle to the mean normal (Bae et al., ICCV 2021, DSINE and Metric3D v2). The mean
-    angle of this density is ``2k / (k^2 + 1) + pi e / (1 + e)`` with ``e = exp(-k pi)``. The
-    squared mean angle serves as the variance along one tangent direction [reference]. For large k,
-    this overestimates the std by 15 %.
+    angle of this density is ``2k / (k^2 + 1) + pi e / (1 + e)`` with ``e = exp(-k pi)``. For large
+    k, the squared mean angle overestimates the std by 15 %. For large k, this overestimates the std
+    by 15 %.
     """
     k = np.maximum(kappa, 0)
     tail = np.exp(-k * np.pi)

@@ -31,7 +31,8 @@ class FixedSize(Options):
     width: int = Field(gt=0)
     height: int = Field(gt=0)
     fit: Literal["stretch", "pad"] = "stretch"
-    """``stretch`` changes the aspect ratio of the image. ``pad`` keeps it and centers the image."""
+    """``stretch`` changes the aspect ratio of the image. ``pad`` keeps the aspect ratio and centers
+    the image."""
     rounding: Literal["nearest", "down"] = "nearest"
     """Rounding of the image size in pixels after resizing with ``fit: pad``."""
 
@@ -131,9 +132,9 @@ class ConfidenceOutput(Options):
 
     name: str
     output: Literal["confidence", "std", "variance", "exp-std"]
-    """Meaning of the tensor. For ``confidence`` c in [0, 1], the std is ``depth * (1 - c)``
-    (Metric3D). ``std``, ``variance`` and ``exp-std`` (whose log is the std) are in the unit of the
-    depth tensor, before the correction by ``canonical_focal``.
+    """Meaning of the values in the uncertainty tensor of depth. For ``confidence`` c in [0, 1], the
+    std is ``depth * (1 - c)`` (Metric3D). ``std``, ``variance`` and ``exp-std`` (whose log is the
+    std) are in the unit of the depth tensor, before the correction by ``canonical_focal``.
     """
 
 
@@ -146,7 +147,7 @@ class MaskOutput(Options):
 
 
 class NormalsOutput(Options):
-    """Output tensor of the normals. Its first three channels are x, y, z."""
+    """Output tensor of the normals. The first three channels of the normals tensor are x, y, z."""
 
     name: str
     axes: tuple[Sign, Sign, Sign] = (1, 1, 1)
@@ -158,8 +159,8 @@ class KappaOutput(Options):
 
     name: str
     output: Literal["kappa", "angle"] = "kappa"
-    """Meaning of the tensor. ``kappa`` is the concentration of DSINE and Metric3D. ``angle`` is the
-    std about each axis in rad.
+    """Meaning of the values in the uncertainty tensor of normals. ``kappa`` is the concentration of
+    DSINE and Metric3D. ``angle`` is the std about each axis in rad.
     """
     channel: int = Field(0, ge=0)
     """Channel of the uncertainty in its tensor, 3 if it follows x, y, z of the normals."""
@@ -252,7 +253,8 @@ def load_description(name: str) -> Description:
     """Load a shipped network description by its name, or a description from a YAML file.
 
     Raises:
-        ConfigError: The name is unknown, or the file is invalid. The message gives file and key.
+        ConfigError: The name is unknown, or the file is invalid. The message names the file and the
+            invalid key.
     """
     path = Path(name).expanduser()
     if path.suffix not in (".yaml", ".yml"):

@@ -167,7 +167,7 @@ def _factor(rule: DepthOutput, answer: NetworkOutput, camera: PinholeCamera) -> 
         sides = zip(answer.canvas.image, camera.size, strict=True)
         scale = max(
             resized_side / side for resized_side, side in sides
-        )  # the other side is rounded
+        )  # the other side of the resized image is rounded
         factor *= (camera.fx + camera.fy) / 2 * scale / rule.canonical_focal
     if rule.assumed_focal is not None:
         factor *= resized.fx / answer.numbers[rule.assumed_focal]

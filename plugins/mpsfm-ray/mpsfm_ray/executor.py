@@ -12,7 +12,8 @@ from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.data.options import Options, SettingsError, parse_settings
 
 MAX_TASKS = 50_000
-"""Maximum number of Ray tasks per extraction step. Further items are grouped."""
+"""Maximum number of Ray tasks per extraction step. If a step has more items, several items share a
+task."""
 
 
 class RayOptions(Options):

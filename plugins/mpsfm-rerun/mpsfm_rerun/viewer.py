@@ -25,7 +25,7 @@ class RerunViewer:
     """Viewer that writes the recording ``OUTPUT/scene.rrd``.
 
     Each scene is a step of the timeline ``step``. If ``z_is_up`` is set, the world is recorded with
-    z up. Without it, y is down, as in the camera frame.
+    z up. If ``z_is_up`` is False, y is down, as in the camera frame.
     """
 
     def __init__(self, output: Path, pictures: Pictures, z_is_up: bool = False) -> None:

@@ -17,7 +17,7 @@ _CELL = 8
 
 
 class SuperPointFeatures:
-    """SuperPoint features. The library places pixel centers at integer coordinates."""
+    """SuperPoint features. The library transformers places pixel centers at integer coordinates."""
 
     def __init__(self, options: SuperPointOptions, context: ProviderContext) -> None:
         config: dict[str, float] = {"max_keypoints": -1}  # the mask may remove some keypoints

@@ -56,7 +56,7 @@ class LoadedModel:
         missing = sorted(report["missing_keys"])
         if missing:
             raise WeightsError(
-                f"{options.model}: {WEIGHTS} does not fit {CONFIG}: it lacks {missing[0]!r} and "
+                f"{options.model}: {WEIGHTS} does not fit {CONFIG}: the tensors lack {missing[0]!r} and "
                 f"{len(missing) - 1} more"
             )
         self.network = network.eval().to(context.device)

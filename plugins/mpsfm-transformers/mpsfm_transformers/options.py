@@ -79,8 +79,9 @@ class HubOptions(Options):
     """
 
     model: str
-    """Name of the model: ``ORG/NAME@REVISION``, ``ORG/NAME``, or a folder. Without a revision, the
-    hash of the first download is recorded, and a file with another hash is rejected later.
+    """Name of the model, which is ``ORG/NAME@REVISION``, ``ORG/NAME``, or a folder. Without a
+    revision, the hash of the first download is recorded, and a file with another hash is rejected
+    later.
     """
     sha256: str | None = None
     """Expected SHA-256 hash of the file ``model.safetensors``."""

@@ -28,7 +28,7 @@ def load(name: str, context: ProviderContext, max_keypoints: int = 2048) -> Any:
 
     if name not in vismatch.available_models:
         hint = did_you_mean(name, vismatch.available_models)
-        raise ConfigError(f"vismatch {vismatch.__version__} knows no {name!r}{hint}")
+        raise ConfigError(f"vismatch {vismatch.__version__} has no matcher {name!r}{hint}")
     return vismatch.get_matcher(name, device=context.device, max_num_keypoints=max_keypoints)
 
 
@@ -48,4 +48,7 @@ def get_inner_network(matcher: Any, name: str, *attributes: str) -> Any:
     for attribute in attributes:
         if hasattr(matcher, attribute):
             return getattr(matcher, attribute)
-    raise ConfigError(f"{name!r} has none of {', '.join(attributes)}: it is of another kind")
+    raise ConfigError(
+        f"the matcher {name!r} has none of the attributes {', '.join(attributes)}: choose another "
+        f"network for this provider"
+    )

@@ -1,7 +1,7 @@
 """Functions ``(builder, x, y, yaw)`` that add a piece of furniture of random size.
 
 The back of a piece is at ``(x, y)`` in meters, and its front faces the direction ``yaw`` (rad).
-Sizes are those of real furniture.
+The sizes of all pieces are those of real furniture.
 """
 
 from __future__ import annotations

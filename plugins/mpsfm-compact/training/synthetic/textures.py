@@ -18,7 +18,8 @@ def make_textures(
 ) -> NDArray[np.uint8]:
     """Create RGB mipmap textures (levels, count, s, s, 3), each level with half the detail.
 
-    If ``photos`` are given, every second texture is a part of one, mirrored such that it repeats.
+    If ``photos`` are given, every second texture is a part of a photo, mirrored such that it
+    repeats.
     """
     bank = np.empty((_LEVELS, count, SIZE, SIZE, 3), np.uint8)
     for number in range(count):
