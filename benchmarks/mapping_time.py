@@ -32,7 +32,10 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["rendered_kitchen", "hololens_room"])
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))
     arguments = parser.parse_args()
-    parts = ["# Mapping time", "Wall time and CPU time in seconds (registered images)."]
+    parts = [
+        "# Mapping time",
+        "Cells list wall time and CPU time of mapping in seconds (registered images).",
+    ]
     for name in arguments.scenes:
         scene, output = shared_folder() / "data" / name, arguments.output / "mapping_time" / name
         frames = frame_names(scene)

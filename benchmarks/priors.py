@@ -233,7 +233,11 @@ def _tables(
 ) -> Iterator[str]:
     yield "# Accuracy of depth and normal priors"
     yield ""
-    yield "`python -m benchmarks.priors`; columns: see its docstring."
+    yield (
+        "`python -m benchmarks.priors`. AbsRel and delta < 1.25 are after scaling each image by the "
+        "ratio of the medians (truth / prediction). AUSE is the area between the sparsification "
+        "curve and the ideal curve, lower is better."
+    )
     yield ""
     columns = (
         "AbsRel | delta < 1.25 | truth / prediction | within 1 std | AUSE | AUSE of a constant std"
