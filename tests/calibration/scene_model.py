@@ -1,4 +1,4 @@
-"""COLMAP model with points from the true poses and depth of a scene."""
+"""Writer of a COLMAP model with points from the true poses and depth of a scene."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from mpsfm_core.data import Float64
 from mpsfm_core.geometry import inside, sample_nearest
 
 SPACING = 12
-"""Pixels between the points of a view."""
+"""Distance between the points of a view in pixels."""
 
 
 class Match(NamedTuple):
-    """A world point (3,) and where two images (ids) see it (2,)."""
+    """Match of two images: a world point (3,), two image ids, and two keypoints (2,)."""
 
     point: Float64
     first: int
@@ -28,7 +28,7 @@ class Match(NamedTuple):
 
 
 def write_model(scene: Path, folder: Path, scale: float) -> None:
-    """Points that two views of a scene see, in a unit that is ``1 / scale`` of the scene's."""
+    """Write a COLMAP model with the points that two images see; lengths are scaled by `scale`."""
     truth = pycolmap.Reconstruction(str(scene / "gt"))
     matches = list(_matches(scene, truth))
     camera = next(iter(truth.cameras.values()))

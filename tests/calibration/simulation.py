@@ -16,7 +16,7 @@ WIDTH, HEIGHT = 96, 72
 
 @dataclass(frozen=True)
 class Simulated:
-    """True parameters of a prior. ``gross``: share of pixels that are anything."""
+    """True parameters of a simulated prior; ``gross`` is the ratio of gross errors."""
 
     std_scale: float = 2.5
     relative_std: float = 0.06
@@ -31,7 +31,7 @@ class Simulated:
 def simulate(
     parameters: Simulated, images: int, seed: int = 0, pixels: int = 1000
 ) -> tuple[DepthSamples, ...]:
-    """Samples of ``images`` images, each with a scale of its own."""
+    """Simulate depth samples of `images` images with random scales."""
     rng = np.random.default_rng(seed)
     samples = []
     for number in range(images):
@@ -68,7 +68,7 @@ def simulate(
 
 
 def _surface(rng: np.random.Generator) -> Float64:
-    """A smooth depth map with a few nearer boxes."""
+    """Return a smooth depth map with a few boxes in the foreground."""
     bumps = cv2.resize(rng.normal(size=(4, 5)), (WIDTH, HEIGHT), interpolation=cv2.INTER_CUBIC)
     depth = np.exp(rng.uniform(-0.3, 0.8) + 0.6 * bumps)
     for _ in range(4):

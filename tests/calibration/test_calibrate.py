@@ -50,7 +50,7 @@ def calibrated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_calibrate_sample_scene_finds_overestimated_std(calibrated: Path) -> None:
-    """Its README: rms of error over declared std 0.90, with the scale errors that we take out."""
+    """The README of the scene states an RMS of 0.90 for error over declared std, before scaling."""
     calibration = load_calibration(calibrated)
     assert isinstance(calibration, DepthCalibration)
     assert calibration.use_network_variance
@@ -148,7 +148,7 @@ def test_calibrate_corrects_std_5_times_too_small(calibrated: Path, tmp_path: Pa
 
 
 def test_calibrate_normals(tmp_path: Path) -> None:
-    """The README of the scene: rms of angle over declared std 0.96."""
+    """The README of the scene states an RMS of 0.96 for normal error over declared std."""
     arguments = ["--kind", "normals", "--ground-truth", SCENE / "gt_normals"]
     arguments += ["--set", f"options.directory={SCENE / 'priors' / 'normals'}"]
     result = run(tmp_path / "normals.yaml", *arguments)
@@ -166,7 +166,7 @@ def test_calibrate_skips_masked_pixels_and_missing_truth(tmp_path: Path) -> None
     (tmp_path / "masks").mkdir()
     for path in (tmp_path / "gt").iterdir():
         depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        depth[:, :320] = 60_000  # nonsense on the left, which is masked
+        depth[:, :320] = 60_000  # The depth of the masked left half is wrong.
         cv2.imwrite(str(path), depth)
         allowed = np.zeros(depth.shape, np.uint8)
         allowed[:, 320:] = 255
@@ -213,7 +213,7 @@ def test_calibrate_command_suffix_selects_format(tmp_path: Path) -> None:
 
 
 def test_calibrate_with_model_points(calibrated: Path, tmp_path: Path) -> None:
-    """Points that two views see lead to about the same std as true maps, in any unit."""
+    """Calibration with model points in any unit gives about the same std as with true maps."""
     write_model(SCENE, tmp_path / "model", scale=7.0)
     result = run(tmp_path / "points.yaml", *PRIOR, "--model", tmp_path / "model")
     assert result.exit_code == 0, result.output
@@ -228,7 +228,7 @@ def test_calibrate_with_model_points(calibrated: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_self_calibration_with_images_only(calibrated: Path, tmp_path: Path) -> None:
-    """The points of our own reconstruction lead to about the same std as true depth."""
+    """Self-calibration gives about the same std as calibration with true depth."""
     result = run(tmp_path / "own.yaml", *PRIOR, "--config", "demo", *_normals())
     assert result.exit_code == 0, result.output
     own, true = load_calibration(tmp_path / "own.yaml"), load_calibration(calibrated)

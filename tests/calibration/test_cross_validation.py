@@ -35,7 +35,7 @@ def test_study_improves_cross_validated_coverage(twenty: CalibrationStudy) -> No
 
 
 def test_study_folds_are_whole_scenes() -> None:
-    """One of three scenes has twice the errors, so a fit to two scenes has low coverage on it."""
+    """A fit to two scenes has low coverage on the third, which has twice the errors."""
     easy = simulate(PRIOR, 16, pixels=300)
     hard = simulate(replace(PRIOR, relative_std=0.2), 8, seed=1, pixels=300)
     named = [replace(image, name=f"{'ab'[n // 8]}/{image.name}") for n, image in enumerate(easy)]
@@ -48,7 +48,7 @@ def test_study_folds_are_whole_scenes() -> None:
 
 
 def test_study_reports_scale_separately(twenty: CalibrationStudy) -> None:
-    # Simulated images have scales with a log spread of 0.2, twice the std.
+    # The log scales of simulated images have a std of 0.2, twice the std of errors.
     assert twenty.report["scale"]["log_spread"] == pytest.approx(0.2, rel=0.5)
     after = twenty.report["metrics"]["after"]
     assert after["coverage_without_scaling"][0] < after["coverage"][0] - 0.2

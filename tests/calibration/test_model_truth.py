@@ -32,7 +32,7 @@ def points() -> Float64:
 
 
 def make_model(points: Float64, stored: Float64) -> pycolmap.Reconstruction:
-    """Five views 8 degrees apart; the model claims the points are at ``stored``."""
+    """Return a COLMAP model of five images 8 degrees apart with the point coordinates `stored`."""
     rng = np.random.default_rng(2)
     model = pycolmap.Reconstruction()
     model.add_camera_with_trivial_rig(pycolmap.Camera(CAMERA.todict()))
@@ -64,7 +64,7 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> ImageSet:
 
 
 def errors(truth: dict[str, DepthTruth], points: Float64, images: ImageSet) -> Float64:
-    """Log depth errors over their std; checks on the way that the pixels are those of the view."""
+    """Return log depth errors over their std, and check that positions are pixels of the view."""
     found = []
     for number, pose in enumerate(arc_poses(5, 8.0), start=1):
         camera_points = points @ pose[:, :3].T + pose[:, 3]
@@ -80,12 +80,12 @@ def errors(truth: dict[str, DepthTruth], points: Float64, images: ImageSet) -> F
 def test_model_depth_std_is_calibrated(points: Float64, images: ImageSet) -> None:
     z = np.abs(errors(depth_truth_from_model(make_model(points, points), images), points, images))
     assert len(z) > POINTS
-    # Noisy keypoints are sometimes nearest to another point, so the middle is looked at.
+    # The median is robust to noisy keypoints that are nearest to a wrong point.
     assert 1.4826 * np.median(z) == pytest.approx(1, abs=0.2)
 
 
 def test_model_depth_is_independent_of_model_points(points: Float64, images: ImageSet) -> None:
-    """A prior that pulled points along their rays must not be compared with itself."""
+    """A depth prior that moved points along their rays must not influence the true depth."""
     center = -arc_poses(5, 8.0)[2][:, :3].T @ arc_poses(5, 8.0)[2][:, 3]
     pulled = center + 1.15 * (points - center)
     right = depth_truth_from_model(make_model(points, points), images)
@@ -96,7 +96,8 @@ def test_model_depth_is_independent_of_model_points(points: Float64, images: Ima
 
 def test_model_depth_excludes_small_angles_and_outliers(points: Float64, images: ImageSet) -> None:
     near = points.copy()
-    near[:100] = points[:100] * 0.1 + [0, 60.0, 0]  # so far away that the rays are parallel
+    # The points are so far away that their rays are nearly parallel.
+    near[:100] = points[:100] * 0.1 + [0, 60.0, 0]
     truth = depth_truth_from_model(make_model(near, near), images)
     assert all(one.depth.max() < 20 for one in truth.values())
     model = make_model(points, points)

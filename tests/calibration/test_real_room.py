@@ -1,4 +1,4 @@
-"""FastDepth in a real room: calibrated with the depth of a sensor, and without."""
+"""Tests of the calibration of FastDepth in a real room with and without sensor depth."""
 
 from __future__ import annotations
 
@@ -31,12 +31,12 @@ pytest.importorskip("mpsfm_kornia")
 pytestmark = pytest.mark.slow
 
 FRAMES = 30
-"""The first of the room's 123: successive frames reconstruct well, and within minutes."""
+"""Number of frames to reconstruct; successive frames of the room reconstruct in minutes."""
 
 
 @dataclass(frozen=True)
 class Room:
-    """All photos and some successive ones, what reconstructs them, options of the sensor depth."""
+    """All images, successive frames, the configuration, and the options of the sensor depth."""
 
     photos: CalibrationImages
     frames: CalibrationImages
@@ -72,7 +72,7 @@ def by_sensor(room: Room) -> CalibrationResult:
 def assert_near(
     found: CalibrationResult, by_sensor: CalibrationResult, room: Room, values: float
 ) -> None:
-    """Check that the median std differs by at most 25 % and its factors by `values`."""
+    """Check that the median std differs by at most 25 %, and factors by a ratio of `values`."""
     own, true = found.file.calibration, by_sensor.file.calibration
     assert isinstance(own, DepthCalibration) and isinstance(true, DepthCalibration)
     assert not (own.use_network_variance or true.use_network_variance)
@@ -81,7 +81,7 @@ def assert_near(
     data = compare_prior(room.photos, room.config, room.truth)
     stds = [std_of(calibration, data.residuals(calibration)) for calibration in (own, true)]
     assert 0.75 < np.median(stds[0] / stds[1]) < 1.25
-    # So different a std shows: the defaults, which are another network's, are not near.
+    # The default calibration, which is for another network, has a clearly different std.
     other = DepthCalibration()
     assert np.median(std_of(other, data.residuals(other)) / stds[1]) < 0.3
 
@@ -110,7 +110,7 @@ def test_colmap_points_are_close_to_sensor_calibration(
     images = load_images(photos.folder, photos.intrinsics, photos.image_list, config.inputs)
     problem = extract(images, config, registry, Stages(registry)).problem
     write_database(problem, tmp_path / "database.db")
-    with limit_threads(1):  # the same model every time
+    with limit_threads(1):  # COLMAP is deterministic with one thread.
         models = PEERS["colmap"](tmp_path / "database.db", tmp_path)
     largest = max(models, key=lambda number: models[number].num_reg_images())
     found = calibrate(photos, room.config, model=tmp_path / str(largest))

@@ -37,8 +37,7 @@ def test_sample_evenly_skips_distant_pixels() -> None:
 
 
 def photos(*, texture_only: bool) -> DepthData:
-    """Depth that errs 5 % on a textured half of each photo and 15 % on a blank one, which has one
-    in twenty points."""
+    """Return depth with larger errors and fewer points on the textureless half of images."""
     rng = np.random.default_rng(1)
     samples: list[DepthSamples] = []
     for number in range(12):
@@ -58,7 +57,7 @@ def photos(*, texture_only: bool) -> DepthData:
 
 
 def test_sample_evenly_removes_texture_bias() -> None:
-    """Half of the pixels err with a std of 5 %, half with 15 %: 68.27 % are within 8.8 %."""
+    """Errors with a std of 5 % on one half and 15 % on the other are within 8.8 % for 68.27 %."""
     stds = []
     for texture_only in (True, False):
         calibration = select_candidate(photos(texture_only=texture_only).fit()).calibration

@@ -83,7 +83,7 @@ def test_fit_recovers_shift_of_relative_network(alignment: str) -> None:
     shifted = tuple(_unshift(s, alignment, 0.4) for s in simulate(parameters, 20))
     found = fitted(shifted, "scale", "scale-shift", "disparity")
     assert found.shift_space == ("depth" if alignment == "scale-shift" else "disparity")
-    truth = 0.4 / 0.6  # of the median of what the network gives, which is 0.6 of the true one
+    truth = 0.4 / 0.6  # The unit is the median of the shifted prior, 0.6 of the true median.
     assert found.shift == pytest.approx(truth, rel=0.05)
     assert found.relative_std == pytest.approx(0.05, rel=0.05)
 
@@ -156,7 +156,7 @@ def test_tangent_errors_are_angles() -> None:
 
 
 def test_std_of_matches_apply() -> None:
-    """The fit and the extraction must mean the same by a calibration."""
+    """The std in the fit must equal the std that extraction computes with the calibration."""
     samples = simulate(PLAIN, 1)
     calibration = DepthCalibration(
         std_scale=2.0, relative_std=0.05, std_floor=0.1, edge_ratio=1.1, edge_std_scale=1.7
@@ -176,7 +176,7 @@ def test_normal_residuals_have_two_directions() -> None:
 
 
 def _unshift(samples: DepthSamples, alignment: str, share: float) -> DepthSamples:
-    """The same with a share of the map's median taken off depth or inverse depth."""
+    """Subtract a ratio of the map's median from depth or inverse depth of the samples."""
     space = 0 if alignment == "scale-shift" else 1
     median = samples.depth_medians[space]
     quantity = samples.prior if space == 0 else 1 / samples.prior

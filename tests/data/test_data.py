@@ -1,4 +1,4 @@
-"""Tests of constructors that normalize the output of networks."""
+"""Tests of data class constructors that normalize network outputs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def test_sparse_matches_from_arrays_converts_dtypes_and_clips_scores() -> None:
 def test_from_best_scores_keeps_highest_score_per_feature() -> None:
     indices = np.array([[0, 5], [1, 5], [1, 6], [2, 7], [3, 6]])
     found = SparseMatches.from_best_scores(indices, np.array([0.2, 0.9, 0.8, 0.3, 0.5]))
-    # (1, 6) loses to (1, 5), so feature 6 stays available for (3, 6)
+    # The match (1, 6) loses to (1, 5), so feature 6 remains available for (3, 6).
     assert found.indices.tolist() == [[1, 5], [3, 6], [2, 7]]
     np.testing.assert_allclose(found.scores, [0.9, 0.5, 0.3])
 

@@ -1,4 +1,4 @@
-"""Fixture: an analytic room with exact poses and inexact depth maps."""
+"""Fixture of a rendered room with exact poses and inexact depth maps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STD = 0.15
 
 @dataclass(frozen=True)
 class Room:
-    """Images with smooth depth errors, their views, and the true depth by name."""
+    """Reconstruction with smooth depth errors, its views, and true depth by image name."""
 
     reconstruction: Reconstruction
     views: Mapping[str, View]

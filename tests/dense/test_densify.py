@@ -1,4 +1,4 @@
-"""Tests of densification on an analytic room and on difficult images."""
+"""Tests of densification on a rendered room and on difficult images."""
 
 from __future__ import annotations
 
@@ -72,14 +72,16 @@ def test_densify_keeps_sensor_depth_and_fills_holes(room) -> None:
 
 
 def test_densify_poses_from_depth_add_scale_variance(room) -> None:
-    # Without shared pixels (correlation length of the map) only known depth constrains the pairs.
+    # A correlation length of the map's size excludes shared pixels, so only known depth constrains
+    # the scales of pairs.
     loose = OPTIONS.model_copy(update={"correlation_px": 1000.0})
     tied, _ = densify(room.reconstruction, room.views.__getitem__, loose)
     fixed, _ = densify(room.reconstruction, room.views.__getitem__, loose, poses_use_depth=False)
     for a, b in zip(tied.images, fixed.images, strict=True):
         np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
         added = (a.depth.variance - b.depth.variance) / a.depth.depth**2
-        np.testing.assert_allclose(added, added.mean(), rtol=1e-2)  # constant over the image
+        # The scale error is constant over the image.
+        np.testing.assert_allclose(added, added.mean(), rtol=1e-2)
         assert 0.003 < added.mean() ** 0.5 < 0.1
 
 
@@ -149,7 +151,7 @@ def test_densify_ignores_unconfirmed_pose(room) -> None:
 
 
 class FailingCheckpoints:
-    """Checkpoints of two images; interrupts the run at the third."""
+    """Checkpoint store that interrupts densification at the third image."""
 
     def __init__(self, kept: DenseCheckpoints) -> None:
         self.kept, self.loaded, self.saved = kept, 0, 0
@@ -209,7 +211,7 @@ def test_densify_with_full_disk_finishes(
 
 
 def test_dense_view_does_not_interpolate_across_depth_edge(room) -> None:
-    """A coarse depth map with a step that its std cannot explain."""
+    """The coarse depth map has an edge much larger than its std."""
     image, size = room.reconstruction.images[0], 16
     depth = np.where(np.arange(size) < size // 2, 2.0, 4.0) * np.ones((size, 1))
     known = DepthPrior.from_arrays(depth, (0.01 * depth) ** 2)

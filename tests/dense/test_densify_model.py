@@ -24,7 +24,7 @@ from mpsfm_core.testing.synthetic.scenes import room_scene
 
 @pytest.fixture
 def model(room, tmp_path: Path) -> Path:
-    """Write `sparse/` with exact poses and points of the room, and `photos/`."""
+    """Write a COLMAP model `sparse/` with exact poses and points of the room, and `photos/`."""
     images = room.reconstruction.images
     first = images[0]
     camera = first.camera

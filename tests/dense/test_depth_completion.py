@@ -1,4 +1,4 @@
-"""Tests of depth completion where stereo measured nothing."""
+"""Tests of depth completion at pixels without stereo measurement."""
 
 from __future__ import annotations
 

@@ -24,13 +24,13 @@ ACROSS, ALONG = [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]
 
 
 def turned(image: RegisteredImage, axis: list[float], pixels: float) -> RegisteredImage:
-    """Rotate the pose of an image by an angle of about so many pixels."""
+    """Rotate the pose of an image such that pixels move by about `pixels`."""
     turn = Rotation.from_rotvec(np.array(axis) * pixels / image.camera.fx).as_matrix()
     return replace(image, rotation=turn @ image.rotation, translation=turn @ image.translation)
 
 
 def match_patches(room, axis: list[float], pixels: float) -> PatchOffsets:
-    """Match patches of the first image in the second, whose pose is wrong."""
+    """Match patches of the first image in the second image, whose pose has an error."""
     first, second = room.reconstruction.images[:2]
     one, other = (
         DenseView.from_view(image, room.views[image.name], max(image.camera.size))

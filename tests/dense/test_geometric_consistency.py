@@ -20,7 +20,7 @@ SHAPE = 200, 300
 
 
 def differences(std_px: float, parallax: Float32, seed: int, wrong: float = 0.0) -> Float32:
-    """Simulate differences of two equally noisy depth maps; NaN at a ratio of `wrong` pixels."""
+    """Simulate differences of two equally noisy depth maps, NaN at a ratio `wrong` of pixels."""
     rng = np.random.default_rng(seed)
     ours, theirs = std_px * rng.normal(size=(2, *SHAPE))
     found = ((theirs - ours) / parallax).astype(np.float32)
@@ -59,7 +59,7 @@ def test_std_px_accounts_for_correlated_errors(views: int) -> None:
     errors = std_px * (common + 0.7**0.5 * rng.normal(size=(1 + max(views, 1), *SHAPE)))
     found = [((each - errors[0]) / 50).astype(np.float32) for each in errors[1:]]
     agreement = evaluate_consistency(parallax, found)
-    if not views:  # without agreement only the own error remains
+    if not views:  # Without consistent views, only the error of the map remains.
         agreement = replace(agreement, views=np.zeros(SHAPE, np.uint16))
     mean = errors[: 1 + views].mean(axis=0)
     assert (np.abs(mean) < agreement.std_px).mean() == pytest.approx(0.683, abs=0.01)
@@ -74,7 +74,7 @@ def test_compare_depths_separates_agreement_and_near_miss() -> None:
     grid = PosedGrid(PinholeCamera(4, 1, 10.0, 10.0, 2.0, 0.5), np.eye(3), np.zeros(3))
     std = np.full((1, 4), 0.01, np.float32)
     own = PosedDepth(grid, np.zeros((1, 4), np.float32), std)
-    # three times the std of two maps, 0.042, agree
+    # Depths are consistent up to three times the std of a difference, 0.042.
     other = own._replace(log_depth=np.array([[0.0, 0.04, -0.08, 0.09]], np.float32))
     found = compare_depths(own, other)
     assert found.agree.tolist() == [[True, True, False, False]]

@@ -16,7 +16,7 @@ LEFT = np.broadcast_to(np.arange(80) < 40, SHAPE)
 
 
 WEAK = 1e-7
-"""Precision of a negligible constraint."""
+"""Precision of a constraint with negligible influence."""
 
 
 def pair_constraint(a: int, b: int, std: float, known_std: float = 1.0) -> ScaleConstraints:
@@ -37,14 +37,14 @@ def no_pair(known_std: float = 1.0) -> ScaleConstraints:
 
 
 def differences(left: float, right: float, shared: int = 0) -> dict[int, np.ndarray]:
-    """Return differences: views 1 and 2 confirm one half each and both some shared columns."""
+    """Return depth differences of two views: each confirms one half and `shared` columns."""
     maps = {1: np.where(LEFT, left, np.nan), 2: np.where(LEFT, np.nan, right)}
     maps[1][:, 40 : 40 + shared], maps[2][:, 40 - shared : 40] = left, right
     return {view: map_.astype(np.float32) for view, map_ in maps.items()}
 
 
 def test_scale_variance_adds_up_along_chain() -> None:
-    # pairs 0-1, 1-2, 2-3, constrained in images 1 and 2
+    # Images 1 and 2 constrain the scales of the pairs 0-1, 1-2 and 2-3.
     chain = {
         0: end_constraint(1),
         1: pair_constraint(0, 2, 0.03),
@@ -52,7 +52,7 @@ def test_scale_variance_adds_up_along_chain() -> None:
         3: end_constraint(2),
     }
     found = estimate_scale_stds(chain)
-    # x1 = a, x2 = a + b: less the mean, with b of 0.04 and a of 0.03
+    # The log scales are 0, a and a + b minus their mean, with a std of 0.03 for a and 0.04 for b.
     variance = np.array(
         [0.03**2 * 4 / 9 + 0.04**2 / 9, 0.03**2 / 9 + 0.04**2 / 9, 0.03**2 / 9 + 0.04**2 * 4 / 9]
     )
@@ -66,7 +66,7 @@ def test_scale_std_of_ring_is_below_chain() -> None:
     ring = {k: pair_constraint((k - 1) % count, (k + 1) % count, 0.02) for k in range(count)}
     chain = ring | {0: end_constraint(1), count - 1: end_constraint(count - 2)}
     around, along = estimate_scale_stds(ring), estimate_scale_stds(chain)
-    # variance of a closed random walk relative to its mean: s^2 (n^2 - 1) / (12 n)
+    # A closed random walk has the variance s^2 (n^2 - 1) / (12 n) relative to its mean.
     assert around[7] == pytest.approx(0.02 * ((count**2 - 1) / (12 * count)) ** 0.5)
     assert np.ptp(list(around.values())) < 1e-9
     assert along[0] > 1.9 * around[0]
@@ -82,8 +82,8 @@ def test_scale_std_of_single_pair_is_zero() -> None:
 def test_scale_std_of_separate_pairs_is_declared_std() -> None:
     exact, std = 1e9, 0.2
     groups = {view: end_constraint(view ^ 1, exact, std) for view in range(4)}  # pairs 0-1 and 2-3
-    # The scale std of a map is sqrt(1.5) std, because the correlation in a pair is 0.5. A pair has
-    # the mean scale of its maps, at half the distance between both pairs from their mean.
+    # The scale std of a depth map is sqrt(1.5) std, because the correlation in a pair is 0.5. A
+    # pair has the mean scale of its two depth maps, and half the scale difference of the pairs.
     expected = std * (1.5 / 2 / 2) ** 0.5
     assert list(estimate_scale_stds(groups).values()) == pytest.approx([expected] * 4, rel=1e-3)
     alone = estimate_scale_stds(
@@ -104,10 +104,10 @@ def test_known_depth_constraint_uses_regional_error() -> None:
 def test_shared_pixel_constraint_is_bounded_by_mean_difference() -> None:
     change = np.full(SHAPE, 0.1, np.float32)
     constraints = measure_scale_constraints(differences(-0.001, 0.001, shared=10), change, 0.25, 20)
-    # independent of the number of pixels: all have a scale difference of 0.002
+    # The std is 0.002 for any number of pixels, because all pixels differ in scale by 0.002.
     assert constraints.shared[0, 1] ** -0.5 == pytest.approx(0.002, rel=1e-4)
     fewer = measure_scale_constraints(differences(-0.001, 0.001, shared=3), change, 0.25, 20)
-    assert not fewer.shared.any()  # less than one square
+    assert not fewer.shared.any()  # The shared pixels are fewer than one observation.
     left = {j: np.where(LEFT, map_, np.nan) for j, map_ in differences(0, 0).items()}
     masked = measure_scale_constraints(left, change, 0.25, 20)
     assert masked.sources == [1]
@@ -120,8 +120,7 @@ def test_shared_pixel_constraint_excludes_common_error() -> None:
     seen = {j: (errors[j] - errors[0]).astype(np.float32) for j in range(1, count + 1)}
     none = np.zeros(SHAPE, np.float32)
     constraints = measure_scale_constraints(seen, none, 0.25, 1)
-    # precision of `count` observations with a common error that cancels: 1 / std^2 per pixel, minus
-    # the mean
+    # The precision is that of `count` observations whose common error cancels.
     expected = SHAPE[0] * SHAPE[1] / std**2 / count
     off_diagonal = constraints.shared[~np.eye(count, dtype=np.bool_)]
     np.testing.assert_allclose(off_diagonal, expected, rtol=0.1)

@@ -1,4 +1,4 @@
-"""Fixtures: a scene folder of rendered images with true poses and depth."""
+"""Fixture of a scene folder with rendered images, true poses and true depth."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ triplets:
 
 @pytest.fixture(scope="session")
 def scene_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Write five images on an arc; tests must not change the folder."""
+    """Write a scene folder with five images on an arc; tests must not change the folder."""
     folder = tmp_path_factory.mktemp("scenes") / "room"
     for name in ("images", "gt"):
         (folder / name).mkdir(parents=True)

@@ -28,7 +28,7 @@ def test_depth_accuracy_matches_hand_computed_errors() -> None:
     assert found is not None
     assert found.abs_rel == pytest.approx((0.5 + 0.5 + 0) / 3)
     assert found.rmse_log == pytest.approx(np.sqrt((np.log(2) ** 2 + np.log(1.5) ** 2) / 3))
-    # Ratios 2, 1.5, 1 against 1.25, 1.5625, 1.953125.
+    # The depth ratios 2, 1.5 and 1 are compared with the thresholds 1.25, 1.5625 and 1.953125.
     assert (found.delta1, found.delta2, found.delta3) == pytest.approx((1 / 3, 2 / 3, 2 / 3))
     assert (found.pixels, found.coverage, found.scale) == (9, 1.0, 1.0)
 
@@ -70,7 +70,8 @@ def test_cloud_accuracy_of_plane() -> None:
     assert found["accuracy"]["0.02"] == 0
     assert found["accuracy"]["0.05"] == pytest.approx(5000 / 5002, abs=1e-4)
     assert found["completeness"]["0.02"] == 0
-    # Within sqrt(0.05^2 - 0.03^2) = 0.04 of the half that is there.
+    # Scan points are complete within sqrt(0.05^2 - 0.03^2) = 0.04 of the half that the cloud
+    # contains.
     assert found["completeness"]["0.05"] == pytest.approx(0.53, abs=0.011)
     assert found["f1"]["0.05"] == pytest.approx(2 * 0.53 / 1.53, abs=0.01)
     assert found["median_distance_to_scan"] == pytest.approx(0.03)

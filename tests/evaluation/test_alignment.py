@@ -57,7 +57,7 @@ def test_trajectory_errors_are_in_unit_of_truth() -> None:
     assert errors is not None
     assert errors.ate_rmse == pytest.approx(0, abs=1e-9)
     assert errors.truth_from_estimate.scale == pytest.approx(10)
-    # One of eight orientations is off by 3 degrees: the mean takes an eighth of it.
+    # One of eight orientations has an error of 3 degrees, which rotates the mean by 3/8 degrees.
     assert errors.rotations_deg[4] == pytest.approx(3 * 7 / 8, abs=0.01)
     assert np.delete(errors.rotations_deg, 4) == pytest.approx([3 / 8] * 7, abs=0.01)
 
@@ -90,8 +90,8 @@ def test_rpe_measures_steps() -> None:
     assert exact is not None
     assert exact.rpe_rmse == pytest.approx(0, abs=1e-9)
     assert exact.rpe_rmse_deg == pytest.approx(0, abs=1e-6)
-    # The last image turns by 4 degrees about its own centre: the motion into it is wrong, in its
-    # direction as seen from the turned camera too.
+    # The last image is rotated by 4 degrees about its center, so the last relative pose has errors
+    # of rotation and translation.
     turn = Rotation.from_euler("y", 4, degrees=True).as_matrix()
     turned = dict(truth)
     turned["5"] = (turn @ truth["5"][0], turn @ truth["5"][1])

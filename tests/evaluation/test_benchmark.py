@@ -23,7 +23,7 @@ from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 from tests.evaluation.conftest import CAMERA
 
-pytestmark = pytest.mark.slow  # starts processes that load or compile the mapper's loops
+pytestmark = pytest.mark.slow  # The benchmark starts processes that compile the mapper's kernels.
 
 CONFIG = """
 features:
@@ -53,7 +53,7 @@ def config(scene_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 def output(
     scene_folder: Path, config: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, str, str]:
-    """A finished benchmark by the command, with what it printed."""
+    """Finished run of ``mpsfm benchmark``, with its output text."""
     folder = tmp_path_factory.mktemp("benchmark") / "out"
     result = CliRunner().invoke(build_app(), arguments(scene_folder, config, folder))
     assert result.exit_code == 0, result.stderr
@@ -171,7 +171,7 @@ def test_run_benchmark_is_independent_of_workers(
     plan = BenchmarkPlan((scene_folder,), (str(config),), None, ("sensor",), ("colmap",), workers=2)
     records = {r.name: r for r in run_benchmark(plan, tmp_path / "out")}
     assert len(records) == 6
-    # Pairs of the first set contain those of the others, so that its matches are the same.
+    # The first test set contains the image pairs of all test sets, so its matches are the same.
     folder, _, _ = output
     for record in read_records(folder):
         if record.label == "colmap":
@@ -226,7 +226,7 @@ def test_run_methods_survives_crash() -> None:
 
 
 class Deadly:
-    """Ends the process that unpickles it, as a failed assertion in native code does."""
+    """Object whose unpickling ends the process, like a failed assertion in native code."""
 
     def __reduce__(self) -> tuple:
         import os

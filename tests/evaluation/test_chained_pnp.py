@@ -42,6 +42,6 @@ def test_models_convention_counts_all_models() -> None:
         "s", "c", "b", "b-00", "m", "", largest, TRUTH, 4, 0.0, 0.0, others=[other]
     )
     largest_only = (record.errors_deg(CONVENTIONS["paper"]) < 1).sum()
-    assert largest_only == 6  # ordered pairs of three images
+    assert largest_only == 6  # Three images have six ordered pairs.
     assert (record.errors_deg(CONVENTIONS["models"]) < 1).sum() == 8
     assert np.count_nonzero(record.errors_deg(CONVENTIONS["models"]) == 180) == 12

@@ -19,7 +19,7 @@ from mpsfm_core.evaluation.report import ALL_SCENES, build_rows, format_markdown
 def records(
     noise_deg: float, *, sets: int = 8, label: str = "ours", seed: int = 0, scene: str = "room"
 ) -> list[BenchmarkRecord]:
-    """Sets of five cameras whose orientations are off by about ``noise_deg``."""
+    """Return records of five cameras whose orientations have errors of about ``noise_deg``."""
     truth_rng, rng = np.random.default_rng(99), np.random.default_rng(seed)
     made = []
     for number in range(sets):
@@ -55,12 +55,14 @@ def test_compare_benchmarks_equal_sides_are_not_significant() -> None:
 
 
 def test_compare_benchmarks_false_positive_rate() -> None:
-    # Seeds far from those of the other tests; p-values of swaps are uniform for equal sides.
+    # The p-values of the randomization test are uniform for equal benchmarks; the seeds differ from
+    # those of other tests.
     p = [
         difference(records(1.0, seed=k), records(1.0, seed=k + 1), resamples=150).p_value[5]
         for k in range(1000, 1120, 2)
     ]
-    assert np.mean(np.array(p) < 0.05) < 0.13  # 5 % of 60 and 2.8 standard deviations
+    # The limit is 5 % of 60 tests plus 2.8 standard deviations.
+    assert np.mean(np.array(p) < 0.05) < 0.13
     assert 0.3 < np.mean(np.array(p) < 0.5) < 0.7
 
 
@@ -106,7 +108,7 @@ def test_build_rows_pools_errors_and_scenes() -> None:
     assert room.registered == pytest.approx(2 / 3)
     assert room.auc[20] < rows[1].auc[20]
     assert rows[2].sets == 5
-    pooled = (3 * room.auc[5] + 2 * rows[1].auc[5]) / 5  # sets of equal size
+    pooled = (3 * room.auc[5] + 2 * rows[1].auc[5]) / 5  # All test sets have equal size.
     assert rows[2].auc[5] == pytest.approx(pooled)
     text = format_markdown(rows)
     assert "### all scenes, configuration `c`" in text and "| 67% | 1.00 | 1 |" in text

@@ -20,7 +20,7 @@ from tests.evaluation.conftest import CAMERA, NAMES
 
 CAMERAS = dict.fromkeys(NAMES, CAMERA)
 SCALE = 0.25
-"""World units are four metres."""
+"""Length of a meter in world units of the reconstruction."""
 NO_POINTS = np.zeros(0, np.int64)
 
 
@@ -30,7 +30,7 @@ def scene(scene_folder: Path) -> SceneFolder:
 
 
 def model(scene: SceneFolder, factor: float = 1.0, images: int = len(NAMES)) -> Reconstruction:
-    """The truth in other units, its depth off by a factor."""
+    """Return a reconstruction with true poses in world units, and depth with a factor as error."""
     assert scene.depth is not None
     registered = []
     for index, name in enumerate(NAMES[:images]):

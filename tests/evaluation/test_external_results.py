@@ -27,7 +27,7 @@ def scene_of(model: pycolmap.Reconstruction, path: Path) -> SceneFolder:
 
 
 def moved(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """The same in another world and unit, as any program is free to choose."""
+    """Transform poses to another world frame and unit, which programs choose freely."""
     copy = pycolmap.Reconstruction(model)
     turn = pycolmap.Rotation3d(np.array([0.1, 0.2, 0.3]))
     copy.transform(pycolmap.Sim3d(2.5, turn, np.array([1.0, 2, 3])))

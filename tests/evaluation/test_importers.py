@@ -1,6 +1,6 @@
-"""Each importer on a miniature folder in the layout of its dataset.
+"""Tests of each importer on a miniature folder in the layout of its dataset.
 
-Two or three cameras look at a plane 2 m away, so that every pixel's depth is known.
+Two or three cameras view a plane at a distance of 2 m, so that the depth of every pixel is known.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ def check_poses(scene: SceneFolder, names: list[str]) -> None:
 
 
 def cameras(scene: SceneFolder) -> list[list[float]]:
-    """Parameters of the undistorted cameras as the pipeline reads them."""
+    """Return the undistorted camera parameters that the pipeline reads from a scene folder."""
     return [i.pinhole.params.tolist() for i in load_images(scene.images, scene.intrinsics)]
 
 
 def model(
     folder: Path, names: list[str], camera: pycolmap.Camera, *, points: bool = True
 ) -> pycolmap.Reconstruction:
-    """A model of the cameras above that observe four points of the plane z = 2."""
+    """Write a COLMAP model whose images observe four points of the plane z = 2."""
     result = pycolmap.Reconstruction()
     result.add_camera_with_trivial_rig(camera)
     world = np.array([[0.1, 0.1, 2.0], [-0.2, 0.1, 2.0], [0.2, -0.1, 2.0], [0, 0, 2.2]])
@@ -75,8 +75,8 @@ def eth3d(source: Path) -> None:
         model="PINHOLE", width=64, height=48, params=[60, 61, 31, 25], camera_id=1
     )
     model(source / "dslr_calibration_undistorted", names, undistorted)
-    # The original photos are larger and distorted; their depth is that of the plane z = 2 in the
-    # camera's frame, but for the scanner's blind left fifth.
+    # The original images are larger and distorted. Their depth is 2 m, unknown in the left fifth,
+    # which the scanner does not see.
     original = pycolmap.Camera(
         model="THIN_PRISM_FISHEYE",
         width=80,
@@ -104,7 +104,7 @@ def test_eth3d(tmp_path: Path) -> None:
     depth = read_depth(scene.path / "gt_depth" / "DSC_0287.png")
     assert depth.shape == (48, 64)
     assert set(np.unique(depth)) == {0.0, 2.0}
-    # Column 16 of the original is where the scanner began to see.
+    # Column 16 of the original image is the first column with depth.
     original = pycolmap.Camera(
         model="THIN_PRISM_FISHEYE",
         width=80,
@@ -200,7 +200,7 @@ def realestate_lines() -> list[str]:
 @pytest.mark.parametrize("inside", [True, False])
 def test_realestate10k(tmp_path: Path, inside: bool) -> None:
     source = tmp_path / "0a3b5fb184936a83"
-    for stamp in (50050000, 50083000):  # the third frame was not cut out
+    for stamp in (50050000, 50083000):  # The third frame has no image file.
         photo(source / f"{stamp}.png", (64, 36))
     file = (source if inside else tmp_path) / f"{source.name}.txt"
     file.write_text("\n".join(realestate_lines()) + "\n")
@@ -259,7 +259,8 @@ def test_scannet(tmp_path: Path) -> None:
     assert cameras(scene)[0] == [110, 110, 65, 48.5]
     depth = read_depth(scene.path / "gt_depth" / "000001.png")
     assert depth.shape == (97, 130)
-    # Twice the focal length: column 8 of the depth camera is column 65 + 2 * (8 - 32) of the photo.
+    # The image has twice the focal length, so column 8 of the depth camera is column 65 + 2 * (8 -
+    # 32) of the image.
     known = np.flatnonzero(depth[48] > 0)
     assert known.min() in (16, 17, 18) and (depth[48, known] == 2).all()
 

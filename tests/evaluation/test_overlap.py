@@ -1,4 +1,4 @@
-"""Tests of overlap on constructed scenes and on a shared scene."""
+"""Tests of image overlap on constructed scenes and on a dataset scene."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CAMERA = PinholeCamera(100, 50, 50.0, 50.0, 50.0, 25.0)
 
 
 def wall(*shifts: float, depth: float = 2.0):
-    """Cameras side by side before a wall: each metre to the right hides a quarter of the view."""
+    """Return cameras in a row in front of a wall, with an overlap loss of a quarter per meter."""
     names = [f"{k}" for k in range(len(shifts))]
     poses = {n: (np.eye(3), np.array([-s, 0.0, 0.0])) for n, s in zip(names, shifts, strict=True)}
     cameras = dict.fromkeys(names, CAMERA)
@@ -39,8 +39,8 @@ def test_overlap_of_cameras_in_front_of_wall() -> None:
 
 
 def test_overlap_uses_minimum_of_pair_and_maximum_of_triplet() -> None:
-    # The second camera stands twice as far from the wall: it sees all the first does, and four
-    # times as much.
+    # The second camera is twice as far from the wall, so it sees four times the area of the first
+    # camera.
     names, poses, cameras, flat = wall(0.0, 0.0, 1.0)
     poses["1"] = (np.eye(3), np.array([0.0, 0.0, 2.0]))
     depth = {"0": flat, "1": 2 * flat, "2": flat}
@@ -52,7 +52,7 @@ def test_overlap_uses_minimum_of_pair_and_maximum_of_triplet() -> None:
 def test_overlap_ignores_occluded_and_unknown_depth() -> None:
     names, poses, cameras, flat = wall(0.0, 0.0)
     near, holes = flat.copy(), flat.copy()
-    near[:, :50] = 1.0  # something stands before the left half
+    near[:, :50] = 1.0  # An object covers the left half.
     overlap = overlap_from_depth(names, poses, cameras, {"0": flat, "1": near}.__getitem__)
     assert overlap.two_view[0, 1] == pytest.approx(0.5, abs=0.02)
     holes[:, :50] = 0.0
@@ -84,7 +84,8 @@ def test_overlap_from_model_points() -> None:
     np.testing.assert_array_equal(overlap.counts, [4, 8, 2])
     expected = [[1, 2 / 8, 1 / 4], [2 / 8, 1, 2 / 8], [1 / 4, 2 / 8, 1]]
     np.testing.assert_allclose(overlap.two_view, expected)
-    assert overlap.three_view(0, 1, 2) == 0.5  # point 3, one of two of the third image
+    # All images see point 3, one of two points of the third image.
+    assert overlap.three_view(0, 1, 2) == 0.5
 
 
 @pytest.mark.slow

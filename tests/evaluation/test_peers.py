@@ -38,7 +38,7 @@ def test_write_database_contains_problem(problem: MappingProblem, tmp_path) -> N
         pair = problem.pairs[0]
         geometry = database.read_two_view_geometry(pair.image_a + 1, pair.image_b + 1)
         np.testing.assert_array_equal(geometry.inlier_matches, pair.matches)
-        # x_b^T F x_a = 0 for all matches of exact geometry, up to the keypoints' noise
+        # Exact geometry satisfies x_b^T F x_a = 0 for all matches up to keypoint noise.
         a = problem.images[pair.image_a].keypoints[pair.matches[:, 0]]
         b = problem.images[pair.image_b].keypoints[pair.matches[:, 1]]
         lines = np.column_stack([a, np.ones(len(a))]) @ np.asarray(geometry.F).T
@@ -48,7 +48,7 @@ def test_write_database_contains_problem(problem: MappingProblem, tmp_path) -> N
 
 @pytest.mark.parametrize("name", PEERS)
 def test_run_peer_reconstructs_easy_scene(name: str, problem: MappingProblem) -> None:
-    with limit_threads(1):  # the same model every time
+    with limit_threads(1):  # COLMAP is deterministic with one thread.
         (estimated,) = run_peer(name, problem)
     truth = {f"view_{i}.png": (pose[:, :3], pose[:, 3]) for i, pose in enumerate(POSES)}
     errors = pose_errors_deg(estimated, truth, CONVENTIONS["paper"])

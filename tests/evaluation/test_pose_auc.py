@@ -33,7 +33,7 @@ def random_poses(rng: np.random.Generator, count: int) -> dict[str, Pose]:
 
 
 def disturbed(rng: np.random.Generator, truth: dict[str, Pose]) -> dict[str, Pose]:
-    """Poses with errors of 0.1 to 50 degrees in another similarity frame, some missing."""
+    """Return poses with errors of 0.1 to 50 degrees in another frame; some are missing."""
     frame, scale = Rotation.random(rng=rng).as_matrix(), rng.uniform(0.1, 10)
     poses = {}
     for name, (rotation, translation) in truth.items():
@@ -48,7 +48,7 @@ def disturbed(rng: np.random.Generator, truth: dict[str, Pose]) -> dict[str, Pos
 def independent_errors(
     estimated: dict[str, Pose], truth: dict[str, Pose], ordered: bool, folded: bool
 ) -> list[float]:
-    """The definition word by word, pair by pair, on 4 x 4 matrices and quaternions."""
+    """Compute pose errors independently, for each pair with 4 x 4 matrices and quaternions."""
 
     def matrix(pose: Pose) -> np.ndarray:
         return np.block([[pose[0], pose[1][:, None]], [np.zeros((1, 3)), np.ones((1, 1))]])
@@ -72,7 +72,7 @@ def independent_errors(
 
 
 def independent_exact(errors: list[float], threshold: int) -> float:
-    """The integral of the step function, segment by segment."""
+    """Integrate the recall curve, a step function, segment by segment."""
     edges = [0.0, *sorted(e for e in errors if e < threshold), float(threshold)]
     recalls = [sum(e <= left for e in errors) / len(errors) for left in edges[:-1]]
     areas = [r * (b - a) for r, a, b in zip(recalls, edges[:-1], edges[1:], strict=True)]
@@ -80,7 +80,7 @@ def independent_exact(errors: list[float], threshold: int) -> float:
 
 
 def independent_interpolated(errors: list[float], threshold: int) -> float:
-    """Trapezoids as COLMAP's benchmark script takes them."""
+    """Integrate the recall curve by trapezoids like COLMAP's benchmark script."""
     xs, ys = [0.0], [0.0]
     for rank, error in enumerate(sorted(errors)):
         if error <= threshold:
@@ -119,15 +119,16 @@ def test_pose_auc_matches_independent_implementation(convention, area) -> None:
 
 
 def test_pose_errors_match_hand_computed_case() -> None:
-    # Three cameras in a row, 1 m apart, all looking along z. The third is turned by 2 degrees
-    # about y around its own centre; the second is moved 1 m forward instead of 1 m to the right.
+    # Three cameras in a row with a distance of 1 m look along z. The estimated third camera is
+    # rotated by 2 degrees about y. The estimated second camera is 1 m in front of the first instead
+    # of 1 m to the right.
     truth = {name: rotated_y(0, (x, 0, 0)) for x, name in enumerate("abc")}
     estimated = dict(truth, b=rotated_y(0, (0, 0, 1)), c=rotated_y(2, (2, 0, 0)))
     errors = pose_errors_deg(estimated, truth, PAPER)
-    # b as seen from a lies forward instead of right: 90 degrees, both ways. Between a and c the
-    # rotation is off by 2 degrees; so is the direction to a in the turned frame of c. Between b
-    # and c the baseline is (2, 0, -1) in place of (1, 0, 0): off by atan(1/2) in the frame of b,
-    # and by 2 degrees more in the turned frame of c.
+    # The direction between a and b has an error of 90 degrees in both orders. The rotation between
+    # a and c has an error of 2 degrees, and so has the direction to a in the frame of c. The
+    # baseline between b and c is (2, 0, -1) instead of (1, 0, 0). Its error is atan(1/2) in the
+    # frame of b, and 2 degrees more in the frame of c.
     tilt = np.degrees(np.arctan(0.5))
     expected = {"ab": 90, "ac": 2, "ba": 90, "bc": tilt + 2, "ca": 2, "cb": tilt}
     assert errors == pytest.approx(list(expected.values()), abs=1e-9)
@@ -140,9 +141,9 @@ def test_pose_errors_match_hand_computed_case() -> None:
 def test_areas_match_hand_computed_values() -> None:
     errors = np.array([0.5, 1.0, 1.5, 2.0, 180.0])
     assert exact_area(errors, 2) == pytest.approx((1.5 + 1.0 + 0.5 + 0.0) / 5 / 2)
-    # Triangle and trapezoids: 0.05 + 0.15 + 0.25 + 0.35 = 0.8, over 2 degrees.
+    # The triangle and trapezoids have the area 0.05 + 0.15 + 0.25 + 0.35 = 0.8 over 2 degrees.
     assert interpolated_area(errors, 2) == pytest.approx(0.4)
-    # Recall below 1 degree: 0.2; up to 2 degrees: 0.8.
+    # The recall is 0.2 below 1 degree and 0.8 up to 2 degrees.
     assert histogram_area(errors, 2) == pytest.approx((0.2 + 0.8) / 2)
 
 

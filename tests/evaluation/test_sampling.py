@@ -24,7 +24,7 @@ from tests.evaluation.test_overlap import wall
 
 @pytest.fixture(scope="module")
 def overlap() -> Overlap:
-    """Thirty cameras along a wall at uneven distances."""
+    """Return the overlap of thirty cameras along a wall at irregular distances."""
     shifts = np.cumsum(np.random.default_rng(5).uniform(0.4, 1.4, 30))
     names, poses, cameras, flat = wall(*shifts)
     return overlap_from_depth(names, poses, cameras, lambda _: flat)

@@ -25,7 +25,7 @@ def test_read_scene_returns_sets_and_poses(scene_folder: Path) -> None:
     rotation, translation = scene.truth["0003.png"]
     np.testing.assert_allclose(np.column_stack([rotation, translation]), POSES[3], atol=1e-9)
     assert scene.depth == scene_folder / "gt_depth"
-    assert scene.intrinsics == scene_folder / "gt"  # there is no intrinsics.yaml
+    assert scene.intrinsics == scene_folder / "gt"  # The scene folder has no intrinsics.yaml.
 
 
 def test_select_sets_by_bucket_and_group(scene_folder: Path) -> None:

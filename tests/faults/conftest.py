@@ -1,4 +1,4 @@
-"""Fixtures: a small scene, and a process that reconstructs it under faults."""
+"""Fixtures: a small scene, and a process that reconstructs the scene under injected faults."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ runtime: {{workers: 1, checkpoint_s: 0, cache_dir: {cache}}}
 
 @dataclass
 class Scene:
-    """Reconstructions of three photos, into a folder that has earlier results in it."""
+    """Scene of three photos whose output folder contains earlier results."""
 
     folder: Path
     process: Any
@@ -45,7 +45,7 @@ class Scene:
 
     @property
     def work(self) -> Path:
-        """Below it calls are counted: the cache and the output."""
+        """Folder of the cache and the output, in which system calls are counted."""
         return self.folder / "work"
 
     @property
@@ -53,7 +53,7 @@ class Scene:
         return self.work / "out"
 
     def reset(self) -> None:
-        """Earlier results, an empty cache."""
+        """Restore the earlier results and an empty cache."""
         shutil.rmtree(self.work, ignore_errors=True)
         (self.output / "sparse").mkdir(parents=True)
         (self.output / "sparse" / "images.bin").write_text("an earlier model")
@@ -73,19 +73,19 @@ class Scene:
         }
 
     def run(self, **further: Any) -> dict[str, Any]:
-        """One run; ``number`` says which call is struck, ``errno`` how (0: SIGKILL)."""
+        """Run once with a fault ``errno`` (0 for SIGKILL) at the system call ``number``."""
         self.process.stdin.write(json.dumps(self.request(**further)) + "\n")
         self.process.stdin.flush()
         return dict(json.loads(self.process.stdout.readline()))
 
     def leftovers(self) -> list[str]:
-        """Return leftovers: scratch folders, unfinished files and checkpoints."""
+        """Return the temporary folders, unfinished files and checkpoints of earlier runs."""
         paths = [p for p in self.work.rglob("*") if p.name.startswith(".")]
         paths += [p for p in (self.work / "cache" / "mapping").rglob("*") if p.is_file()]
         return [str(path.relative_to(self.work)) for path in paths]
 
     def age(self) -> None:
-        """Let unfinished files be older than those that a living writer may have."""
+        """Set the time of unfinished files so far back that no running process can own them."""
         for path in self.work.rglob("*.tmp"):
             os.utime(path, (0, 0))
 

@@ -16,7 +16,7 @@ import cv2
 from mpsfm_core.data.errors import MpsfmError
 
 LIMIT_S = 10
-"""A file that keeps a reader busy for longer, in time of the processor, hangs it."""
+"""Maximum CPU time in seconds of a reader for a file; a longer time counts as a hang."""
 MEMORY = 1 << 30
 """Maximum bytes that a reader may allocate for a file of some kilobytes."""
 
@@ -40,13 +40,13 @@ _TOKENS = (
 )
 
 WELL_FORMED = -1
-"""The case that is the file itself: it must be read, a refusal is a fault."""
+"""Number of the case with the unmutated file, which the reader must accept."""
 
 Reader = Callable[[Path], object]
 
 
 def mutated(data: bytes, rng: random.Random) -> bytes:
-    """A file that differs in a few places: cut, overwritten, repeated, or with foreign tokens."""
+    """Mutate a file: truncate, overwrite, repeat or delete bytes, or insert tokens."""
     kind = rng.randrange(6)
     if kind == 0:
         return data[: rng.randrange(len(data) + 1)]
@@ -69,11 +69,12 @@ def mutated(data: bytes, rng: random.Random) -> bytes:
 
 
 def failures(reader: Reader, name: str, seed: bytes, numbers: range) -> Iterator[str]:
-    """Read mutated copies in a process of its own; a line for each that it does not refuse or
-    read as it should: another exception than ours, its death, a hang, too much memory.
+    """Read mutated files in a subprocess and yield a line for each fault of the reader.
 
-    The process that calls this should not have read with threads just before: one that is about
-    to end can hold a lock of OpenCV when the reader's process is forked, which then never opens.
+    A fault is an exception other than `MpsfmError`, a crash, a hang, or too much memory.
+
+    The calling process should not run OpenCV threads just before. A thread that is about to end can
+    hold a lock of OpenCV during the fork, which blocks the subprocess forever.
     """
     start = numbers.start
     while start < numbers.stop:
@@ -84,7 +85,7 @@ def failures(reader: Reader, name: str, seed: bytes, numbers: range) -> Iterator
 
 
 def case(name: str, seed: bytes, number: int) -> bytes:
-    """The bytes of a numbered case, the same each time."""
+    """Return the bytes of a mutation case, reproducible by its number."""
     if number == WELL_FORMED:
         return seed
     return mutated(seed, random.Random(f"{name} {number}"))
@@ -93,7 +94,7 @@ def case(name: str, seed: bytes, number: int) -> bytes:
 def _in_process(reader: Reader, name: str, seed: bytes, numbers: range):
     receiver, sender = os.pipe()
     threads = cv2.getNumThreads()
-    cv2.setNumThreads(1)  # a child waits forever for threads that OpenCV had before the fork
+    cv2.setNumThreads(1)  # A fork waits forever for the threads that OpenCV had before.
     child = os.fork()
     if child == 0:
         os.close(receiver)
@@ -132,7 +133,7 @@ def _read_all(reader: Reader, name: str, seed: bytes, numbers: range, sender: in
             path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(case(name, seed, number))
             signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
-            signal.alarm(10 * LIMIT_S)  # one that waits for something that never comes
+            signal.alarm(10 * LIMIT_S)  # Wall time limit for a reader that blocks.
             try:
                 reader(path)
             except BaseException as error:

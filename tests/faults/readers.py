@@ -1,4 +1,4 @@
-"""Readers of results, matches, weights and datasets, each with a well-formed file."""
+"""File readers for results, matches, weights and datasets, each with a well-formed file."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ _PHOTOS = ("0.png", "1.png")
 
 Reader = Callable[[Path], object]
 Table = dict[str, tuple[bytes, Reader]]
-"""Path below the folder of a case -> the content of a well-formed file, and what reads it."""
+"""Relative file path -> the content of a well-formed file, and the reader of the file."""
 
 
 def synthetic() -> pycolmap.Reconstruction:
-    """A model of three images and eight points."""
+    """Return a synthetic COLMAP model of three images and eight points."""
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig = 1, 1
@@ -57,7 +57,7 @@ def synthetic() -> pycolmap.Reconstruction:
 
 
 def in_model(*readers: Reader) -> dict[str, Reader]:
-    """Return readers of a folder for each file of a model; the other files are well-formed."""
+    """Return a reader for each file of a COLMAP model, in a folder with well-formed other files."""
 
     def in_folder(text: bool, reader: Reader) -> Reader:
         def read(path: Path) -> None:
@@ -91,7 +91,7 @@ def exported(folder: Path) -> None:
 
 
 def used(folder: Path) -> None:
-    """Read a model like the dense command, the viewers and the sampling of test sets."""
+    """Read a COLMAP model like the dense command, the viewers and the sampling of test sets."""
     model = read_model(folder)
     for image in model.images.values():
         _point_depths(model, image)
@@ -100,7 +100,7 @@ def used(folder: Path) -> None:
 
 
 def model_files(*readers: Reader) -> Table:
-    """Files of COLMAP models, for each of some readers of a folder."""
+    """Return the files of COLMAP models, once for each reader of a model folder."""
     made: dict[str, bytes] = {}
     with tempfile.TemporaryDirectory() as folder:
         synthetic().write_binary(folder)
@@ -110,12 +110,12 @@ def model_files(*readers: Reader) -> Table:
 
 
 def models() -> Table:
-    """Return files of COLMAP models, for every use except poses and intrinsics."""
+    """Return files of COLMAP models for all readers except those of poses and intrinsics."""
     return model_files(exported, used)
 
 
 def results() -> Table:
-    """Files of a result folder, of a cache, and of an interrupted exchange."""
+    """Return files of result folders, of the cache, and of interrupted replacements."""
 
     def beside_golden(name: str, reader: Reader) -> tuple[str, tuple[bytes, Reader]]:
         def read(path: Path) -> None:
@@ -173,7 +173,7 @@ def results() -> Table:
 
 
 def photos_beside(path: Path) -> Path:
-    """A folder of two photos."""
+    """Create a folder of two photos next to the mutated file."""
     folder = path.parent / "photos"
     folder.mkdir(exist_ok=True)
     for name in _PHOTOS:
@@ -216,7 +216,7 @@ def clip(path: Path) -> None:
 
 
 def of_others() -> Table:
-    """Matches, videos and photos of phones."""
+    """Return match files, videos and phone photos with their readers."""
 
     def from_database(path: Path) -> None:
         matches_from_database(path, load_images(photos_beside(path)))
@@ -258,7 +258,7 @@ def of_others() -> Table:
 
 
 def weights() -> Table:
-    """Files of weights, and what another environment's process says."""
+    """Return weight files, and messages of a provider process in another environment."""
     tensors = {"a.weight": torch.ones(3, 4), "b": torch.arange(5)}
     pickled = io.BytesIO()
     torch.save({"model": tensors}, pickled)
@@ -274,7 +274,7 @@ def weights() -> Table:
 
 
 def datasets() -> Table:
-    """Test sets, and texts of public datasets."""
+    """Return test set files, and text files of public datasets."""
 
     def scene(path: Path) -> None:
         shutil.copytree(GOLDEN / "out" / "sparse", path.parent / "gt", dirs_exist_ok=True)
@@ -284,7 +284,7 @@ def datasets() -> Table:
         read_scene(path.parent)
 
     def imported(kind: str, *names: str) -> Reader:
-        """``names``: of the photos; all texts but the one that is read are well-formed."""
+        """Return a reader of a text file in a dataset whose photos have `names`."""
 
         def read(path: Path) -> None:
             source = path.parents[1] if kind == "scannet" else path.parent
@@ -331,7 +331,7 @@ def datasets() -> Table:
 
 
 def made(write: Callable[[Path], None], name: str) -> bytes:
-    """The bytes of a file that needs a path to be written to."""
+    """Return the bytes of a file that `write` writes to a path."""
     with tempfile.TemporaryDirectory() as folder:
         write(Path(folder) / name)
         return (Path(folder) / name).read_bytes()

@@ -1,7 +1,7 @@
-"""Runs a small reconstruction again and again, disturbed in another place each time.
+"""Process that repeats a small reconstruction with a fault at a different system call.
 
-A process of its own, with ``failing_calls`` loaded: everything is imported and compiled once, and
-each run is a fork of it. Reads a line of JSON for each run from stdin and answers with one.
+The process loads ``failing_calls``, imports and compiles the package once, and forks for each run.
+The process reads a JSON line with a request from stdin and writes a JSON line with the result.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _LIMIT_S = 120
 
 
 def disturbed(request: dict[str, Any]) -> dict[str, Any]:
-    """Run once in a fork; returns the signal, or the class and message of the error."""
+    """Reconstruct in a fork and return the signal, or the class and message of the error."""
     report = Path(request["report"])
     report.unlink(missing_ok=True)
     child = os.fork()
@@ -57,7 +57,7 @@ def _reconstruct(request: dict[str, Any], report: Path) -> None:
 
 
 def main() -> None:
-    """Answer requests until there are no more; the first warms everything up in this process."""
+    """Answer requests until stdin ends; the first request compiles the kernels before any fork."""
     _reconstruct(json.loads(sys.stdin.readline()), Path(os.devnull))
     sys.stdout.write("ready\n")
     sys.stdout.flush()

@@ -18,20 +18,20 @@ ERRORS = (errno.ENOSPC, errno.EIO, errno.EACCES, errno.EROFS, errno.EMFILE)
 
 
 def points(scene: Scene, count: int, seed: int) -> list[int]:
-    """Calls to strike, spread over all of a run, the same each time."""
+    """Return reproducible system call numbers, spread over a whole run, for injected faults."""
     rng = np.random.default_rng(seed)
     edges = np.linspace(0, scene.calls, count + 1).astype(int)
     return [int(rng.integers(first, max(first + 1, end))) for first, end in pairwise(edges)]
 
 
 def check_intact(scene: Scene, what: object) -> None:
-    """Check that results are old or new, never mixed, and that a partial exchange is marked."""
+    """Check that results are old or new, never mixed, or that a partial replacement is marked."""
     found = content(scene.output)
     scratch = {name for name in found if name.startswith(".mpsfm-")}
     visible = {name: value for name, value in found.items() if name not in scratch}
     assert "notes.txt" in visible
     if any(name.endswith("ready.json") for name in scratch):
-        return  # amid the exchange: the next run finishes it
+        return  # The next run finishes an interrupted replacement.
     assert visible == scene.earlier or is_whole(scene, visible), what
 
 

@@ -1,4 +1,4 @@
-"""Tests that no file can crash, hang or fill the memory of a reader."""
+"""Tests that no malformed file can crash a file reader, block it or exhaust its memory."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def archive(**arrays: Any) -> bytes:
 
 
 def as_photo(path: Path) -> None:
-    """Read a file as one photo of three."""
+    """Read a mutated file as one of three photos."""
     for name in ("a.png", "b.png"):
         (path.parent / name).write_bytes(encoded(".png"))
     found = load_images(path.parent)
@@ -94,7 +94,7 @@ def as_cache_entry(path: Path) -> None:
 
 
 def as_state(path: Path) -> None:
-    """Read a file as a checkpoint of the same problem."""
+    """Read a mutated file as a checkpoint of a mapping problem."""
     deserialize(checkpoints.read_checkpoint(path)[1])
 
 
@@ -135,7 +135,7 @@ _RECORD = json.dumps({
 
 
 def readers(registry: Registry) -> dict[str, tuple[bytes, Callable[[Path], object]]]:
-    """File name -> a well-formed one, and what reads it."""
+    """Return for each file name the content of a well-formed file, and its reader."""
     depth = np.ones((4, 5), np.float32)
     state = serialize(
         {"a": np.arange(20.0), "b": [1, (2, "x")], "f": Features(np.ones((4, 2)), depth)}
@@ -206,7 +206,8 @@ def test_well_formed_files_are_read(tmp_path: Path, registry: Registry) -> None:
         path = tmp_path / name.replace(".", "_") / name
         path.parent.mkdir(parents=True)
         path.write_bytes(data)
-        if name not in ("hashes.json", "record.json"):  # no such download, no such run
+        # The readers ignore unknown downloads and runs.
+        if name not in ("hashes.json", "record.json"):
             reader(path)
 
 
@@ -231,7 +232,7 @@ def test_further_files(table: str) -> None:
 
 
 def test_what_was_found_in_further_files(tmp_path: Path) -> None:
-    """A pair of no images, a summary without times, a model without points, a strange name."""
+    """Test a pair without images, a summary without times, a model without points, and a name."""
     table = of_others()
     path = tmp_path / "a.db"
     path.write_bytes(table["a.db"][0])
@@ -268,7 +269,8 @@ def test_compressed_file_size_is_limited(tmp_path: Path, monkeypatch: pytest.Mon
         read_arrays(path, "depth")
     with pytest.raises(InputError, match="unpacks to 4 MB, 1 at most"):
         read_depth_map(path)
-    np.savez(path, depth=np.zeros((1000, 1000), np.float32))  # is as large as it says
+    # The array has the size that its header declares.
+    np.savez(path, depth=np.zeros((1000, 1000), np.float32))
     assert read_arrays(path, "depth")["depth"].shape == (1000, 1000)
     image = tmp_path / "large.png"
     image.write_bytes(encoded(".png")[:16] + struct.pack(">II", 40_000, 40_000))
@@ -360,13 +362,13 @@ FOUND = {
     "testsets.yaml": [b"[" * 3000], "calibration.yaml": [b"{" * 3000],
     "transforms.json": [b"[" * 100_000], "record.json": [b"[" * 100_000, b"[]", b"1"],
     "hashes.json": [b"", b"{", b"[1]", b'{"a": 1}', b"\xff", b"[" * 100_000],
-    # counts that kept COLMAP busy without end
+    # COLMAP reads these counts without end.
     "poses/points3D.bin": [b"\xff" * 8, b"\x01" + bytes(50) + b"\xff" * 8],
     "poses/frames.bin": [b"\x01" + bytes(71) + b"\xff" * 4],
     "poses/images.bin": [b"\x01" + bytes(7)],
     "state.npz": [b"", b"PK\x05\x06" + bytes(18)],
 }  # fmt: skip
-"""What mutation found, or what it led to."""
+"""Malformed contents that crashed or blocked a reader in the past."""
 
 
 @pytest.mark.parametrize("name", FOUND)

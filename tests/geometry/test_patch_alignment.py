@@ -30,12 +30,12 @@ def pixels() -> np.ndarray:
 
 
 def warp_pixels(xy: np.ndarray) -> np.ndarray:
-    """Map pixels (..., 2) of the template to the other image."""
+    """Map pixels (..., 2) of the template to the searched image."""
     return (xy - CENTER) @ WARP.T + CENTER + MOVED
 
 
 def searched(seed: int = 0, noise: float = 0.0) -> np.ndarray:
-    """Render the warped texture with other brightness and contrast."""
+    """Render the warped texture with changed brightness and contrast."""
     back = (pixels() - CENTER - MOVED) @ np.linalg.inv(WARP).T + CENTER
     image = 0.7 * texture(seed, back) + 20
     white = np.random.default_rng(1).normal(0, noise, image.shape)
@@ -45,7 +45,7 @@ def searched(seed: int = 0, noise: float = 0.0) -> np.ndarray:
 def align_texture(
     image: np.ndarray, off: np.ndarray | float = 0.0, count: int = 200, radius: int = RADIUS
 ) -> tuple[PatchAlignment, np.ndarray]:
-    """Align patches from positions that are `off` pixels wrong, and return the residuals too."""
+    """Align patches from positions with an error of `off` pixels, and return final errors."""
     template = texture(0, pixels()).astype(np.float32)
     at = np.random.default_rng(2).uniform(40, 160, (count, 2))
     start = warp_pixels(at) + off
@@ -66,11 +66,13 @@ def test_align_patches_other_brightness_recovers_shift_and_warp() -> None:
 def test_align_patches_noise_gives_calibrated_covariance() -> None:
     found, residual = align_texture(searched(noise=8.0), off=0.5, count=1000)
     squared = np.einsum("ni,nij,nj->n", residual, np.linalg.inv(found.covariance), residual)
-    assert 1.0 < np.median(squared) < 2.8  # 1.39 is the median of chi squared with two freedoms
+    # The median of a chi-squared distribution with two degrees of freedom is 1.39.
+    assert 1.0 < np.median(squared) < 2.8
 
 
 def test_align_patches_other_texture_has_low_correlation() -> None:
-    found, _ = align_texture(searched(seed=7), radius=13)  # as many samples as 17 x 17 pixels
+    # The patch has as many samples as 17 x 17 pixels.
+    found, _ = align_texture(searched(seed=7), radius=13)
     assert np.median(found.correlation) < 0.6
     assert (found.correlation > 0.8).mean() < 0.02
 
