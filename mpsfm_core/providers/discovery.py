@@ -93,8 +93,8 @@ def crashing_plugins(timeout_s: float) -> set[tuple[str, str]]:
     """Find the plugins that crash the process in which they are loaded.
 
     A child process prints the name of each entry point before loading the plugin. If the child
-    process crashes, the last printed entry point is the cause. The search continues without this
-    plugin.
+    process crashes, the last printed entry point is the cause. The search for crashing plugins then
+    continues without this plugin.
 
     Args:
         timeout_s: Time limit for loading each plugin.
@@ -150,7 +150,7 @@ def inspect_plugin(module: object, name: str, distribution: str, version: str) -
     """Collect the providers and hooks of an imported plugin module.
 
     Args:
-        module: Module or object with hook implementations.
+        module: Plugin module, or object with hook implementations.
         name: Name of the plugin's entry point.
         distribution: Name of the plugin's distribution package.
         version: Version of the plugin's distribution package.
@@ -160,7 +160,7 @@ def inspect_plugin(module: object, name: str, distribution: str, version: str) -
 
     Raises:
         TypeError: The object implements no hook, or ``mpsfm_providers`` does not return a list.
-        Exception: Any exception of the plugin's ``mpsfm_providers``.
+        Exception: Any exception that the plugin's ``mpsfm_providers`` raises.
     """
     manager = create_plugin_manager()
     manager.register(module, name)

@@ -116,7 +116,7 @@ class DepthProvider(Protocol):
         Returns:
             Depth (h, w) float32 along the optical axis, in meters if ``metric``, else in a unit of
             its own. Optional variance (h, w) float32 in the squared unit of depth. Validity (h, w)
-            bool. The map covers the view and may have any resolution.
+            bool of the depth. The map covers the view and may have any resolution.
         """
         ...
 
@@ -168,8 +168,8 @@ class NormalsProvider(Protocol):
 
         Returns:
             Unit normals (h, w, 3) float32 in the camera frame that face the camera. Optional
-            variance (h, w) float32 of the angle in rad^2. Validity (h, w) bool. The map covers the
-            view and may have any resolution.
+            variance (h, w) float32 of the angle in rad^2. Validity (h, w) bool of the normals. The
+            map covers the view and may have any resolution.
         """
         ...
 
@@ -205,8 +205,8 @@ class FeatureProvider(Protocol):
 
         Returns:
             Keypoints (n, 2) float64 in pixels of the view, not of a resized image. Descriptors (n,
-            d) float32 with the same d for every view. Optional scores and scales (n,) float32.
-            ``std_px`` is the standard deviation of a keypoint in pixels.
+            d) float32 with the same d for every view. Optional detection scores and scales in
+            pixels, (n,) float32. ``std_px`` is the standard deviation of a keypoint in pixels.
         """
         ...
 
@@ -285,7 +285,7 @@ class Executor(Protocol):
         started.
 
         Args:
-            step: Picklable function of one item.
+            step: Picklable function that processes one item.
             items: Picklable arguments of ``step``.
 
         Yields:
@@ -310,8 +310,8 @@ PROTOCOLS: dict[Kind, type] = {
     "retrieval": RetrievalProvider,
     "mask": MaskProvider,
 }
-"""Protocol class of each provider kind. A wrapper has no protocol of its own and implements that of
-its inner provider."""
+"""Protocol class of each provider kind. A wrapper has no protocol of its own and implements the
+protocol of the wrapped provider."""
 
 
 CAPABILITY_METHODS: dict[Capability, str] = {
@@ -335,7 +335,7 @@ def require_features(
         Both feature sets.
 
     Raises:
-        ProviderError: One of the feature sets is None.
+        ProviderError: One of the two feature sets is None.
     """
     if features_a is None or features_b is None:
         raise ProviderError(f"{purpose}: choose a features provider")
@@ -352,7 +352,7 @@ class WeightsFile:
     """Expected SHA-256 in hex. With None the hash of the first download is recorded
     and compared later."""
     license: str = "unknown"
-    """License of the weights: SPDX identifier or a short text."""
+    """License of the weights as SPDX identifier or short text."""
     size: int | None = None
     """Size of the file in bytes, shown before a download; None if unknown."""
 
@@ -394,7 +394,7 @@ class ModelExport:
     commit: str
     """Git commit of the authors' code with which the export was tested."""
     license: str
-    """License of the authors' weights: SPDX identifier or a short text."""
+    """License of the authors' weights as SPDX identifier or short text."""
     packages: tuple[str, ...] = ()
     """Python packages that the authors' code needs in addition to torch and onnx."""
 
@@ -427,9 +427,9 @@ class ProviderSpec:
     install_hint: str = ""
     """Command that installs the packages in ``requires``."""
     code_license: str = "unknown"
-    """License of the code: SPDX identifier or short text."""
+    """License of the provider's code as SPDX identifier or short text."""
     weights_license: str = "none"
-    """License of the weights: SPDX identifier or short text."""
+    """License of the provider's weights as SPDX identifier or short text."""
     weights: tuple[WeightsFile, ...] | Callable[[Any], tuple[WeightsFile, ...]] = ()
     """Weights files of the provider, or a function from its options to the files. A run finds or
     downloads the weights files before reading the first image."""
@@ -455,7 +455,7 @@ class ExportFormat:
     name: str
     """Name of the format on the command line."""
     description: str
-    """One-line description of the format for users."""
+    """One-line description of the export format for users."""
     entries: tuple[str, ...]
     """Files and folders that the exporter writes into the output folder."""
     write: str | Callable[[Any, Path], None]
@@ -494,7 +494,7 @@ class Hooks:
         The run matches the pairs that the filters of all plugins select.
 
         Args:
-            pairs: Pairs of image names.
+            pairs: Candidate pairs of image names.
 
         Returns:
             Selected pairs of image names, a subset of ``pairs``.

@@ -1,6 +1,6 @@
 """Registry of providers: availability, options, weights, calibration and construction.
 
-A :class:`Registry` is an ordinary object. The pipeline creates a registry with
+A :class:`Registry` is an ordinary object and no singleton. The pipeline creates a registry with
 :meth:`Registry.discover` and passes the registry on.
 """
 
@@ -157,7 +157,7 @@ class Registry:
         """Register a plugin of this process that has no entry point.
 
         Args:
-            plugin: Module or object with ``@hookimpl`` functions.
+            plugin: Plugin module, or object with ``@hookimpl`` functions.
             name: Name of the plugin, by default the name of ``plugin``.
             distribution: Name of the distribution package, shown in lists.
             version: Version of the distribution package, shown in lists.

@@ -2,9 +2,9 @@
 
 ``run_*`` calls a provider and validates its return value. Any failure of a provider becomes one
 :class:`~mpsfm_core.data.errors.MpsfmError` that names provider and image. ``validate_*`` only
-validates a given return value. The data types validate themselves on construction. This module
-validates them again, because arrays are mutable. It also compares them with the view and with the
-capabilities of the specification.
+validates a given return value. The data types validate themselves on construction. The validators
+check these types again, because arrays are mutable. The validators also compare the return value
+with the view and with the capabilities of the specification.
 """
 
 from __future__ import annotations
@@ -149,8 +149,8 @@ def validate_depth(spec: ProviderSpec, view: View, output: object) -> DepthPrior
         The prior.
 
     Raises:
-        ProviderOutputError: The result violates a rule. The message names provider, image, field
-            and rule.
+        ProviderOutputError: The return value violates a rule of the interface. The message names
+            provider, image, field and rule.
     """
     with _name_violations(spec, view.name):
         return _check_depth(spec, output, "depth")
@@ -168,8 +168,8 @@ def validate_normals(spec: ProviderSpec, view: View, output: object) -> NormalPr
         The prior.
 
     Raises:
-        ProviderOutputError: The result violates a rule. The message names provider, image, field
-            and rule.
+        ProviderOutputError: The return value violates a rule of the interface. The message names
+            provider, image, field and rule.
     """
     with _name_violations(spec, view.name):
         prior = _revalidate(output, NormalPrior, "normals")
@@ -197,8 +197,8 @@ def validate_multiview(spec: ProviderSpec, views: Sequence[View], output: object
         The group prior.
 
     Raises:
-        ProviderOutputError: The result violates a rule. The message names provider, images, field
-            and rule.
+        ProviderOutputError: The return value violates a rule of the interface. The message names
+            provider, images, field and rule.
     """
     with _name_violations(spec, _group_name(views)):
         group = _revalidate(output, MultiViewPrior, "output")
@@ -226,8 +226,8 @@ def validate_features(spec: ProviderSpec, view: View, output: object) -> Feature
         The features.
 
     Raises:
-        ProviderOutputError: The result violates a rule. The message names provider, image, field
-            and rule.
+        ProviderOutputError: The return value violates a rule of the interface. The message names
+            provider, image, field and rule.
     """
     with _name_violations(spec, view.name):
         features = _revalidate(output, Features, "features")
@@ -276,7 +276,7 @@ def validate_matches(
 
 
 def validate_retrieval(spec: ProviderSpec, view: View, output: object) -> Float32:
-    """Validate a global descriptor: (d,) float32, finite, d > 0.
+    """Validate a global descriptor, which is (d,) float32, finite, with d > 0.
 
     Args:
         spec: Specification of the provider.
@@ -287,8 +287,8 @@ def validate_retrieval(spec: ProviderSpec, view: View, output: object) -> Float3
         The descriptor.
 
     Raises:
-        ProviderOutputError: The result violates a rule. The message names provider, image, field
-            and rule.
+        ProviderOutputError: The return value violates a rule of the interface. The message names
+            provider, image, field and rule.
     """
     with _name_violations(spec, view.name):
         vector = _require_array(output, "descriptor", np.dtype(np.float32), 1)
@@ -310,8 +310,8 @@ def validate_mask(spec: ProviderSpec, view: View, output: object) -> Bool:
         The mask.
 
     Raises:
-        ProviderOutputError: The result violates a rule. The message names provider, image, field
-            and rule.
+        ProviderOutputError: The return value violates a rule of the interface. The message names
+            provider, image, field and rule.
     """
     with _name_violations(spec, view.name):
         mask = _require_array(output, "mask", np.dtype(np.bool_), 2)
@@ -336,7 +336,7 @@ def validate_filtered_pairs(
 
     Raises:
         TypeError: The return value is not an iterable of pairs of image names.
-        ValueError: The plugin returns pairs, but none of them is a candidate.
+        ValueError: The plugin returns pairs, but no returned pair is a candidate.
     """
     if not isinstance(answer, Iterable):
         raise TypeError(f"must return pairs of image names, got {_type(answer)}")

@@ -14,8 +14,8 @@ URI                                    Meaning
 Interrupted downloads continue. A weights file appears in the cache only when the file is complete
 and verified. The SHA-256 of the file is compared with the hash that the plugin or the user gives.
 Without a given hash, the hash of the first download is recorded in ``hashes.json`` of the cache.
-Later files with another hash are rejected. Files in the cache of huggingface_hub are verified in
-the same way and not copied. No code of a weights file is ever executed.
+Later downloads with another hash are rejected. Files in the cache of huggingface_hub are verified
+in the same way and not copied. No code of a weights file is ever executed.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ class WeightStore:
             sha256: Expected SHA-256 in hex, or None.
 
         Returns:
-            Local path of the weights file.
+            Verified local path of the weights file.
 
         Raises:
             WeightsError: The file is missing, cannot be downloaded, must not be downloaded
@@ -172,7 +172,7 @@ class WeightStore:
             sha256: Expected SHA-256 in hex; None uses the hash that was recorded at the download.
 
         Returns:
-            SHA-256 of the file.
+            SHA-256 of the weights file in hex.
 
         Raises:
             WeightsError: The file is not on this machine or has another hash.
@@ -306,7 +306,7 @@ def load_torch_state(path: Path) -> dict[str, Any]:
     containers (``weights_only``), so that a file cannot run code.
 
     Args:
-        path: Path of the file.
+        path: Path of the weights file.
 
     Returns:
         Tensors by name.

@@ -1,7 +1,7 @@
 """Comparison of a provider's output with the ground truth, for each kind of provider.
 
-Each tolerance is several times the error of a correct provider on the synthetic views, and several
-times below the error of the mistakes that it detects.
+Each tolerance is several times larger than the error of a correct provider on synthetic views, and
+several times smaller than the error of the mistakes to detect.
 """
 
 from __future__ import annotations
@@ -87,12 +87,12 @@ def require_small_shift(
 
     Args:
         case: Provider under test.
-        example: Synthetic view that the map belongs to.
+        example: Synthetic view that shows the true content of the map.
         shift: Estimated shift.
-        shape: Height and width of the map.
+        shape: Height and width of the depth or normal map.
 
     Returns:
-        Remark with the measured shift.
+        Remark with the measured shift in pixels.
 
     Raises:
         CheckFailed: The shift exceeds :data:`SHIFT_TOLERANCE_PX`.

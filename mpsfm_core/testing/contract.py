@@ -54,8 +54,7 @@ CHECKS_BY_KIND: Mapping[Kind, tuple[Check, ...]] = MappingProxyType(
 """Contract checks of each provider kind, in addition to the common ones."""
 
 REQUIRED: tuple[Check, ...] = (check_specification, check_construction, check_output_rules)
-"""Checks without which the results of all later checks mean nothing; if one of them fails, later
-checks are skipped."""
+"""Checks that all later checks rely on; if one of these checks fails, later checks are skipped."""
 
 
 @dataclass(frozen=True)

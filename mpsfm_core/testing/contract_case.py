@@ -67,8 +67,8 @@ class ContractSetup:
     """Function that is called with each synthetic view before the provider runs on the view, for
     instance to write a file."""
     expected_failures: Mapping[str, str] = field(default_factory=dict)
-    """Reason of each known failure, by check id. A check with a reason fails if the provider passes
-    it."""
+    """Reason of each known failure, by check id. A check that is listed as a known failure fails if
+    the provider passes the check."""
 
     def __post_init__(self) -> None:
         if self.truth_source == "prepared" and self.prepare is None:
@@ -133,7 +133,7 @@ class ContractCase:
         return capability in self.spec.capabilities
 
     def require_truth(self, *sources: TruthSource) -> None:
-        """Skip the check unless the ground truth comes from one of these sources.
+        """Skip the check unless the ground truth comes from one of the given sources.
 
         Raises:
             CheckSkipped: The provider has another source of the ground truth, or none.
@@ -276,8 +276,8 @@ class ContractCase:
     def _validated_spec(self) -> ProviderSpec:
         """Specification from which the validator reads the capabilities.
 
-        A wrapper need not have the capabilities of its inner provider in this specification;
-        separate checks cover them.
+        The specification omits the capabilities of the wrapped provider, because separate checks
+        test what a wrapper keeps.
         """
         if self._ground_truth is None:
             return self.spec

@@ -46,7 +46,7 @@ class TrueMaps:
     """Mask (h, w), True where there is a surface."""
     smooth: Bool
     """Mask (h, w), True where the surface continues for two pixels in all directions and is not
-    seen at a grazing angle. Interpolation causes no large error in these pixels."""
+    seen at a grazing angle. Interpolation of a map causes no large error in smooth pixels."""
     edge_free: Bool
     """Mask (h, w), True where all pixels up to two away have the same value of ``valid``."""
 

@@ -32,7 +32,7 @@ def measure_usage(run: Callable[[], object], count: int) -> Iterator[ProcessUsag
         count: Number of calls.
 
     Yields:
-        Resources of the process after each call.
+        Resources of this process after each call.
     """
     process = psutil.Process()
     for _ in range(count):

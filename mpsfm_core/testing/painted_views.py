@@ -62,8 +62,9 @@ def decoder() -> tuple[Float64, Float64]:
     """Return weights and bias of the affine layer that decodes a painted pixel.
 
     Returns:
-        Weights (4, 3) and bias (4,). The product ``weights @ rgb + bias`` for RGB from 0 to 255 is
-        ``(depth, p, q, -1)``: depth in meters and a normal that is not normalized.
+        Weights (4, 3) and bias (4,) of the affine decoder. The product ``weights @ rgb + bias`` for
+        RGB from 0 to 255 is ``(depth, p, q, -1)``: depth in meters and a normal that is not
+        normalized.
     """
     step = MAX_SLOPE / _HALF
     weights = np.zeros((4, 3))

@@ -1,6 +1,7 @@
 """Correct providers of every kind without weights, for the tests of the contract kit.
 
-Some tests derive faulty providers from these classes. Depth, normals and masks are decoded from painted views, as a tiny test network would do.
+Some tests derive faulty providers from these classes. Depth, normals and masks are decoded from
+painted views, as a tiny test network would do.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ class DepthFiles:
         """Read the depth map of a view from its file, in the resolution of the file.
 
         Args:
-            view: View whose name selects the file.
+            view: Undistorted image; its name selects the map file.
 
         Returns:
             Depth with variance.
@@ -87,7 +87,7 @@ class NormalFiles:
         """Read the normal map of a view from its file, in the resolution of the file.
 
         Args:
-            view: View whose name selects the file.
+            view: Undistorted image; its name selects the map file.
             depth: Not used.
 
         Returns:
@@ -123,7 +123,7 @@ class MaskFiles:
         """Read the mask of a view and resize the mask to the view by nearest neighbor.
 
         Args:
-            view: View whose name selects the file.
+            view: Undistorted image; its name selects the map file.
 
         Returns:
             Mask (H, W) bool, True where a pixel may be used.

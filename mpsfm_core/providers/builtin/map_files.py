@@ -23,7 +23,7 @@ _SINGLE_CHANNELS = ("Z", "Y", "depth.Z", "Depth.Z", "R", "V")
 _VECTOR_CHANNELS = (("X", "Y", "Z"), ("R", "G", "B"))
 _MAX_ASPECT_DIFFERENCE = 0.02
 """Largest relative difference between the aspect ratios of a map file and its view. Rounding the
-size of a reduced map stays below this difference."""
+width and height of a reduced map changes its aspect ratio by less than this limit."""
 
 
 def find_file(options: FileOptions, view: View, what: str) -> Path:
@@ -31,7 +31,7 @@ def find_file(options: FileOptions, view: View, what: str) -> Path:
 
     Args:
         options: Folder and suffix.
-        view: View whose name selects the file.
+        view: Undistorted image; its name selects the map file.
         what: Name of the quantity for messages, such as "depth".
 
     Returns:
@@ -67,8 +67,8 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
 
     Args:
         path: File in NPZ, NPY, EXR or an image format; colors are returned as RGB.
-        main: Name of the required array. Formats other than NPZ have one array, which gets this
-            name.
+        main: Name of the required array. Files in formats other than NPZ contain one array, which
+            is returned under this name.
 
     Returns:
         Arrays by name.
@@ -96,10 +96,10 @@ def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> No
     """Require that a map has the expected number of channels and covers the view.
 
     Args:
-        path: File of the map, for messages.
-        values: Map (h, w) or (h, w, channels).
-        view: View that the map belongs to.
-        channels: Expected number of channels.
+        path: Path of the map file, for messages.
+        values: Depth, normal or mask map, (h, w) or (h, w, channels).
+        view: Undistorted image that the map belongs to.
+        channels: Expected number of channels of the map.
 
     Raises:
         InputError: The shape is wrong, or the aspect ratio of the map differs from that of the

@@ -45,8 +45,8 @@ class MutualNearest:
         Args:
             view_a: Undistorted image, used for messages.
             view_b: Undistorted image, used for messages.
-            features_a: Features of the first view.
-            features_b: Features of the second view.
+            features_a: Features of the first view, with descriptors.
+            features_b: Features of the second view, with descriptors.
 
         Returns:
             Sparse matches.

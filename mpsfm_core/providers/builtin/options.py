@@ -43,8 +43,8 @@ class MutualNearestOptions(Options):
 
     ratio: float | None = Field(0.8, gt=0, le=1)
     """Largest ratio of nearest to second nearest descriptor distance, in both directions [COLMAP
-    max_ratio]. Raising it accepts more ambiguous matches; null disables the test, for learned
-    features."""
+    max_ratio]. Raising the ratio accepts more ambiguous matches; null disables the ratio test, for
+    learned features."""
     max_distance: float | None = Field(None, gt=0)
     """Largest Euclidean distance of matching descriptors; null sets no limit."""
 
@@ -67,13 +67,13 @@ class DepthFileOptions(FileOptions):
     """
 
     scale: float = Field(1.0, gt=0)
-    """Meters per stored unit: 0.001 for millimeters."""
+    """Meters per stored depth unit, such as 0.001 for millimeters."""
     metric: bool = True
     """False if the scaled depth has no metric unit."""
     relative_std: float | None = Field(None, ge=0)
     """Std relative to depth; required if the files have no variance."""
     std_floor: float = Field(0.0, ge=0)
-    """Smallest depth std, in scaled units."""
+    """Smallest depth std, in the unit of the scaled depth."""
     variance: FileOptions | None = None
     """Separate files with depth variance maps, in the squared stored unit."""
 
@@ -95,7 +95,7 @@ class NormalFileOptions(FileOptions):
 class MaskFileOptions(FileOptions):
     """Options of mask files in any image format, NPY, or NPZ with the array ``mask``.
 
-    Nonzero pixels may be used.
+    Nonzero pixels of a mask may be used.
     """
 
     invert: bool = False
@@ -113,5 +113,5 @@ class NormalsFromDepthOptions(Options):
     Raising the edge threshold fits planes across small steps [reference: continuity ratio
     1.015]."""
     slope_std: float = Field(4.0, ge=0)
-    """Angular std of normals in radians per relative std of depth. Raising it lowers the weight of
-    the normals [tuned: FastDepth on the rendered kitchen]."""
+    """Angular std of normals in radians per relative std of depth. Raising this factor lowers the
+    weight of the normals [tuned: FastDepth on the rendered kitchen]."""

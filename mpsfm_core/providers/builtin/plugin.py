@@ -1,6 +1,6 @@
 """Plugin of the built-in providers, which need no weights.
 
-This module imports no heavy library.
+The plugin module imports no heavy library.
 """
 
 from __future__ import annotations

@@ -50,9 +50,9 @@ class Channel:
         """Open one end of the channel on a pair of pipes.
 
         Args:
-            reader: Pipe to read from.
-            writer: Pipe to write to.
-            folder: Folder of the shared memory files.
+            reader: Pipe from which this end reads messages.
+            writer: Pipe to which this end writes messages.
+            folder: Folder of the shared memory files of both ends.
             own: File name prefix of the blocks that this end of the channel writes.
             other: File name prefix of the blocks that the other end of the channel writes.
             lent: Number of messages whose arrays may be alive at the same time. Received arrays are
@@ -70,7 +70,7 @@ class Channel:
         """Send a value.
 
         Raises:
-            ChannelClosed: The other process has ended.
+            ChannelClosed: The process at the other end of the channel has ended.
         """
         packed = EncodedMessage(value)
         if packed.size:
@@ -88,10 +88,10 @@ class Channel:
             raise ChannelClosed from error
 
     def receive(self) -> Any:
-        """Receive the next message.
+        """Receive the next message from the other process.
 
         Raises:
-            ChannelClosed: The other process has ended.
+            ChannelClosed: The process at the other end of the channel has ended.
         """
         length, self._target, size = _HEADER.unpack(self._read(_HEADER.size))
         if length > _LARGEST_TEXT:

@@ -95,19 +95,19 @@ def decode_message(text: bytes, block: UInt8, copy: bool) -> Any:
     """Decode a value.
 
     The decoder does not validate the restored data types. The constructors in the sending process
-    validated them, and :mod:`mpsfm_core.providers.validation` validates every return value of a
-    provider.
+    validated the values, and :mod:`mpsfm_core.providers.validation` validates every return value of
+    a provider.
 
     Args:
-        text: JSON text of the message.
-        block: Bytes of the arrays.
-        copy: True copies the arrays; False returns read-only views of the block.
+        text: JSON text of the received message.
+        block: Bytes of the arrays in the received message.
+        copy: True copies the received arrays; False returns read-only views of the block of bytes.
 
     Returns:
         The value.
 
     Raises:
-        DataError: The message does not follow the protocol.
+        DataError: The message does not follow the encoding protocol.
     """
     try:
         return _Decoder(block, copy).build(json.loads(text))

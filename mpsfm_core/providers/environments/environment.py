@@ -145,7 +145,7 @@ def create_environment(
     """Create a Python environment with mpsfm-core and other packages, by uv or by venv and pip.
 
     Args:
-        name: Name of the environment.
+        name: Name of the provider environment.
         packages: Requirements or source folders to install, as for pip.
         python: Python interpreter or version; by default the running interpreter.
 
@@ -154,7 +154,8 @@ def create_environment(
 
     Raises:
         InputError: The name is invalid or an environment with that name exists.
-        ProviderError: The environment cannot be created. A partly created environment is removed.
+        ProviderError: The environment cannot be created. MP-SfM removes a partly created
+            environment.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"{name!r} is not made of lower-case letters, digits and - . _")
@@ -176,7 +177,7 @@ def create_environment(
 
 
 def remove_environment(name: str) -> None:
-    """Remove a provider environment and its folder."""
+    """Remove a provider environment together with its folder."""
     shutil.rmtree(find_environment(name).folder)
 
 
@@ -203,7 +204,8 @@ def _relocate_scripts(scripts: Path, before: Path, after: Path) -> None:
     for path in scripts.iterdir():
         if path.is_file() and not path.is_symlink():
             content = path.read_bytes()
-            if old in content and b"\0" not in content:  # On Windows, launchers are binary files.
+            # On Windows, the launchers of an environment are binary files.
+            if old in content and b"\0" not in content:
                 path.write_bytes(content.replace(old, new))
 
 

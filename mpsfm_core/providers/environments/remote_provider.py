@@ -105,7 +105,7 @@ class RemoteProvider:
         self._running()
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
-        """Predict depth or normals."""
+        """Predict depth or normals in the worker process."""
         given = (view,) if self._location.kind == "depth" else (view, depth)
         return self._call("predict", *given)
 
@@ -180,7 +180,7 @@ class RemoteProvider:
 
 @dataclass(frozen=True)
 class _Factory:
-    """Picklable factory of a remote provider."""
+    """Picklable factory of a provider in another environment."""
 
     location: ProviderLocation
 
@@ -215,7 +215,7 @@ class RemoteSpec:
 def remote_providers(environment: Environment) -> list[RemoteSpec]:
     """List the provider specifications of an environment from its stored description.
 
-    Starts no process. The names of the providers are ``NAME@ENVIRONMENT``.
+    Starts no process. The names of the listed providers have the form ``NAME@ENVIRONMENT``.
 
     Args:
         environment: The environment.

@@ -106,8 +106,8 @@ class ProviderServer:
 def _description(registry: Registry) -> list[dict[str, Any]]:
     """Describe the providers of the plugins that are installed in this environment.
 
-    Built-in providers are left out, because every environment has them. Wrappers are left out,
-    because a wrapper has to run in the process of its inner provider.
+    The description omits built-in providers, because every environment has them. The description
+    also omits wrappers, because a wrapper has to run in the process of its inner provider.
     """
     entries = []
     for line in registry.status():

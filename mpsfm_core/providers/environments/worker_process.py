@@ -211,7 +211,7 @@ def encode_error(error: BaseException) -> dict[str, Any]:
 
 
 def decode_error(message: Mapping[str, Any]) -> Exception:
-    """Decode the exception of a protocol message."""
+    """Decode an exception from a protocol message."""
     if "settings" in message:
         problems = (
             SettingProblem(tuple(p), text, missing) for p, text, missing in message["settings"]
@@ -244,6 +244,6 @@ def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[s
         if pipe is not None:
             try:
                 pipe.close()
-            except OSError:  # Buffered data could not be written.
+            except OSError:  # Buffered bytes of the pipe could not be written.
                 continue
     folder.cleanup()

@@ -89,8 +89,8 @@ class ExportJob:
             model: Network to export.
             inputs: Input arrays by name, in the order of the network's arguments.
             outputs: Names of the network's outputs.
-            dynamic: Names of the axes of variable length, by tensor name. The inputs should differ
-                in these axes.
+            dynamic: Names of the axes of variable length, by tensor name. The example inputs should
+                differ in the lengths of these axes.
             expected: Outputs of the original network if ``model`` is a modified form of that
                 network.
         """
@@ -150,7 +150,8 @@ class MaskedWriteRewriter(TorchFunctionMode):
     def __init__(self) -> None:
         super().__init__()
         self._last: tuple[torch.Tensor, torch.Tensor, Any] | None = None
-        """Last view of a tensor that was indexed, its tensor and the index."""
+        """Most recent view of a tensor that was created by indexing, its base tensor and the
+        index."""
 
     def __torch_function__(
         self,

@@ -49,7 +49,7 @@ def export_model(
     A manifest is stored with the ONNX file, and ``export:NAME`` refers to the file from then on.
 
     Args:
-        name: Name of the exported network.
+        name: Name under which the exported network is registered.
         recipe: Export recipe that the plugin declares.
         code: Source checkouts: first that of the network, then those of required libraries.
         checkpoint: Path or URI of the authors' weights, or ``random``.
@@ -64,7 +64,7 @@ def export_model(
 
     Raises:
         InputError: A source checkout does not exist.
-        WeightsError: The checkpoint is not available.
+        WeightsError: The checkpoint with the weights is not available.
         ProviderError: The authors' code fails, or the ONNX file computes other outputs than the
             network.
     """

@@ -32,8 +32,8 @@ class DepthCalibration(Options):
     """
 
     std_scale: float = Field(3.33, gt=0)
-    """Factor of the network's depth std [reference prior_std_multiplier]. Raising it lowers the
-    weight of the depth prior."""
+    """Factor of the network's depth std [reference prior_std_multiplier]. Raising the factor lowers
+    the weight of the depth prior."""
     relative_std: float = Field(0.0263, ge=0)
     """Smallest std relative to depth [reference depth_uncertainty]."""
     std_floor: float = Field(0.02, ge=0)
@@ -85,8 +85,8 @@ class DepthCalibration(Options):
             medians: Medians of depth and inverse depth over the map, see :func:`depth_medians`.
 
         Returns:
-            Shifted depth, the factor by which the shift changes its std, and validity, in the shape
-            of ``depth``.
+            Shifted depth, factor by which the shift changes the depth std, and validity, in the
+            shape of ``depth``.
         """
         in_depth = self.shift_space == "depth"
         quantity = depth if in_depth else 1 / depth

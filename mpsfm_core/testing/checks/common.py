@@ -144,7 +144,7 @@ def check_no_state(case: ContractCase) -> None:
 def check_inputs_unchanged(case: ContractCase) -> None:
     """Require that the provider does not modify the view, depth or features that it receives.
 
-    Other providers use the same arrays.
+    Other providers of the same run use the same arrays.
     """
     example = case.example.sized(*case.example.camera.size)
     image = np.array(example.view.image)
@@ -201,7 +201,7 @@ def check_intrinsics_declared(case: ContractCase) -> None:
 def check_threads(case: ContractCase) -> None:
     """Require that two instances in two threads give the same output as each instance alone.
 
-    A run uses one instance per thread.
+    A run uses one instance of a provider per thread.
     """
     examples = [case.example, case.example.sized(*case.example.camera.size).partner]
     alone = [case.run(example) for example in examples]

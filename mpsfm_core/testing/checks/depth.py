@@ -26,7 +26,7 @@ from mpsfm_core.testing.painted_views import RELATIVE_STD, read_depth
 
 RAY_TOLERANCE = 0.25
 """Largest exponent p in ``depth = z * (ray length / z) ** p``: 0 for z-depth, 1 for ray length.
-Correct providers on painted views have 0.002."""
+Correct providers on painted views have an exponent of 0.002."""
 FLIP_TOLERANCE = 0.3
 """Largest relative depth difference of mirrored or enlarged views if the ground truth is unknown.
 Trained networks are not exactly symmetric; rotated or cropped maps have larger differences."""

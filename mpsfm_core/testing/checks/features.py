@@ -140,7 +140,7 @@ def check_features_descriptors(case: ContractCase) -> str:
 def check_features_dimension(case: ContractCase) -> str:
     """Require the same descriptor length for every view.
 
-    Views without any keypoint are included.
+    Views without any keypoint are included in the check.
     """
     flat = replace(case.example.view, image=np.full_like(case.example.view.image, 128))
     some, none = case.run(case.example), case.run_on_view(flat, case.example)

@@ -47,7 +47,7 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
     """Require dense matches in COLMAP's pixel convention.
 
     If a view is matched with its copy at half the size, matched coordinates are halved exactly.
-    Integer pixel centers shift the matched coordinates.
+    Matches with integer pixel centers are shifted.
     """
     if not case.declares("dense"):
         raise CheckSkipped("sparse matches have the positions of the keypoints")
@@ -99,8 +99,8 @@ def check_matcher_few_features(case: ContractCase) -> None:
 def check_matcher_many_features(case: ContractCase) -> str:
     """Require valid output for 4096 features per view.
 
-    Real images have as many features. A fixed buffer or a size limit of the network must not end a
-    run.
+    Real images have as many features as this view. A fixed buffer or a size limit of the network
+    must not end a run.
     """
     if not case.declares("sparse"):
         raise CheckSkipped("the matcher needs no features")

@@ -1,8 +1,9 @@
 """Synthetic monocular depth: true depth with smooth, seeded errors.
 
 The errors of depth networks are not pixel noise. The whole map has a wrong scale, and smooth errors
-bend and shift whole surfaces. This module simulates both kinds of errors. The errors of an image
-depend only on its name and the seed, so that all tests and benchmarks use the same errors.
+bend and shift whole surfaces. This module simulates a scale error of the whole map and smooth
+errors of its surfaces. The errors of an image depend only on its name and the seed, so that all
+tests and benchmarks use the same errors.
 """
 
 from __future__ import annotations
@@ -55,13 +56,13 @@ def degrade_depth(
     """Add the errors of a monocular depth network to a true depth map.
 
     Args:
-        depth: True depth (h, w). Zeros are invalid and remain zero.
+        depth: True z-depth (h, w). Zeros in the true depth are invalid and remain zero.
         name: Name of the image, which seeds the errors.
         errors: Model of the errors, by default :class:`DepthErrors`.
         seed: Seed in addition to the image name.
 
     Returns:
-        Depth (h, w) with errors.
+        z-depth (h, w) with simulated errors.
     """
     errors = errors or DepthErrors()
     key = hashlib.sha256(name.encode()).digest()[:8]

@@ -42,8 +42,8 @@ TURN_DEG = 20.0
 REACH = 2.6
 """Largest distance in meters between the cameras of a matched image pair."""
 MAX_MATCH_TURN_DEG, MAX_MATCH_ZOOM = 40.0, 1.8
-"""Limits for a match of a point: largest angle between its two rays, and largest ratio of its two
-distances."""
+"""Largest angle between the two rays of a matched point, and largest ratio of its two distances
+from the cameras."""
 MIN_MATCHES = 30
 """Smallest number of common points of an image pair."""
 

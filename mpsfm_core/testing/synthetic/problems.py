@@ -128,7 +128,7 @@ def render_mapping_image(
         scene: Scene to render.
         camera: Camera of the view.
         pose: ``cam_from_world`` (3, 4).
-        keypoints: Keypoints (n, 2) in pixels.
+        keypoints: Keypoints (n, 2) of the view in pixels.
         map_width: Width of the prior maps in pixels.
         depth_std: Relative std that the depth prior declares.
         normal_std_deg: Angular std that the normal prior declares.

@@ -30,11 +30,11 @@ class Surface(Protocol):
 
         Args:
             origin: Common origin (3,).
-            directions: Ray directions (n, 3) of any length.
+            directions: Ray directions (n, 3) in the world frame, of any length.
 
         Returns:
             Parameters t (n,) of the first hits, inf without a hit, and unit normals (n, 3) that
-            face the origin of the ray. Normals are arbitrary without a hit.
+            face the origin of the ray. Normals of rays without a hit are arbitrary.
         """
         ...
 
@@ -121,7 +121,8 @@ class Texture:
     """Random color texture in 3D: octaves of plane waves with random direction and phase.
 
     The texture does not repeat in practice. The argument ``footprint``, the size of a pixel on the
-    surface in meters, limits the frequencies of the texture. Renderings therefore have no aliasing.
+    surface in meters, limits the frequencies of the texture. Rendered images therefore have no
+    aliasing.
     """
 
     longest_wave: float = 1.2  # meters

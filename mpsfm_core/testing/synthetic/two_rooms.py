@@ -145,7 +145,8 @@ def make_twin_room_problem(
     """Create a synthetic mapping problem of two similar rooms.
 
     A keypoint matches the same point in another view as well as the copy of the point in the other
-    room. Geometric verification keeps the more frequent of both alternatives.
+    room. Geometric verification keeps the more frequent alternative: the same points, or their
+    copies.
 
     Args:
         seed: Seed of poses, points and errors.
