@@ -38,7 +38,7 @@ def load_state(module: torch.nn.Module, state: dict[str, Any], uri: str) -> None
     learned |= {name for name, _ in module.named_buffers() if "running_" in name}
     if missing := sorted(learned & set(mismatch.missing_keys)):
         raise WeightsError(
-            f"{uri} is a weights file for another network: tensors {', '.join(missing[:3])} are missing"
+            f"{uri} is a weights file for another network: it has no {', '.join(missing[:3])}"
         )
     module.eval()
 

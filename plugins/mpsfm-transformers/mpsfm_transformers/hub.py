@@ -56,8 +56,8 @@ class LoadedModel:
         missing = sorted(report["missing_keys"])
         if missing:
             raise WeightsError(
-                f"{options.model}: {WEIGHTS} does not fit {CONFIG}: the tensors lack {missing[0]!r} and "
-                f"{len(missing) - 1} more"
+                f"{options.model}: {WEIGHTS} does not fit {CONFIG}: tensor {missing[0]!r} and "
+                f"{len(missing) - 1} more are missing"
             )
         self.network = network.eval().to(context.device)
 

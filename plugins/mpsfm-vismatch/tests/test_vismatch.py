@@ -103,7 +103,9 @@ def test_missing_scores_are_one(context: ProviderContext) -> None:
 
 
 def test_a_network_of_another_kind(context: ProviderContext) -> None:
-    with pytest.raises(ConfigError, match=r"Known' has none of roma_model, matcher, model"):
+    with pytest.raises(
+        ConfigError, match=r"Known' has none of the attributes roma_model, matcher, model"
+    ):
         roma.DenseMatcher(RomaDenseOptions(network=NETWORK), context)
 
 
