@@ -50,7 +50,7 @@ def test_an_expected_failure_is_told_with_its_reason() -> None:
     assert found["depth-is-z"][0] == "pass"
     status, message = found["depth-scale"]
     assert status == "xfail"
-    assert message.startswith("the network is in mm (is called metric")
+    assert message.startswith("the network is in mm (depth is declared metric")
 
 
 def test_an_expected_failure_that_passes_is_a_failure() -> None:
@@ -81,8 +81,11 @@ def test_without_a_known_answer_accuracy_is_skipped_not_passed() -> None:
     needing = {"depth-is-z", "depth-scale", "depth-channel-order", "depth-pixel-convention"}
     needing |= {"depth-orientation", "depth-validity", "depth-variance"}
     assert {found[name][0] for name in needing} == {"skip"}
-    assert all("correct answer is unknown" in found[name][1] for name in needing)
-    assert found["odd-size"] == ("pass", "answers; the correct answer is unknown")
+    assert all("ground truth is unknown" in found[name][1] for name in needing)
+    assert found["odd-size"] == (
+        "pass",
+        "valid output; accuracy not measured without ground truth",
+    )
 
 
 def test_the_plugin_says_how_it_is_tested(tmp_path: Path) -> None:

@@ -238,7 +238,7 @@ def test_options_that_nobody_can_import(caught: Callable[..., None]) -> None:
         factor: float = 1.0
 
     caught(
-        "depth", PaintedDepth, "pickles", "its options cannot be pickled", PAINTED, options=Local
+        "depth", PaintedDepth, "pickles", "the options cannot be pickled", PAINTED, options=Local
     )
 
 

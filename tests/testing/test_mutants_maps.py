@@ -201,7 +201,12 @@ class FocalRatio(PaintedDepth):
         (HugeVariance, "depth-calibration", "after calibration, variance: must be finite", ()),
         (TinyVariance, "depth-calibration", "changes nothing after calibration", ()),
         (TwoOpinions, "depth-joint", "return different depth", ("joint-normals",)),
-        (JointNormalsTurned, "depth-joint", "normals are .* degrees off", ("joint-normals",)),
+        (
+            JointNormalsTurned,
+            "depth-joint",
+            "normals of predict_joint are .* degrees off",
+            ("joint-normals",),
+        ),
         (FocalRatio, "depth-focal", "is 1 px, and 1 px", ("estimates-focal",)),
     ],
 )

@@ -334,7 +334,7 @@ class NotScaledBack(Sift):
 
 @pytest.mark.parametrize(
     ("factory", "check", "message"),
-    [(NotScaledBack, "features-large-view", "have to be scaled back")],
+    [(NotScaledBack, "features-large-view", "of a reduced image back")],
 )
 def test_features_of_large_views(
     caught: Callable[..., None], factory: type, check: str, message: str

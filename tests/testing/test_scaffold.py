@@ -55,7 +55,7 @@ def test_it_passes_its_contract_at_once(
     registry, folder = written(kind)
     results = run_checks(registry, kind, f"brand-new-{kind}")
     assert {r.id: r.message for r in results if r.status not in ("pass", "skip")} == {}
-    assert "correct answer is unknown" not in "".join(r.message for r in results)
+    assert "ground truth is unknown" not in "".join(r.message for r in results)
     assert f"mpsfm plugins check brand-new-{kind}" in (folder / "README.md").read_text()
 
 
