@@ -1,1 +1,1 @@
-"""Benchmarks of accuracy, time and memory."""
+"""Benchmarks of the accuracy, time and memory of MP-SfM."""

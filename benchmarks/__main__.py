@@ -1,4 +1,4 @@
-"""Runner of benchmarks: ``python -m benchmarks [NAME ...]``, all by default."""
+"""Run the named benchmarks, or all benchmarks, by ``python -m benchmarks [NAME ...]``."""
 
 from __future__ import annotations
 

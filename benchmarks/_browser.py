@@ -34,7 +34,9 @@ def start_browser(width: int = 1280, height: int = 800) -> Iterator[Any]:
         raise SystemExit("pip install selenium") from error
     chromium, driver = shutil.which("chromium"), shutil.which("chromedriver")
     if chromium is None or driver is None:
-        raise SystemExit("needs chromium and chromedriver (Debian: chromium chromium-driver)")
+        raise SystemExit(
+            "chromium or chromedriver is missing: apt install chromium chromium-driver"
+        )
     options = webdriver.ChromeOptions()
     options.binary_location = chromium
     for argument in _ARGUMENTS:
@@ -42,7 +44,7 @@ def start_browser(width: int = 1280, height: int = 800) -> Iterator[Any]:
     options.page_load_strategy = "none"  # the benchmarks wait until the page shows its content
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
-    browser.command_executor.client_config.timeout = 600  # s; slow without a GPU
+    browser.command_executor.client_config.timeout = 600  # seconds
     browser.set_script_timeout(600)
     screen = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", screen)

@@ -20,7 +20,9 @@ def shared_folder() -> Path:
     default = Path(__file__).resolve().parents[2] / "shared"
     folder = Path(os.environ.get("MPSFM_SHARED", default))
     if not (folder / "data").is_dir():
-        raise SystemExit(f"no scenes in {folder}: set MPSFM_SHARED")
+        raise SystemExit(
+            f"no benchmark scenes in {folder}: set MPSFM_SHARED to the folder with data/ and models/"
+        )
     return folder
 
 

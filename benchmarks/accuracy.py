@@ -27,7 +27,7 @@ PRIORS = ("sensor", "degraded", "config")
 SEEDS = 12
 """Number of seeds of degraded depth on rendered_kitchen.
 
-Seeds change pose AUC there by several points, because the test sets have few images.
+Seeds change pose AUC on rendered_kitchen by several points, because its test sets have few images.
 """
 DEGRADED = ("degraded", *(f"degraded-{seed}" for seed in range(1, SEEDS)))
 """Names of the degraded depth priors, one per seed."""

@@ -8,9 +8,9 @@ and estimates depth scales, points and refined depth maps.
 
 Depth errors are computed in the scale of the camera centers, std coverage in the scale that fits
 the depth best. The fused cloud is aligned by camera centers and compared with all true depth maps
-of the test set. The scene ``fountain`` has no true depth maps. Its metric is the share of points,
-triangulated with the true poses, whose depth is within 1 %. ``--json`` prints one JSON object as
-the last line.
+of the test set. The scene ``fountain`` has no true depth maps. The metric on ``fountain`` is the
+share of points, triangulated with the true poses, whose depth is within 1 %. ``--json`` prints one
+JSON object as the last line.
 """
 
 from __future__ import annotations
@@ -294,9 +294,9 @@ def own_scale(maps: Sequence[MapBesideTruth]) -> float:
 def map_errors(pixels: MapBesideTruth, scale: float, own_scale_factor: float) -> dict[str, float]:
     """Compute the depth errors of one depth map.
 
-    In the scale of the camera centers (``scale``): share of accurate pixels and AbsRel. In the
-    scale that fits the depth maps best (``own_scale_factor``): AbsRel, and the share of errors
-    within one std.
+    The share of accurate pixels and AbsRel are in the scale of the camera centers (``scale``). A
+    second AbsRel and the share of errors within one std are in the scale that fits the depth maps
+    best (``own_scale_factor``).
     """
     measured, relative = pixels.measured, np.abs(scale * pixels.depth - pixels.truth) / pixels.truth
     error = np.abs(own_scale_factor * pixels.depth - pixels.truth)

@@ -309,7 +309,7 @@ def ablation(analytic: list[Problem], real: list[Problem]) -> dict[str, Any]:
     """Print log depth errors (rms, median) with each option changed from its default."""
     changes: list[dict[str, float]] = [
         {},
-        {"independent_depths": 1e9, "independent_normals": 1e9},  # cvg/mpsfm
+        {"independent_depths": 1e9, "independent_normals": 1e9},  # weights of cvg/mpsfm
         *({"independent_depths": v} for v in (10.0, 30.0, 300.0, 1000.0)),
         *({"independent_normals": v} for v in (100.0, 300.0, 3000.0, 10_000.0)),
         *({"sharpness": v} for v in (0.5, 1.0, 4.0)),

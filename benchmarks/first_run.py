@@ -63,7 +63,7 @@ def timed(command: Sequence[str], folder: Path) -> tuple[float, float, str]:
     ended = subprocess.run(command, cwd=folder, stdout=subprocess.PIPE, text=True, check=False)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     if ended.returncode:
-        raise SystemExit(f"{' '.join(command)} ended with {ended.returncode}")
+        raise SystemExit(f"{' '.join(command)} failed with exit code {ended.returncode}")
     used = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
     return used, time.perf_counter() - started, ended.stdout
 
@@ -75,7 +75,7 @@ def look(page: Path) -> tuple[float, str]:
         browser.get(page.resolve().as_uri())
         while not browser.execute_script("return window.report !== undefined"):
             if time.perf_counter() - started > 300:
-                raise SystemExit(f"{page}: does not show its scene")
+                raise SystemExit(f"{page}: the 3D scene did not appear within 300 s")
             time.sleep(0.1)
         clock = time.perf_counter() - started
         faults = [line for line in browser.get_log("browser") if line["level"] == "SEVERE"]

@@ -4,9 +4,9 @@
 
 Photos of real scenes are in $MPSFM_SHARED or ../shared; features are XFeat as in `fast-cpu`. The
 scene `hall` is a synthetic hall of 200 views (mpsfm_core/testing/synthetic/halls.py) with random
-descriptors. Each view of the hall detects half of its points, and as many outliers. Descriptor
-noise is half the descriptor length. At most a quarter of the keypoints are repeatable, as for XFeat
-on rendered_kitchen (18 to 25 %).
+descriptors. Each view of the hall detects half of its points, and as many outliers. The norm of the
+descriptor noise is half the norm of a descriptor. At most a quarter of the keypoints are
+repeatable, as for XFeat on rendered_kitchen (18 to 25 %).
 
 A pair is true if its two-view overlap (mpsfm_core/evaluation/overlap.py) is above a limit.
 *Matched* pairs can contribute to a reconstruction. A real pair counts as matched if its overlap is

@@ -3,9 +3,10 @@
     python -m benchmarks.paper_chain PHOTOS [--mast3r DIR --dsine DIR] [--work DIR]
 
 Runs ``mpsfm models export ... --checkpoint random`` and ``mpsfm reconstruct`` on a folder of
-photos: SuperPoint (of transformers), MASt3R (ViT-L) matches and depth, DSINE (EfficientNet-B5)
-normals with a mirrored pass, mapper. Random weights give no matches, so ``mpsfm reconstruct`` ends
-with exit code 3 and a report. Prints the time and peak memory of each command.
+photos. The networks are SuperPoint (of transformers) for features, MASt3R (ViT-L) for matches and
+depth, and DSINE (EfficientNet-B5) with a mirrored pass for normals. Random weights give no matches,
+so ``mpsfm reconstruct`` ends with exit code 3 and a report. Prints the time and peak memory of each
+command.
 """
 
 from __future__ import annotations

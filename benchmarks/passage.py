@@ -1,4 +1,4 @@
-"""CPU time of calls to a provider in another environment: ``python -m benchmarks.passage``.
+"""CPU time of calls to providers in other environments, by ``python -m benchmarks.passage``.
 
 Calls a provider with a constant result through a worker process. Measures CPU time of the main
 process and the worker. View and depth map have one megapixel each, without and with variance. Each
@@ -45,7 +45,7 @@ class _Service(worker.ProviderServer):
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure the CPU time of calls through a worker process, and print the times."""
     rng = np.random.default_rng(1)
     image = rng.integers(0, 255, (_SIDE, _SIDE, 3), dtype=np.uint8)
     camera = PinholeCamera(_SIDE, _SIDE, 800, 800, 500, 500)

@@ -1,4 +1,4 @@
-"""Create all pictures of the documentation: ``python -m benchmarks.pictures``.
+"""Create all pictures of the documentation with ``python -m benchmarks.pictures``.
 
 Reconstructs the sample scene on a pseudo terminal. Also reconstructs two photos without overlap to
 get the report of a failed run. Then captures both reports and the viewer in headless Chromium.
@@ -51,13 +51,13 @@ def on_terminal(*arguments: str, code: int = 0) -> str:
     while True:
         try:
             part = os.read(ours, 65536)
-        except OSError:  # Linux: the command closed the terminal
+        except OSError:  # on Linux, the command closed the terminal
             break
         if not part:
             break
         output += part
     if process.wait() != code:
-        raise SystemExit(f"mpsfm {' '.join(arguments)} ended with {process.returncode}")
+        raise SystemExit(f"mpsfm {' '.join(arguments)} ended with exit code {process.returncode}")
     return output.decode("utf-8", errors="replace")
 
 
@@ -161,8 +161,8 @@ def shoot_viewer(browser: Any, folder: Path) -> None:
         address = next(filter(None, (re.search(r"http://\S+", line) for line in process.stdout)))
         browser.get(address[0])
         wait_for(browser, "location.protocol === 'http:' && document.querySelector('canvas')")
-        time.sleep(20)  # the viewer gets the scene through a socket after the page has loaded
-        # it warns of browsers that draw without a GPU
+        time.sleep(20)  # the page loads before the scene
+        # close the warning of viser about browsers without a GPU
         close = "document.querySelectorAll('.mantine-Notification-closeButton')"
         browser.execute_script(f"{close}.forEach((button) => button.click())")
         time.sleep(2)

@@ -40,7 +40,7 @@ runtime: {{workers: {workers}, cache_dir: {folder}/cache}}
 
 @dataclass(frozen=True)
 class Case:
-    """Case: number of rooms (0: a hall), photo size (width, height) and width of prior maps."""
+    """Case with number of photos, rooms (0: a hall), photo size and width of prior maps."""
 
     count: int
     rooms: int

@@ -5,8 +5,9 @@
 The first table (*placed*) starts from true poses and refined depth. The depth check compares each
 view at its true pose with all other views. The check also compares each view at the corresponding
 pose in the other room with the views of that room and of the corridor. The second table (*mapped*)
-runs the whole mapper, with and without the depth check. A registration is wrong if it is nearer to
-the corresponding position in the other room than to the true position, relative to the first pair.
+runs the whole mapper, with and without the depth check. The registered pose of an image is wrong if
+it is nearer to the corresponding position in the other room than to the true position, relative to
+the first pair.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ class Observed(ModelMaintenance):
         return reason
 
     def _misplaced(self, image: int) -> bool:
-        """Return if an image is nearer to the wrong room than to its true position."""
+        """Return if an image is registered nearer to its position in the other room."""
         scene, poses = self.scene, np.array(self.case.poses)
         if self.first is None or self.size == 2:
             others = scene.registered.copy()

@@ -1,4 +1,6 @@
-"""Compare providers with original code: ``... [NETWORK ...] [--checkouts DIR]``.
+"""Compare our providers with the original code of their networks.
+
+Usage: ``python -m benchmarks.conformance [NETWORK ...] [--checkouts DIR]``.
 
 DIR (default ``$MPSFM_CHECKOUTS``) contains checkouts of the networks' repositories and of required
 libraries. Each folder is named after the export, with the commit that the plugin names. A network
@@ -38,7 +40,7 @@ _HOLDS = {"normals, deg": 0.06, "positions, px": 1e-2, APART: np.inf}
 _TOLERANCE = 1e-3
 """Maximum relative difference of depth and std between our provider and the authors' code.
 
-Both compute in float32.
+Our providers and the authors' code compute in float32.
 """
 
 
@@ -116,7 +118,7 @@ def _through_file(network: Network, checkouts: Path) -> dict[str, float]:
             run_script(AUTHORS / network.script, code, made, size=network.size)
         except ProviderError as error:
             needs = f" (needs {', '.join(network.packages)})" if network.packages else ""
-            raise ProviderError(f"the authors' code fails: {error}{needs}") from None
+            raise ProviderError(f"original code of {network.export}: {error}{needs}") from None
         return {
             "file": max(compare_with_original(made).values()),
             **_differences(network, made, views),

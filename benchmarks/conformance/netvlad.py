@@ -18,7 +18,7 @@ from mpsfm_core.providers.registry import Registry
 
 _CAMERAS = ((640, 480, 500.0), (333, 500, 500.0), (1601, 1203, 500.0), (900, 1300, 500.0))
 _LARGEST = 1024
-"""Longer side in pixels to which hloc shrinks photos."""
+"""Longer side in pixels to which hloc shrinks photos for NetVLAD."""
 APART = "(two photos)"
 """Label of the distance between descriptors of different photos, a scale for the differences."""
 

@@ -24,12 +24,12 @@ Differences = dict[str, float]
 class Network:
     """Network whose exported ONNX file is compared with the authors' code.
 
-    ``export`` is the name for ``mpsfm models export``. ``script`` is the file in ``authors/`` that
-    runs the authors' code. ``size`` is the network size for the export, and ``described`` its text
-    in the table. ``libraries`` maps folders of further checkouts to repository and commit.
-    ``packages`` are installed by ``pip install --no-deps``. ``provider`` returns kind, name and
-    options of our provider for an ONNX file. ``ask`` calls our provider with ``views`` photos.
-    ``compare`` computes the largest differences from the authors' arrays.
+    ``export`` is the name for ``mpsfm models export``. ``script`` is the file in the folder
+    ``authors`` that runs the original code of the network. ``size`` is the network size for the
+    export, and ``described`` its text in the table. ``libraries`` maps folders of further checkouts
+    to repository and commit. ``packages`` are installed by ``pip install --no-deps``. ``provider``
+    returns kind, name and options of our provider for an ONNX file. ``ask`` calls our provider with
+    ``views`` photos. ``compare`` computes the largest differences from the authors' arrays.
     """
 
     export: str

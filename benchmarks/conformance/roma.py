@@ -1,8 +1,8 @@
 """Comparison of RoMa in ``vismatch-roma`` with the repository of RoMa's authors.
 
 Our provider runs the copy of RoMa in vismatch. The authors' repository is called through ``match``
-and ``to_pixel_coordinates``. Both use the original architecture and the same random weights in one
-Python environment, because RoMa cannot be exported to ONNX.
+and ``to_pixel_coordinates``. Both networks have the original architecture and the same random
+weights, and run in one Python environment, because RoMa cannot be exported to ONNX.
 """
 
 from __future__ import annotations

@@ -43,10 +43,10 @@ def run_authors(environment: Environment, script: str, *arguments: Path) -> None
     """Run a script of the folder ``authors`` in a Python environment.
 
     Raises:
-        ProviderError: The script fails; the message is its last line.
+        ProviderError: The authors' script failed; the message is the last line of its error output.
     """
     command = [str(part) for part in (environment.python, AUTHORS / script, *arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         message = (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise ProviderError(f"the authors' code fails: {message}")
+        raise ProviderError(f"the authors' script {script} failed: {message}")

@@ -2,8 +2,8 @@
 
 Each script exports a network like the export script of a plugin
 (:mod:`mpsfm_core.providers.model_export.author_script`). The script reads ``photos.json`` and the
-photos in its output folder. It runs the authors' inference code on each photo, and writes the
-predictions to ``reference_N.npz``.
+photos in its output folder. Each script runs the original inference code on each photo, and writes
+the predictions to ``reference_N.npz``.
 """
 
 from __future__ import annotations

@@ -14,8 +14,8 @@ _PADDING = (123.675, 116.28, 103.53)
 job = ExportJob.from_arguments()
 model = network(job.size)
 last = model.model.depth_model.decoder.normal_predictor[-1]
-last.bias.data += torch.tensor([0.0, 0.0, -10.0])  # face the camera
-for index, (image, camera) in enumerate(photos(job)):  # the steps of the authors' hubconf.py
+last.bias.data += torch.tensor([0.0, 0.0, -10.0])  # let normals face the camera
+for index, (image, camera) in enumerate(photos(job)):  # inference as in hubconf.py of Metric3D
     height, width = image.shape[:2]
     scale = min(SIZE[0] / height, SIZE[1] / width)
     rgb = cv2.resize(

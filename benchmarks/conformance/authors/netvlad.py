@@ -1,4 +1,4 @@
-"""NetVLAD of hloc: ``python netvlad.py CHECKOUT OUTPUT.onnx PHOTO ...``.
+"""Run hloc's NetVLAD by ``python netvlad.py CHECKOUT OUTPUT.onnx PHOTO ...``.
 
 Needs torchvision. Uses random weights in the layout of the published file, without whitening.
 Writes the network as ONNX file, and NetVLAD's descriptors of the photos, which hloc's loader reads.
@@ -62,7 +62,7 @@ with torch.inference_mode():
     for path in photos:
         image = scope["cv2"].imread(path)[..., ::-1].astype(np.float32)
         size = image.shape[:2][::-1]
-        if max(size) > 1024:  # resize_max of hloc's "netvlad"
+        if max(size) > 1024:  # as the configuration "netvlad" of hloc
             new = tuple(round(x * (1024 / max(size))) for x in size)
             image = scope["resize_image"](image, new, "cv2_area")
         batch = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)) / 255)[None]

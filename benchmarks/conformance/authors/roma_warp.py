@@ -1,4 +1,4 @@
-"""Run the original code of RoMa: ``python roma_warp.py CHECKOUT PHOTO PHOTO OUTPUT``.
+"""Run the original code of RoMa by ``python roma_warp.py CHECKOUT PHOTO PHOTO OUTPUT``.
 
 Needs torchvision. RoMa's function ``to_pixel_coordinates`` converts the warp to pixels.
 """
@@ -21,4 +21,4 @@ with torch.inference_mode():
     warp, certainty = model.match(first, second, device="cpu")
     sizes = [Image.open(path).size[::-1] for path in (first, second)]
     a, b = model.to_pixel_coordinates(warp.reshape(-1, 4), *sizes[0], *sizes[1])
-np.savez(output, a=a, b=b, certainty=np.squeeze(certainty))  # remove the batch dimension
+np.savez(output, a=a, b=b, certainty=np.squeeze(certainty))  # without batch dimension
