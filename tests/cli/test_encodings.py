@@ -21,7 +21,7 @@ NAMES = ["snow-\u96ea.jpg", "\u03b1.jpg", "\U0001f600.jpg"]
 
 @pytest.fixture
 def model(tmp_path: Path) -> Path:
-    """A COLMAP model and its images, with names that few encodings have."""
+    """COLMAP model and images whose names most encodings cannot represent."""
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
         model="PINHOLE", width=64, height=48, params=[70, 70, 32, 24], camera_id=1
@@ -52,7 +52,7 @@ def test_finished_command_succeeds_in_any_terminal(
         assert r"scene-\u03a9" in result.stdout.decode(encoding)
 
 
-def test_names_that_are_not_utf8_are_named_and_left_out(tmp_path: Path, caplog) -> None:
+def test_names_that_are_not_utf8_are_reported_and_skipped(tmp_path: Path, caplog) -> None:
     for name in ("a.jpg", "b.jpg"):
         Image.new("RGB", (64, 48)).save(tmp_path / name)
     latin = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9.jpg"))
@@ -66,7 +66,7 @@ def test_names_that_are_not_utf8_are_named_and_left_out(tmp_path: Path, caplog) 
     assert r"1 name is not UTF-8" in caplog.text and r"caf\xe9.jpg" in caplog.text
 
 
-def test_folder_whose_name_is_not_utf8(tmp_path: Path) -> None:
+def test_folder_name_that_is_not_utf8_is_accepted(tmp_path: Path) -> None:
     folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/caf\xe9"))
     try:
         folder.mkdir()

@@ -30,7 +30,7 @@ PLUGIN = """
 
 
 def models(*arguments: str) -> tuple[int, str, str]:
-    """Exit code, stdout and stderr of ``mpsfm models ...``."""
+    """Run ``mpsfm models ...``; return exit code, stdout and stderr."""
     result = CliRunner().invoke(build_app(), ["models", *arguments])
     return result.exit_code, result.stdout, result.stderr
 

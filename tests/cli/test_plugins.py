@@ -22,7 +22,7 @@ HEAVY = ("torch", "onnxruntime", "kornia", "cv2", "numba", "pycolmap", "scipy")
 
 
 def mpsfm(*arguments: str) -> tuple[int, str, str]:
-    """Exit code, stdout and stderr of a command in this process."""
+    """Run a command in this process; return exit code, stdout and stderr."""
     result = CliRunner().invoke(build_app(), arguments)
     return result.exit_code, result.stdout, result.stderr
 
@@ -92,7 +92,7 @@ def test_plugins_list_json_equals_table(install_plugin: Callable[..., str]) -> N
 
 
 class TestConfig:
-    def test_list(self) -> None:
+    def test_config_list_prints_shipped_configurations(self) -> None:
         code, text, _ = mpsfm("config", "list")
         assert code == 0
         assert {"default", "fast-cpu", "sensor-depth"} <= {
@@ -101,7 +101,7 @@ class TestConfig:
 
     @pytest.fixture
     def tiny_config(self, tmp_path: Path, install_plugin: Callable[..., str]) -> str:
-        """A configuration whose providers come from one plugin of the test."""
+        """Configuration whose providers come from one plugin of the test."""
         source = """
             from mpsfm_core import Options, ProviderSpec, hookimpl
             class TinyOptions(Options):
@@ -117,7 +117,7 @@ class TestConfig:
         path.write_text("depth: {use: tiny}\nnormals: {use: tiny}\ndense_matcher: {use: tiny}\n")
         return str(path)
 
-    def test_show_fills_in_defaults(self, tiny_config: str) -> None:
+    def test_config_show_fills_in_defaults(self, tiny_config: str) -> None:
         code, text, _ = mpsfm("config", "show", tiny_config, "--set", "runtime.seed=5")
         assert code == 0
         shown = yaml.safe_load(text)
@@ -125,7 +125,7 @@ class TestConfig:
         assert shown["runtime"]["seed"] == 5
         assert shown["runtime"]["device"] == "auto"
 
-    def test_a_wrong_setting_is_one_line_and_exit_code_2(self, tiny_config: str) -> None:
+    def test_config_show_with_wrong_setting_exits_with_2(self, tiny_config: str) -> None:
         code, text, error = mpsfm("config", "show", tiny_config, "--set", "depth.options.fra=5")
         assert (code, text) == (2, "")
         assert error == (
@@ -137,7 +137,7 @@ class TestConfig:
 class TestEndings:
     @pytest.fixture
     def app(self) -> typer.Typer:
-        """A command line whose command ``fail`` raises what the test puts into ``errors``."""
+        """Command line whose command ``fail`` raises the exception in ``errors``."""
         app = build_app()
 
         @app.command()
@@ -166,24 +166,26 @@ class TestEndings:
             ("usage", 2, ""),
         ],
     )
-    def test_one_line_and_a_code(self, app: typer.Typer, name: str, code: int, line: str) -> None:
+    def test_errors_print_one_line_and_set_exit_code(
+        self, app: typer.Typer, name: str, code: int, line: str
+    ) -> None:
         result = CliRunner().invoke(app, ["fail", name])
         assert result.exit_code == code
         assert result.stderr.startswith(line)
         assert "Traceback" not in result.output
 
     @pytest.mark.parametrize("variable", [None, "1"])
-    def test_debug_lets_the_error_through(self, app: typer.Typer, variable: str | None) -> None:
+    def test_debug_raises_the_error(self, app: typer.Typer, variable: str | None) -> None:
         arguments = ["fail", "bug"] if variable else ["--debug", "fail", "bug"]
         environment = {"MPSFM_DEBUG": variable} if variable else {}
         result = CliRunner().invoke(app, arguments, env=environment)
         assert isinstance(result.exception, KeyError)
 
-    def test_usage_errors(self) -> None:
+    def test_usage_errors_exit_with_2(self) -> None:
         assert mpsfm("plugin")[0] == 2
         assert mpsfm("config", "show", "--sett", "a=1")[0] == 2
 
-    def test_version(self) -> None:
+    def test_version_option_prints_version(self) -> None:
         code, text, _ = mpsfm("--version")
         assert code == 0 and text.strip()
 

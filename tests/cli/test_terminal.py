@@ -119,7 +119,7 @@ def test_remaining_time_ignores_disabled_stage(tmp_path: Path) -> None:
     without = left.seconds()
     assert with_dense is not None
     assert without is not None
-    assert with_dense > without + 10  # ten images of mapping, and of dense
+    assert with_dense > without + 10  # ten images in mapping, and ten in the dense stage
     left.finish_stage("results")
     left.start_stage("report", 10)
     left.finish_stage("report")

@@ -1,4 +1,4 @@
-"""Merging, overrides, and errors that say where and what."""
+"""Tests of merging, overrides and error messages of configurations."""
 
 from __future__ import annotations
 
@@ -33,11 +33,11 @@ class KeypointOptions(Options):
 
 
 def factory(*_: object) -> None:
-    """These tests construct no provider."""
+    """Provider factory that no test of this module calls."""
 
 
 def make_registry() -> Registry:
-    """Stand-ins for the providers that the shipped configurations name, and some more."""
+    """Registry with fake providers for all names in the shipped configurations."""
     sparse, dense = frozenset({"sparse"}), frozenset({"dense"})
     registry = Registry()
     registry.add(
@@ -79,7 +79,7 @@ QUICK = "{features: {use: sift}, matcher: {use: mutual-nearest}}"
 
 
 class TestMerging:
-    def test_a_child_changes_what_it_names(self, load: Load) -> None:
+    def test_child_file_replaces_named_settings(self, load: Load) -> None:
         config = load(
             "extends: fast-cpu\nfeatures:\n  options:\n    max_keypoints: 7\nruntime: {seed: 3}\n"
         )
@@ -90,7 +90,7 @@ class TestMerging:
         assert config.runtime.seed == 3
         assert config.description == ""
 
-    def test_another_provider_drops_the_parents_options(self, load: Load, tmp_path: Path) -> None:
+    def test_other_provider_drops_options_of_parent(self, load: Load, tmp_path: Path) -> None:
         (tmp_path / "parent.yaml").write_text(
             "extends: fast-cpu\n"
             "depth:\n  use: onnx\n  options: {model: a.onnx}\n  wrap: [{use: flip}]\n"
@@ -102,14 +102,14 @@ class TestMerging:
         assert changed.depth.options == {"directory": "d", "scale": 1.0, "weights": {}}
         assert changed.depth.wrap == ()
 
-    def test_extends_is_relative_to_its_file(self, tmp_path: Path) -> None:
+    def test_extends_path_is_relative_to_its_file(self, tmp_path: Path) -> None:
         (tmp_path / "sub").mkdir()
         (tmp_path / "base.yaml").write_text("extends: fast-cpu\nruntime: {threads: 5}\n")
         (tmp_path / "sub" / "run.yaml").write_text("extends: ../base.yaml\n")
         config = load_config(tmp_path / "sub" / "run.yaml", (), make_registry())
         assert config.runtime.threads == 5
 
-    def test_null_removes_a_block(self, load: Load) -> None:
+    def test_null_removes_block(self, load: Load) -> None:
         config = load("extends: fast-cpu\nmatcher: null\ndense_matcher: {use: loftr}\n")
         assert config.matcher is None
         assert config.dense_matcher is not None
@@ -145,7 +145,7 @@ class TestMerging:
             ("matcher: {use: lighterglue}", (f"fast_pass={QUICK}",), None),
         ],
     )
-    def test_dropping_the_fast_pass_unasked_is_a_warning(
+    def test_dropping_the_fast_pass_implicitly_warns(
         self, load: Load, text: str, overrides: Sequence[str], named: str | None
     ) -> None:
         warnings = load(f"extends: fast-cpu\n{text}", *overrides).warnings
@@ -157,7 +157,7 @@ class TestMerging:
         for name in ("sift", "fast-cpu"):
             assert load_config(name, (), make_registry()).warnings == ()
 
-    def test_circles_are_told(self, tmp_path: Path) -> None:
+    def test_extends_in_a_circle_is_an_error(self, tmp_path: Path) -> None:
         (tmp_path / "a.yaml").write_text("extends: b.yaml\n")
         (tmp_path / "b.yaml").write_text("extends: a.yaml\n")
         with pytest.raises(ConfigError, match=r"circle: .*a\.yaml -> .*b\.yaml -> .*a\.yaml"):
@@ -165,7 +165,7 @@ class TestMerging:
 
 
 class TestOverrides:
-    def test_values_are_yaml(self, load: Load) -> None:
+    def test_override_values_are_yaml(self, load: Load) -> None:
         config = load(
             "extends: fast-cpu\n",
             "depth.options.model=runs/2024-01-01",
@@ -184,11 +184,11 @@ class TestOverrides:
             ("depth={use: files, options: {directory: d}}",),
         ],
     )
-    def test_their_order_does_not_matter(self, load: Load, overrides: Sequence[str]) -> None:
+    def test_order_of_overrides_does_not_matter(self, load: Load, overrides: Sequence[str]) -> None:
         config = load("extends: fast-cpu\ndepth: {options: {model: a}}\n", *overrides)
         assert config.depth.options["directory"] == "d"
 
-    def test_lists_by_index(self, load: Load) -> None:
+    def test_override_of_list_entry_by_index(self, load: Load) -> None:
         text = "extends: fast-cpu\n"
         masks = ("masks.0.use=files", "masks.0.options.directory=m")
         assert load(text, *masks).masks[0].options["directory"] == "m"
@@ -198,12 +198,12 @@ class TestOverrides:
         assert [mask.options["scale"] for mask in config.masks] == [2.0, 1.0]
 
     @pytest.mark.parametrize("text", ["runtime.seed", "=3", "runtime..seed=3"])
-    def test_what_does_not_look_like_one(self, load: Load, text: str) -> None:
+    def test_override_without_assignment_is_an_error(self, load: Load, text: str) -> None:
         assert f"--set {text}: must look like a.b=value" in error_of(
             load, "extends: fast-cpu\n", text
         )
 
-    def test_an_entry_far_behind_the_end(self, load: Load) -> None:
+    def test_override_beyond_end_of_list_is_an_error(self, load: Load) -> None:
         message = error_of(load, "extends: fast-cpu\n", "masks.2.use=files")
         assert message == "--set masks.2.use=files: entry 2 of a list that has 0"
 
@@ -251,23 +251,23 @@ class TestErrors:
             ),
         ],
     )
-    def test_file_line_path_and_nearest_name(
+    def test_error_names_file_line_path_and_nearest_key(
         self, load: Load, tmp_path: Path, text: str, message: str
     ) -> None:
         told = error_of(load, f"extends: fast-cpu\n{text}")
         assert message in told
         assert str(tmp_path) in told
 
-    def test_overrides_are_blamed_by_their_text(self, load: Load) -> None:
+    def test_error_in_override_quotes_the_override(self, load: Load) -> None:
         message = error_of(load, "extends: fast-cpu\n", "runtime.seed=-1", "depth.ues=onnx")
         assert "--set runtime.seed=-1: runtime.seed: " in message
         assert "--set depth.ues=onnx: depth.ues: unknown key; did you mean 'use'?" in message
 
-    def test_all_backends_are_told_at_once(self, load: Load) -> None:
+    def test_errors_of_all_providers_are_reported_together(self, load: Load) -> None:
         message = error_of(load, "extends: fast-cpu\n", "depth.use=a", "normals.use=b")
         assert "no depth provider 'a'" in message and "no normals provider 'b'" in message
 
-    def test_names_and_files_that_do_not_exist(self, load: Load, tmp_path: Path) -> None:
+    def test_missing_configuration_is_an_error(self, load: Load, tmp_path: Path) -> None:
         with pytest.raises(ConfigError, match="no configuration 'fast-cup'; did you mean 'fast-c"):
             load_config("fast-cup", (), make_registry())
         with pytest.raises(ConfigError, match=r"gone\.yaml: no such configuration file"):
@@ -279,7 +279,7 @@ class TestErrors:
         ("content", "message"),
         [(b"- a\n", "must be a mapping, is a list"), (b"\xff\xfe\x00", "cannot be read")],
     )
-    def test_a_file_that_is_no_configuration(
+    def test_file_without_mapping_is_an_error(
         self, tmp_path: Path, content: bytes, message: str
     ) -> None:
         (tmp_path / "run.yaml").write_bytes(content)
@@ -288,7 +288,7 @@ class TestErrors:
 
 
 class TestResult:
-    def test_the_effective_configuration_loads_to_itself(self, load: Load, tmp_path: Path) -> None:
+    def test_effective_configuration_reloads_unchanged(self, load: Load, tmp_path: Path) -> None:
         config = load(
             "extends: fast-cpu\n",
             "depth.options.model='1e-3'",
@@ -301,7 +301,7 @@ class TestResult:
         assert again == config
         assert again.depth.options["model"] == "1e-3"
 
-    def test_a_calibration_file_is_read_beside_the_file_that_names_it(
+    def test_calibration_path_is_relative_to_its_configuration(
         self, load: Load, tmp_path: Path
     ) -> None:
         (tmp_path / "kitchen.json").write_text('{"relative_std": 0.07}')
@@ -310,7 +310,7 @@ class TestResult:
         assert config.depth.calibration["relative_std"] == 0.07
         assert config.depth.calibration["std_floor"] == 0.02
 
-    def test_incomplete_configurations_can_be_looked_at(self, load: Load) -> None:
+    def test_incomplete_configuration_loads_if_allowed(self, load: Load) -> None:
         text = "extends: fast-cpu\ndepth: {use: files, options: {scale: 2}}\n"
         assert load(text, complete=False).depth.options == {
             "directory": None,
@@ -320,7 +320,7 @@ class TestResult:
         with pytest.raises(ConfigError, match="unknown key"):
             load(text, "depth.options.scael=3", complete=False)
 
-    def test_the_shipped_files(self) -> None:
+    def test_shipped_configurations_are_listed(self) -> None:
         assert {"default", "fast-cpu", "sensor-depth"} <= shipped_configs().keys()
 
 
@@ -342,17 +342,17 @@ class TestYaml:
             ("1.2.3", "1.2.3"),
         ],
     )
-    def test_scalars(self, text: str, value: object) -> None:
+    def test_yaml_scalars_follow_version_1_2(self, text: str, value: object) -> None:
         found = parse_yaml(text, "test")
         assert found == value and type(found) is type(value)
 
     @pytest.mark.parametrize("value", ["1e-3", "no", "null", "", "12", "a: b", "é", 1e-9, None])
-    def test_what_is_written_reads_back(self, value: object) -> None:
+    def test_written_yaml_reads_back(self, value: object) -> None:
         assert parse_yaml(write_yaml({"key": value}), "test") == {"key": value}
 
 
 def sections(options: type[Options]) -> Iterator[tuple[str, type[Options], object]]:
-    """Every section below a group of settings that has a default: its name, type and default."""
+    """Yield name, type and default of every nested section of settings that has a default."""
     for name, field in options.model_fields.items():
         kind = field.annotation
         if isinstance(kind, type) and issubclass(kind, Options) and not field.is_required():
@@ -364,7 +364,5 @@ def sections(options: type[Options]) -> Iterator[tuple[str, type[Options], objec
     ("kind", "default"),
     [pytest.param(kind, default, id=name) for name, kind, default in sections(Config)],
 )
-def test_a_section_set_in_part_keeps_its_other_defaults(
-    kind: type[Options], default: object
-) -> None:
+def test_partly_set_section_keeps_other_defaults(kind: type[Options], default: object) -> None:
     assert kind() == default

@@ -1,4 +1,4 @@
-"""The shipped configurations: each loads, fits the plugins and is documented."""
+"""Tests that each shipped configuration loads, fits the plugins and is documented."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ GUIDE = ROOT / "docs" / "backends.md"
 
 @pytest.fixture(scope="module")
 def registry() -> Registry:
-    """All plugins; skips where one that a configuration names is not installed."""
+    """Registry of all plugins; tests are skipped if a plugin is not installed."""
     registry = Registry.discover()
     here = {line.distribution for line in registry.status()}
     missing = {home.partition("[")[0] for home in PLUGIN_PROVIDERS} - here
@@ -35,7 +35,7 @@ def registry() -> Registry:
 
 
 def closed(config: Config, registry: Registry) -> Config:
-    """With the first choice of each block."""
+    """Return the configuration with the first choice of each provider block."""
     joint = "joint-normals" in registry.spec("depth", config.depth.use).capabilities
     for path, _, backend in list(config.provider_configs()):
         chosen = {"use": backend.use, "fallback": ()}
@@ -48,7 +48,7 @@ def closed(config: Config, registry: Registry) -> Config:
 
 
 def required(config: Config, registry: Registry) -> list[str]:
-    """Options that only the user can know, as ``--set`` names them."""
+    """Return the required options without default, as ``--set`` keys."""
     found = []
     for path, kind, backend in closed(config, registry).provider_configs():
         given = {key: value for key, value in backend.options.items() if value is not None}
@@ -60,7 +60,7 @@ def required(config: Config, registry: Registry) -> list[str]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_loads_and_resolves(name: str, registry: Registry) -> None:
+def test_shipped_configuration_loads_and_resolves(name: str, registry: Registry) -> None:
     config = load_config(name, (), registry, complete=False)
     assert describe_shipped()[name]
     complete = load_config(name, [f"{o}=FILE" for o in required(config, registry)], registry)
@@ -77,8 +77,8 @@ def test_loads_and_resolves(name: str, registry: Registry) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_says_what_it_has_to_be_told(name: str, registry: Registry) -> None:
-    """In a comment of the file, or of one that it extends."""
+def test_shipped_configuration_documents_required_options(name: str, registry: Registry) -> None:
+    """A comment of the configuration file or of its parents shows the ``--set`` option."""
     texts = {path.stem: path.read_text(encoding="utf-8") for path in shipped_configs().values()}
     text, parent = "", name
     while parent:
@@ -89,11 +89,10 @@ def test_says_what_it_has_to_be_told(name: str, registry: Registry) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_needs_nothing_but_what_can_be_fetched_or_exported(
+def test_shipped_configuration_needs_only_available_weights(
     name: str, registry: Registry, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Files have to be named for the maps of a sensor, and for two networks that nobody publishes
-    and nothing exports yet."""
+    """Only sensor depth, MASt3R and RoMa need file names, because their files are not published."""
     monkeypatch.setenv("MPSFM_EXPORTS", str(tmp_path))
     file = tmp_path / "dsine.onnx"
     file.touch()
@@ -109,8 +108,8 @@ def test_needs_nothing_but_what_can_be_fetched_or_exported(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_tells_what_to_install(name: str, registry: Registry) -> None:
-    """Without any plugin the error names the package of the first thing that is missing."""
+def test_shipped_configuration_without_plugins_names_package(name: str, registry: Registry) -> None:
+    """Without plugins, the error names the packages of the missing providers."""
     config = load_config(name, (), registry, complete=False)
     wanted = [
         (kind, name)
@@ -124,7 +123,7 @@ def test_tells_what_to_install(name: str, registry: Registry) -> None:
     assert all(hint in str(caught.value) for hint in hints)
 
 
-def test_one_pass_gives_depth_and_normals_where_nothing_wraps_them(registry: Registry) -> None:
+def test_depth_and_normals_of_one_network_have_same_options(registry: Registry) -> None:
     for name in NAMES:
         config = closed(load_config(name, (), registry, complete=False), registry)
         joint = "joint-normals" in registry.spec("depth", config.depth.use).capabilities
@@ -133,13 +132,13 @@ def test_one_pass_gives_depth_and_normals_where_nothing_wraps_them(registry: Reg
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_is_described(name: str) -> None:
+def test_shipped_configuration_is_in_guide_and_readme(name: str) -> None:
     assert f"| `{name}` |" in GUIDE.read_text(encoding="utf-8")
     assert f"`{name}`" in (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def test_every_first_party_provider_is_announced_and_in_the_guide(registry: Registry) -> None:
-    """What to install for it is known without its plugin."""
+def test_every_first_party_provider_is_documented(registry: Registry) -> None:
+    """The core knows which package provides each first-party provider."""
     text = GUIDE.read_text(encoding="utf-8")
     homes = {home.partition("[")[0] for home in PLUGIN_PROVIDERS}
     found = set()
@@ -152,7 +151,7 @@ def test_every_first_party_provider_is_announced_and_in_the_guide(registry: Regi
 
 
 @pytest.mark.parametrize("name", ["default", "fast-cpu", "demo"])
-def test_runs_with_nothing_named_and_without_a_network_connection(
+def test_shipped_configuration_resolves_offline(
     name: str, registry: Registry, tmp_path: Path
 ) -> None:
     offline = ("runtime.offline=true", f"runtime.cache_dir={tmp_path}")

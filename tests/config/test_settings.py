@@ -1,4 +1,4 @@
-"""Separation of user settings from expert settings."""
+"""Tests of the separation of user settings from expert settings."""
 
 from __future__ import annotations
 

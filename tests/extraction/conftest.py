@@ -1,4 +1,4 @@
-"""A folder of photos of the analytic room, and providers that know the truth and count calls."""
+"""Photos of a synthetic room, and ground-truth providers that count their calls."""
 
 from __future__ import annotations
 
@@ -38,14 +38,14 @@ INTRINSICS = "1: {params: [140, 140, 80, 60], images: all}"
 
 
 class FakeOptions(Options):
-    """``weights`` names a file that the provider's output would depend on."""
+    """Options of the test providers; ``weights`` is a file that is part of the cache key."""
 
     flavour: int = 0
     weights: str = ""
 
 
 class Truth:
-    """What the images show, rendered once for all tests."""
+    """Ground truth of the images, rendered once for all tests."""
 
     def __init__(self) -> None:
         self.names = [f"view{number}.png" for number in range(COUNT)]
@@ -103,7 +103,7 @@ class World:
         return extract(images, config, self.registry, events)
 
     def asked(self) -> Counter[str]:
-        """Calls by kind since the last time this was asked for."""
+        """Return the number of provider calls by kind since the last call of this method."""
         counts: Counter[str] = Counter()
         for (kind, _), number in self.calls.items():
             counts[kind] += number
@@ -115,7 +115,7 @@ class World:
         return self.break_on.get((kind, name), lambda: None)()
 
     def positions(self, name: str) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels and world points of the common points that a view sees."""
+        """Return pixels and world coordinates of the shared 3D points that a view observes."""
         first = self.poses[self.names[1]]
         found = self.scene.correspondences(CAMERA, first, CAMERA, self.poses[name], self.seeds)
         return found.xy_b[found.visible], found.points[found.visible]
@@ -155,7 +155,7 @@ class Fake:
 
 
 class TrueFeatures(Fake):
-    """Projections of common points; the descriptor is the point."""
+    """Feature provider: keypoints are projections of 3D points, descriptors their coordinates."""
 
     def extract(self, view: View) -> Features:
         self.world.count("features", view.name)
@@ -185,7 +185,7 @@ class TrueJoint(TrueDepth):
 
 
 class TrueDense(Fake):
-    """Exact matches on a grid of 10 pixels."""
+    """Dense matcher: ground-truth matches on a grid of 10 pixels."""
 
     def match(self, view_a: View, view_b: View, features_a=None, features_b=None) -> PairMatches:
         assert features_a is None and features_b is None
@@ -200,7 +200,7 @@ class TrueDense(Fake):
 
 
 class TrueDenseDepth(TrueDense):
-    """The depth's std is 10 % less 1 % for each image the two are apart."""
+    """Matcher with depth: the relative std is 10 % minus 1 % per image between the two images."""
 
     def match(self, view_a: View, view_b: View, features_a=None, features_b=None) -> PairMatches:
         found = super().match(view_a, view_b)
@@ -214,7 +214,7 @@ class TrueDenseDepth(TrueDense):
 
 
 class TrueRetrieval(Fake):
-    """The camera's place on the arc."""
+    """Retrieval provider: the descriptor is the camera's position on the arc."""
 
     def describe(self, view: View) -> np.ndarray:
         self.world.count("retrieval", view.name)
@@ -223,7 +223,7 @@ class TrueRetrieval(Fake):
 
 
 class LeftMask(Fake):
-    """Only the left half may be used; ``flavour`` pixels more."""
+    """Mask provider: the left half, plus ``flavour`` pixel columns, is usable."""
 
     def mask(self, view: View) -> np.ndarray:
         self.world.count("mask", view.name)

@@ -1,4 +1,4 @@
-"""Cache entries: complete, exact, found by their content, computed again when damaged."""
+"""Tests of the content-addressed cache of provider results."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def examples() -> dict[str, object]:
 
 
 @pytest.mark.parametrize("name", examples())
-def test_round_trip(name: str, tmp_path: Path) -> None:
+def test_cache_store_then_load_returns_equal_object(name: str, tmp_path: Path) -> None:
     value = examples()[name]
     cache = Cache(tmp_path)
     assert cache.load("kind", KEY, type(value)) is None
@@ -72,7 +72,7 @@ def test_round_trip(name: str, tmp_path: Path) -> None:
     assert digest(found) == digest(value)
 
 
-def test_digest_sees_everything() -> None:
+def test_digest_changes_with_any_array() -> None:
     prior = depth()
     changed = prior.depth.copy()
     changed[0, 0] = np.nextafter(changed[0, 0], 9)
@@ -86,7 +86,7 @@ def test_digest_sees_everything() -> None:
     assert digest(prior) == digest(DepthPrior(prior.depth, prior.variance, prior.valid))
 
 
-def test_key_is_of_content_not_of_order() -> None:
+def test_content_key_ignores_order_of_dictionary() -> None:
     assert content_key({"a": 1, "b": [2]}) == content_key({"b": [2], "a": 1})
     assert content_key({"a": 1}) != content_key({"a": 1.5}) != content_key(["a", 1.5])
     assert content_key("a", "b") != content_key("ab")
@@ -115,14 +115,18 @@ def test_damaged_entry_is_computed_again(
     assert cache.load("depth", KEY, DepthPrior) is not None
 
 
-def test_entry_of_another_kind_of_thing(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_cache_entry_of_another_class_is_computed_again(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     cache = Cache(tmp_path)
     cache.store("depth", KEY, depth())
     assert cache.load("depth", KEY, Features) is None
     assert "damaged" in caplog.text
 
 
-def test_disk_full_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_store_on_full_disk_raises_output_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -133,13 +137,15 @@ def test_disk_full_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.Monkey
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
-def test_folder_that_cannot_be_written(tmp_path: Path) -> None:
+def test_cache_store_below_a_file_raises_output_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(OutputError, match="cannot write to the cache"):
         Cache(tmp_path / "file").store("depth", KEY, depth())
 
 
-def test_place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_cache_folder_default_and_environment_variable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("MPSFM_CACHE", str(tmp_path / "environment"))
     assert Cache().folder == tmp_path / "environment" / "extraction"
     assert Cache(tmp_path).folder == tmp_path / "extraction"
@@ -159,7 +165,7 @@ for number in range(10_000):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
-def test_killed_writer_leaves_only_whole_entries(
+def test_killed_writer_leaves_only_complete_entries(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     cache = Cache(tmp_path)

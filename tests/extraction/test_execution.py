@@ -35,7 +35,7 @@ CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
 
 
 class Pickled:
-    """Does a step as another process would: from its pickle."""
+    """Executor that processes items from a pickled step, like another process."""
 
     def __init__(self) -> None:
         self.stages: dict[str, int] = {}
@@ -96,7 +96,9 @@ def run(tmp_path: Path, plugin: Plugin) -> Callable[..., Extraction]:
     return run
 
 
-def test_results_are_those_of_threads(run: Callable[..., Extraction], plugin: Plugin) -> None:
+def test_executor_results_equal_results_of_threads(
+    run: Callable[..., Extraction], plugin: Plugin
+) -> None:
     here, there = run("threads"), run("pickled")
     assert not describe_difference(here.problem, there.problem)
     executor = plugin.executor
@@ -105,7 +107,9 @@ def test_results_are_those_of_threads(run: Callable[..., Extraction], plugin: Pl
     assert all(line["computed"] == 0 for line in there.report["providers"] if line["from_cache"])
 
 
-def test_masks_and_retrieval(run: Callable[..., Extraction], plugin: Plugin) -> None:
+def test_executor_computes_masks_and_retrieval(
+    run: Callable[..., Extraction], plugin: Plugin
+) -> None:
     changes = {
         "masks": (ProviderConfig(use="sky-simple"),),
         "retrieval": ProviderConfig(use="appearance"),
@@ -116,7 +120,7 @@ def test_masks_and_retrieval(run: Callable[..., Extraction], plugin: Plugin) -> 
     assert plugin.executor.stages["masks"] == plugin.executor.stages["retrieval"] == 3
 
 
-def test_a_cache_that_is_not_shared(
+def test_executor_without_shared_cache_is_an_input_error(
     run: Callable[..., Extraction], plugin: Plugin, tmp_path: Path
 ) -> None:
     plugin.executor.another_cache = tmp_path / "elsewhere"
@@ -128,7 +132,7 @@ def test_a_cache_that_is_not_shared(
 @pytest.mark.parametrize(
     ("name", "hint"), [("dask", "pip install mpsfm-dask"), ("thread", "did you mean 'threads'")]
 )
-def test_no_such_executor(
+def test_unknown_executor_is_a_config_error(
     run: Callable[..., Extraction], monkeypatch: pytest.MonkeyPatch, name: str, hint: str
 ) -> None:
     monkeypatch.setattr(Registry, "hook", _NoHook())
@@ -150,7 +154,7 @@ class _NoHook:
         ReconstructionError("none", {"status": "failed"}),
     ],
 )
-def test_errors_come_from_other_processes_as_they_were(error: Exception) -> None:
+def test_errors_survive_pickling(error: Exception) -> None:
     arrived = pickle.loads(pickle.dumps(error))
     assert type(arrived) is type(error) and str(arrived) == str(error)
     assert vars(arrived) == vars(error)

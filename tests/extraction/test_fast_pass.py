@@ -1,4 +1,4 @@
-"""Quick matching first, and further matches of the photos that it does not hold."""
+"""Tests of the fast pass and of further matches for images with few points."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ DENSE = {"features": None, "matcher": None, "dense_matcher": ProviderConfig(use=
 
 
 def distances_to_epipolar_lines(world, extraction: Extraction, pair) -> Float64:
-    """Of all matches of a pair, in units of the normalised image plane."""
+    """Return the epipolar errors of all matches of a pair, in normalized image coordinates."""
     names = [extraction.problem.images[index].name for index in (pair.image_a, pair.image_b)]
     a, b = (world.poses[name] for name in names)
     rotation = b[:, :3] @ a[:, :3].T
@@ -33,13 +33,13 @@ def distances_to_epipolar_lines(world, extraction: Extraction, pair) -> Float64:
     return np.abs(along) / np.linalg.norm(lines[:, :2], axis=1)
 
 
-def test_more_matches_of_one_photo(world) -> None:
+def test_extend_matches_adds_matches_of_one_image(world) -> None:
     first = world.extract()
     assert world.asked() == {"features": 4, "depth": 4, "normals": 4}
     config = world.config(**DENSE)
     images = load_images(world.root / "images", world.root / "intrinsics.yaml")
     both = extend_matches(images, config, world.registry, first, {3})
-    assert world.asked() == {"dense": 3}  # its pairs alone, and no prior again
+    assert world.asked() == {"dense": 3}  # only pairs of the image, and no priors
     assert [len(image.keypoints) for image in both.problem.images[:3]] > [
         len(image.keypoints) for image in first.problem.images[:3]
     ]
@@ -49,7 +49,7 @@ def test_more_matches_of_one_photo(world) -> None:
         np.testing.assert_array_equal(pair.matches[: len(earlier)], earlier.matches)
         assert (len(pair) > len(earlier)) == (pair.image_b == 3)
         added = distances_to_epipolar_lines(world, both, pair)[len(earlier) :]
-        assert (added < 1e-6).all()  # rows of the right keypoints
+        assert (added < 1e-6).all()  # match rows index the right keypoints
     for image, earlier in zip(both.problem.images, first.problem.images, strict=True):
         assert image.depth is earlier.depth and image.normals is earlier.normals
     report = both.report
@@ -59,7 +59,7 @@ def test_more_matches_of_one_photo(world) -> None:
     assert [provider["kind"] for provider in report["providers"]].count("matcher") == 2
 
 
-def test_a_pair_that_quick_matching_dropped(world) -> None:
+def test_extend_matches_verifies_pair_that_fast_pass_dropped(world) -> None:
     first = world.extract(matcher=ProviderConfig(use="mutual-nearest", options={"ratio": 0.001}))
     assert not first.problem.pairs
     images = load_images(world.root / "images", world.root / "intrinsics.yaml")
@@ -69,8 +69,8 @@ def test_a_pair_that_quick_matching_dropped(world) -> None:
     assert kept == [[world.names[0], name] for name in world.names[1:]]
 
 
-def test_photos_that_are_held_ask_for_no_partners(world) -> None:
-    """The last photo is most like the one before it, which is its neighbour too."""
+def test_extend_matches_uses_number_of_partners_of_fast_pass(world) -> None:
+    """The most similar image of the last image is also its neighbor in the sequence."""
     pairs = PairOptions(mode="auto", partners=2, overlap=1)
     fast_pass = TRUTH.model_copy(update={"partners": 1})
     images = load_images(world.root / "images", world.root / "intrinsics.yaml")
@@ -86,7 +86,7 @@ def test_photos_that_are_held_ask_for_no_partners(world) -> None:
 
 
 @pytest.mark.parametrize(("fast_pass", "asked"), [(TRUTH, 0), ("weak", 6)])
-def test_photos_that_are_held_are_not_matched_again(world, fast_pass, asked: int) -> None:
+def test_constrained_images_are_not_matched_again(world, fast_pass, asked: int) -> None:
     if fast_pass == "weak":
         sift = ProviderConfig(use="sift", options={"max_keypoints": 5})
         fast_pass = TRUTH.model_copy(update={"features": sift})
@@ -109,8 +109,8 @@ def test_photos_that_are_held_are_not_matched_again(world, fast_pass, asked: int
     ]
 
 
-def test_the_same_features_are_not_found_twice(world) -> None:
-    """Where networks cannot be had both are SIFT."""
+def test_same_features_in_both_passes_skip_second_pass(world) -> None:
+    """Without networks, both passes use SIFT."""
     assert not world.config(fast_pass=TRUTH).has_second_pass
     assert world.config(**DENSE, fast_pass=TRUTH).has_second_pass
     assert not world.config().has_second_pass

@@ -1,4 +1,4 @@
-"""Focal lengths by the depth provider, for photos that do not tell them."""
+"""Tests of focal length estimation by the depth provider."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ ESTIMATES = {"view0.png": 150.0, "view1.png": 130.0, "view2.png": 100.0, "view3.
 
 @pytest.fixture
 def estimated(world):
-    """The images with estimated focal lengths, and how often the provider was asked."""
+    """Return images with estimated focal lengths, and the calls of the depth provider."""
     asked = []
 
     class Sees:
@@ -37,31 +37,31 @@ def estimated(world):
     return run
 
 
-def test_images_of_one_camera_get_the_median(estimated) -> None:
+def test_focal_length_of_camera_is_median_of_its_images(estimated) -> None:
     images, asked = estimated()
     assert sorted(asked) == sorted(ESTIMATES)
     assert [image.pinhole.fx for image in images] == [130.0] * 4
     assert all(image.focal_source == "provider" and not image.focal_known for image in images)
 
 
-def test_it_is_asked_once_for_a_photo(estimated) -> None:
+def test_focal_length_estimate_is_cached(estimated) -> None:
     first, _ = estimated()
     again, asked = estimated()
     assert len(asked) == 4
     assert [image.pinhole for image in again] == [image.pinhole for image in first]
 
 
-def test_known_focal_lengths_stay(estimated, world) -> None:
+def test_known_focal_lengths_are_unchanged(estimated, world) -> None:
     images, asked = estimated(intrinsics=world.root / "intrinsics.yaml")
     assert asked == [] and images[0].pinhole.fx == 140.0
 
 
-def test_a_provider_that_cannot_tell_changes_nothing(estimated) -> None:
+def test_provider_without_focal_estimates_changes_nothing(estimated) -> None:
     images, _ = estimated("truth")
     assert images[0].focal_source == "default"
 
 
-def test_where_it_cannot_tell_the_default_stays(estimated, monkeypatch) -> None:
+def test_failed_focal_estimate_leaves_default(estimated, monkeypatch) -> None:
     monkeypatch.setattr(f"{__name__}.ESTIMATES", dict.fromkeys(ESTIMATES))
     images, asked = estimated()
     assert len(asked) == 4 and images[0].focal_source == "default"

@@ -1,4 +1,4 @@
-"""Keypoints of verified matches become exact; those without alignments stay."""
+"""Tests of keypoint adjustment by patch alignment."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def pair_of(matches: list[tuple[int, int]], images: tuple[int, int] = (0, 1)) ->
 
 
 def says(offset: np.ndarray, rows: list[int] | None = None) -> AlignedPair:
-    """Alignments that find no rotation or scale, exact to 0.05 px."""
+    """Build alignments with identity warp and a standard deviation of 0.05 px."""
     count = len(offset)
     return AlignedPair(
         np.arange(count) if rows is None else np.array(rows),
@@ -63,8 +63,8 @@ def says(offset: np.ndarray, rows: list[int] | None = None) -> AlignedPair:
     )
 
 
-def test_the_warp_is_that_of_a_facing_plane() -> None:
-    """Held against finite differences of the plane's own projection."""
+def test_fronto_parallel_warp_equals_finite_differences() -> None:
+    """The warp equals finite differences of the plane's projection."""
     rng = np.random.default_rng(0)
     xy, depth = rng.uniform(40, 200, (20, 2)), rng.uniform(1, 4, 20)
     rotation, translation = relative(*arc_poses(2, 25.0))
@@ -78,7 +78,7 @@ def test_the_warp_is_that_of_a_facing_plane() -> None:
     assert np.abs(warp - np.stack(numeric, axis=2)).max() < 1e-6
 
 
-def test_the_warp_without_parallax_is_the_rotation_s() -> None:
+def test_fronto_parallel_warp_without_parallax_is_rotation_homography() -> None:
     xy = np.array([[100.0, 90.0], [200.0, 30.0]])
     rotation, _ = relative(*arc_poses(2, 10.0))
 
@@ -86,15 +86,16 @@ def test_the_warp_without_parallax_is_the_rotation_s() -> None:
         return project(CAMERA, transform(rotation, np.zeros(3), unproject(CAMERA, xy, [far, far])))
 
     numeric = [(seen(xy + 1e-4 * e, 1.0) - seen(xy - 1e-4 * e, 1.0)) / 2e-4 for e in np.eye(2)]
-    for translation in (np.zeros(3), np.array([0.0, 0.0, -1.0])):  # behind the cameras: far away
+    # With the second translation, points are behind a camera and use the plane at infinity.
+    for translation in (np.zeros(3), np.array([0.0, 0.0, -1.0])):
         warp = fronto_parallel_warp(side(xy), side(seen(xy, 1.0)), rotation, translation)
         if not translation.any():
             assert np.abs(warp - np.stack(numeric, axis=2)).max() < 1e-6
         assert np.isfinite(warp).all()
 
 
-def test_both_orders_of_a_pair_say_the_same() -> None:
-    """The template is the finer image's, whichever it is."""
+def test_align_pair_is_symmetric_in_both_views() -> None:
+    """The template comes from the image of higher resolution, in either order of the pair."""
     scene, poses = room_scene(), arc_poses(2, 10.0)
     views = [
         smooth_gray_image(scene.render(camera, pose).rgb, 1.0)
@@ -110,15 +111,15 @@ def test_both_orders_of_a_pair_say_the_same() -> None:
     left = forth.offset + np.einsum("mij,mj->mi", forth.warp, back.offset)
     assert np.median(np.linalg.norm(left, axis=1)) < 0.02
     assert np.median(np.abs(forth.warp @ back.warp - np.eye(2))) < 0.02
-    # In units of b, and of a: information transforms as the offsets do.
+    # Information and offsets transform in the same way from pixels of b to pixels of a.
     turned = forth.warp.transpose(0, 2, 1) @ forth.information @ forth.warp
     ratio = np.linalg.det(turned) / np.linalg.det(back.information)
     assert 0.5 < np.median(ratio) < 2
     assert np.median(np.linalg.norm(forth.offset, axis=1)) < 0.1
 
 
-def test_shifts_are_the_least_squares_solution() -> None:
-    """Of consistent alignments, held against a dense solution of all equations."""
+def test_solve_shifts_equals_dense_least_squares() -> None:
+    """For consistent alignments, the shifts equal a dense least-squares solution."""
     rng = np.random.default_rng(0)
     count, std = 12, np.ones(12)
     a, b = np.triu_indices(count, 1)
@@ -140,17 +141,17 @@ def test_shifts_are_the_least_squares_solution() -> None:
     assert np.abs(found - truth).max() < 0.05
 
 
-def test_two_keypoints_share_what_is_between_them() -> None:
+def test_adjust_keypoints_shares_offset_by_variance() -> None:
     keypoints = [np.array([[10.0, 10.0]]), np.array([[20.0, 20.0]])]
     pairs, found = [pair_of([(0, 0)])], [says(np.array([[0.6, -0.4]]))]
     a, b = adjust_keypoints(keypoints, [1.0, 1.0], pairs, found, 3.0)
     assert np.allclose(a.keypoints, [[9.7, 10.2]], atol=0.01)
     assert np.allclose(b.keypoints, [[20.3, 19.8]], atol=0.01)
-    a, b = adjust_keypoints(keypoints, [0.1, 1.0], pairs, found, 9.0)  # a is known better
+    a, b = adjust_keypoints(keypoints, [0.1, 1.0], pairs, found, 9.0)  # smaller std of a
     assert np.abs(a.keypoints - keypoints[0]).max() < 0.02
 
 
-def test_an_alignment_that_others_contradict_has_no_say() -> None:
+def test_adjust_keypoints_ignores_outlier_alignment() -> None:
     keypoints = [np.full((1, 2), 50.0) for _ in range(4)]
     pairs = [pair_of([(0, 0)], (a, b)) for a in range(4) for b in range(a + 1, 4)]
     truth = np.array([[0.0, 0.0], [0.5, 0.2], [-0.4, 0.1], [-0.1, -0.3]])
@@ -161,7 +162,7 @@ def test_an_alignment_that_others_contradict_has_no_say() -> None:
     assert np.abs(moved - truth).max() < 0.06
 
 
-def test_what_is_not_measured_stays() -> None:
+def test_keypoints_without_alignment_are_unchanged() -> None:
     keypoints = [np.arange(6.0).reshape(3, 2), np.arange(4.0).reshape(2, 2)]
     pairs = [pair_of([(0, 0), (2, 1)])]
     adjusted = adjust_keypoints(keypoints, [1.0, 1.0], pairs, [says(np.ones((1, 2)), [1])], 3.0)
@@ -171,19 +172,19 @@ def test_what_is_not_measured_stays() -> None:
         assert (after.keypoints[after.measured] != before[after.measured]).all()
 
 
-def test_a_keypoint_that_would_go_far_stays() -> None:
+def test_keypoint_with_too_large_shift_is_unchanged() -> None:
     keypoints = [np.zeros((1, 2)), np.zeros((1, 2))]
     found = [says(np.array([[5.0, 0.0]]))]
     adjusted = adjust_keypoints(keypoints, [1.0, 1.0], [pair_of([(0, 0)])], found, 2.0)
     assert not any(each.measured.any() or each.keypoints.any() for each in adjusted)
 
 
-def test_without_pairs_nothing_moves() -> None:
+def test_adjust_keypoints_without_pairs_changes_nothing() -> None:
     (adjusted,) = adjust_keypoints([np.ones((2, 2))], [1.0], [], [], 3.0)
     assert np.array_equal(adjusted.keypoints, np.ones((2, 2))) and not adjusted.measured.any()
 
 
-def test_images_of_coarse_keypoints_are_made_smaller() -> None:
+def test_smooth_gray_image_of_coarse_keypoints_is_downscaled() -> None:
     rgb = np.random.default_rng(0).integers(0, 255, (100, 200, 3), dtype=np.uint8)
     assert smooth_gray_image(rgb, 0.5).shape == (100, 200)
     assert smooth_gray_image(rgb, 4.0).shape == (25, 50)
@@ -195,7 +196,7 @@ ROUNDED = {"features": ProviderConfig(use="rounded"), "adjustment": AdjustmentOp
 
 
 class RoundedFeatures:
-    """True keypoints as a network gives them: of whole pixels."""
+    """Scene whose feature provider rounds ground-truth keypoints to whole pixels."""
 
     def __init__(self, world) -> None:
         self._world = world
@@ -229,7 +230,7 @@ def miss(world, problem: MappingProblem, measured: bool) -> float:
     return float(np.median(np.concatenate(off)))
 
 
-def test_rounded_keypoints_become_exact(rounded) -> None:
+def test_adjustment_of_rounded_keypoints_is_subpixel_accurate(rounded) -> None:
     off = rounded.extract(**{**ROUNDED, "adjustment": OFF}).problem
     on = rounded.extract(**ROUNDED).problem
     assert all(image.keypoint_std_factor.min() == 1 for image in off.images)
@@ -248,7 +249,7 @@ def test_rounded_keypoints_become_exact(rounded) -> None:
         assert np.array_equal(a.keypoints, b.keypoints)
 
 
-def test_the_order_of_pairs_does_not_matter(rounded) -> None:
+def test_adjustment_does_not_depend_on_order_of_pairs(rounded) -> None:
     off = rounded.extract(**{**ROUNDED, "adjustment": OFF}).problem
     images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml")
     config = rounded.config(**ROUNDED)
@@ -258,7 +259,7 @@ def test_the_order_of_pairs_does_not_matter(rounded) -> None:
         assert np.abs(a.keypoints - b.keypoints).max() < 1e-6
 
 
-def test_imported_keypoints_stay(rounded) -> None:
+def test_imported_keypoints_are_not_adjusted(rounded) -> None:
     found = rounded.extract(**{**ROUNDED, "adjustment": OFF}).problem
     images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml")
     imported = ImportedMatches(
@@ -274,8 +275,8 @@ def test_imported_keypoints_stay(rounded) -> None:
         assert (image.keypoint_std_factor == 1).all()
 
 
-def test_more_matches_leave_keypoints_that_are_adjusted(rounded) -> None:
-    """Those of the second matching alone are measured, beside the first ones."""
+def test_extend_matches_keeps_adjusted_keypoints(rounded) -> None:
+    """Only keypoints of the second pass are adjusted; the first keypoints are unchanged."""
     images = load_images(rounded.root / "images", rounded.root / "intrinsics.yaml")
     config = rounded.config(**ROUNDED)
     first = extract(images, config, rounded.registry)
@@ -287,8 +288,8 @@ def test_more_matches_leave_keypoints_that_are_adjusted(rounded) -> None:
         assert (after.keypoint_std_factor[count:] < 1).any()
 
 
-def test_a_match_that_no_keypoint_needs_is_not_aligned() -> None:
-    """Of a star the best of its middle, and those that are the only ones of their ends."""
+def test_select_best_matches_drops_matches_that_are_not_best() -> None:
+    """In a star of matches, the best of the center and the only match of each end remain."""
     pairs = [
         replace(pair_of([(0, 0)], (0, other)), scores=np.array([score], np.float32))
         for other, score in ((1, 0.9), (2, 0.5), (3, 0.7))

@@ -1,4 +1,4 @@
-"""Photos that are shown to a multi-view network together, and what the mapper gets of it."""
+"""Tests of image groups of a multi-view network, and of their depth and poses."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from .conftest import World
 
 
-def test_groups_hold_what_sees_the_same() -> None:
-    """Two rooms of three photos, and one photo that shares nothing."""
+def test_choose_groups_joins_images_with_shared_matches() -> None:
+    """Two groups of three images with matches, and one image without matches."""
     matches = {(0, 2): 90, (2, 4): 80, (0, 4): 70, (1, 3): 90, (3, 5): 60, (4, 5): 5}
     groups = choose_groups(7, matches, 3)
     assert [(sorted(group), own) for group, own in groups] == [
@@ -30,8 +30,8 @@ def test_groups_hold_what_sees_the_same() -> None:
     ]
 
 
-def test_every_image_is_in_one_group_and_small_groups_are_filled() -> None:
-    """A chain of seven in groups of three: the last group borrows what it shares most with."""
+def test_choose_groups_partitions_images_and_fills_small_groups() -> None:
+    """A chain of seven images in groups of three; the last group is filled with shared images."""
     matches = {(i, i + 1): 100 - i for i in range(6)}
     groups = choose_groups(7, matches, 3)
     owned = [image for group, own in groups for image in group[:own]]
@@ -39,11 +39,11 @@ def test_every_image_is_in_one_group_and_small_groups_are_filled() -> None:
     assert all(len(group) == 3 and len(set(group)) == 3 for group, _ in groups)
 
 
-def test_groups_in_turn() -> None:
+def test_consecutive_groups_split_in_order() -> None:
     assert consecutive_groups([3, 5, 7, 9, 11], 2) == [(3, 5), (7, 9), (11,)]
 
 
-def test_the_cache_keeps_a_group(tmp_path: Path) -> None:
+def test_multiview_prior_of_group_is_cached(tmp_path: Path) -> None:
     depth = tuple(DepthPrior.from_arrays(np.full((2, 3), 1.0 + i)) for i in range(11))
     group = MultiViewPrior(depth, np.tile(np.eye(3, 4), (11, 1, 1)))
     cache = Cache(tmp_path)
@@ -54,7 +54,7 @@ def test_the_cache_keeps_a_group(tmp_path: Path) -> None:
     assert unpack(MultiViewPrior, pack(MultiViewPrior(()))).depth == ()
 
 
-def test_a_group_checks_itself() -> None:
+def test_multiview_prior_of_wrong_shape_raises() -> None:
     depth = (DepthPrior.from_arrays(np.ones((2, 2))),)
     with pytest.raises(DataError, match=r"poses: must have shape \(1, 3, 4\)"):
         MultiViewPrior(depth, np.zeros((2, 3, 4)))
@@ -64,7 +64,7 @@ def test_a_group_checks_itself() -> None:
 
 @pytest.fixture
 def shown(world: World) -> list[list[str]]:
-    """Adds a multi-view provider that knows the scene; the views that it was shown."""
+    """Add a ground-truth multi-view provider; return the list of views it received."""
     asked: list[list[str]] = []
 
     class TrueGroup:
@@ -90,7 +90,9 @@ def shown(world: World) -> list[list[str]]:
 MULTIVIEW = {"multiview": ProviderConfig(use="truth"), "depth": ProviderConfig(use="multiview")}
 
 
-def test_the_mapper_gets_depth_groups_and_poses(world: World, shown: list[list[str]]) -> None:
+def test_extract_with_multiview_sets_depth_groups_and_poses(
+    world: World, shown: list[list[str]]
+) -> None:
     problem = world.extract(**MULTIVIEW).problem
     (group,) = shown
     assert sorted(group) == sorted(world.names)
@@ -107,7 +109,7 @@ def test_the_mapper_gets_depth_groups_and_poses(world: World, shown: list[list[s
     assert np.median(first.depth.depth) == pytest.approx(2 * np.median(rendered), rel=0.02)
 
 
-def test_a_second_run_asks_nothing_and_the_report_names_the_groups(
+def test_multiview_second_run_uses_cache_and_reports_groups(
     world: World, shown: list[list[str]]
 ) -> None:
     world.extract(**MULTIVIEW)
@@ -117,13 +119,15 @@ def test_a_second_run_asks_nothing_and_the_report_names_the_groups(
     assert [sorted(group) for group in report["groups"]] == [sorted(world.names)]
 
 
-def test_other_depth_takes_no_scale_of_a_group(world: World, shown: list[list[str]]) -> None:
+def test_depth_of_other_provider_has_no_group(world: World, shown: list[list[str]]) -> None:
     problem = world.extract(multiview=ProviderConfig(use="truth")).problem
     assert shown
     assert {(image.depth_group, image.proposed_pose) for image in problem.images} == {(None, None)}
 
 
-def test_the_calibration_is_that_of_the_network(world: World, shown: list[list[str]]) -> None:
+def test_multiview_depth_uses_calibration_of_multiview_network(
+    world: World, shown: list[list[str]]
+) -> None:
     wide = {"relative_std": 0.5, "std_scale": 1.0, "std_floor": 0.0}
     blocks = {**MULTIVIEW, "multiview": ProviderConfig(use="truth", calibration=wide)}
     depth = world.extract(**blocks).problem.images[0].depth
@@ -132,7 +136,7 @@ def test_the_calibration_is_that_of_the_network(world: World, shown: list[list[s
     assert np.median(relative) == pytest.approx(0.5, rel=1e-3)
 
 
-def test_a_provider_that_fails_leaves_depth_unknown(
+def test_failing_multiview_provider_gives_empty_depth(
     world: World, shown: list[list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(options: object, context: object) -> object:
@@ -149,7 +153,7 @@ def test_a_provider_that_fails_leaves_depth_unknown(
     assert not any(image.depth.valid.any() for image in problem.images)
 
 
-def test_depth_of_a_network_that_nobody_names(tmp_path: Path) -> None:
+def test_depth_from_multiview_without_network_is_a_config_error(tmp_path: Path) -> None:
     from mpsfm_core import load_config
 
     with pytest.raises(ConfigError, match=r"multiview: is needed by depth.use: multiview"):

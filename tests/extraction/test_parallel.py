@@ -1,4 +1,4 @@
-"""Stages on several threads, and how many of them."""
+"""Tests of parallel stages and of the number of workers and threads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mpsfm_core.extraction.parallel import run_stage
 from mpsfm_core.providers import ProviderSpec
 
 
-def test_order_is_that_of_the_items() -> None:
+def test_run_stage_returns_results_in_order() -> None:
     def work(item: int) -> int:
         time.sleep(0.02 * (3 - item % 4))
         return item * item
@@ -26,13 +26,13 @@ def test_order_is_that_of_the_items() -> None:
     assert run_stage(NullExtractionEvents(), "stage", [], work, 4) == []
 
 
-def test_items_run_at_the_same_time() -> None:
+def test_run_stage_runs_items_in_parallel() -> None:
     meeting = threading.Barrier(3, timeout=10)
     run_stage(NullExtractionEvents(), "stage", range(3), lambda _: meeting.wait(), 3)
 
 
 @pytest.mark.parametrize("error", [ValueError, KeyboardInterrupt])
-def test_an_error_drops_the_rest(error: type[BaseException]) -> None:
+def test_run_stage_error_cancels_remaining_items(error: type[BaseException]) -> None:
     done: list[int] = []
 
     def work(item: int) -> None:
@@ -53,7 +53,7 @@ def test_an_error_drops_the_rest(error: type[BaseException]) -> None:
     assert len(done) < 20 and watch.finished
 
 
-def test_events_come_from_the_calling_thread() -> None:
+def test_run_stage_sends_events_in_calling_thread() -> None:
     seen: set[int] = set()
 
     class Watch(NullExtractionEvents):
@@ -65,18 +65,20 @@ def test_events_come_from_the_calling_thread() -> None:
 
 
 @pytest.mark.parametrize(("cores", "workers", "threads"), [(1, 1, 1), (2, 2, 1), (16, 4, 4)])
-def test_automatic_numbers(cores, workers, threads, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_worker_and_thread_counts_follow_cores(
+    cores, workers, threads, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(backends, "count_cores", lambda: cores)
     runtime = RuntimeOptions()
     assert (worker_count(runtime), thread_count(runtime)) == (workers, threads)
 
 
-def test_chosen_numbers() -> None:
+def test_worker_and_thread_counts_follow_options() -> None:
     runtime = RuntimeOptions(workers=7, threads=3)
     assert (worker_count(runtime), thread_count(runtime)) == (7, 3)
 
 
-def test_device(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_device_auto_uses_gpu_if_library_of_provider_can(monkeypatch: pytest.MonkeyPatch) -> None:
     network = ProviderSpec(kind="depth", name="n", factory="a:B", requires=("torch",))
     plain = ProviderSpec(kind="depth", name="p", factory="a:B")
     assert backends._device(RuntimeOptions(device="cuda"), network) == "cuda"

@@ -1,4 +1,4 @@
-"""Resizing, masking and edges of prior maps."""
+"""Tests of resizing, masking and edges of prior maps."""
 
 from __future__ import annotations
 
@@ -31,25 +31,25 @@ def normal_prior(shape: tuple[int, int], valid: np.ndarray | None = None) -> Nor
     ("size", "expected"),
     [((1600, 1067), (387, 258)), ((1067, 1600), (258, 387)), ((100, 100), (387, 387))],
 )
-def test_grid_keeps_the_aspect_ratio(size, expected) -> None:
+def test_integration_grid_has_aspect_ratio_of_image(size, expected) -> None:
     assert priors.integration_grid(size, 387) == expected
     assert priors.integration_grid((100_000, 10), 387) == (387, 1)
 
 
-# Pixels that an average covers in part count with their own centre: exact only for whole ratios.
+# Area averaging of a plane is exact for integer ratios only.
 @pytest.mark.parametrize(
     ("grid", "tolerance"), [(GRID, 2e-5), ((150, 100), 2e-5), ((70, 40), 1e-3)]
 )
-def test_planes_stay_planes(grid, tolerance) -> None:
+def test_resize_depth_of_plane_is_exact(grid, tolerance) -> None:
     resized = priors.resize_depth(depth_prior(plane_depth(FULL)), grid)
     assert resized.shape == grid[::-1] and resized.valid.all()
-    inner = np.s_[3:-3, 3:-3]  # enlarging repeats the border
+    inner = np.s_[3:-3, 3:-3]  # upsampling repeats the border
     assert np.allclose(resized.depth[inner], plane_depth(grid)[inner], rtol=tolerance)
     assert np.allclose(np.sqrt(resized.variance), 0.05 * resized.depth, rtol=1e-3)
 
 
-def test_pixel_convention() -> None:
-    """A pixel of the small grid covers exactly four of the large one."""
+def test_resize_depth_averages_pixel_areas() -> None:
+    """A pixel of the small grid covers exactly four pixels of the large grid."""
     depth = np.full(FULL[::-1], 2.0)
     depth[10:12, 20:22] = 4.0
     small = priors.resize_depth(depth_prior(depth), GRID)
@@ -57,7 +57,7 @@ def test_pixel_convention() -> None:
 
 
 @pytest.mark.parametrize("grid", [GRID, (150, 100), (70, 40)])
-def test_validity_is_strict(grid) -> None:
+def test_resize_depth_is_valid_only_if_all_pixels_are(grid) -> None:
     valid = np.ones(FULL[::-1], dtype=np.bool_)
     valid[20, 30] = False
     depth = plane_depth(FULL)
@@ -74,20 +74,20 @@ def test_validity_is_strict(grid) -> None:
     assert np.array_equal(normals.valid, resized.valid)
 
 
-def test_same_grid_is_untouched() -> None:
+def test_resize_to_same_grid_returns_same_prior() -> None:
     prior = depth_prior(plane_depth(FULL))
     assert priors.resize_depth(prior, FULL) is prior
     normals = normal_prior((64, 96))
     assert priors.resize_normals(normals, FULL) is normals
 
 
-def test_variance_may_be_absent() -> None:
+def test_resize_without_variance() -> None:
     assert priors.resize_depth(DepthPrior.from_arrays(plane_depth(FULL)), GRID).variance is None
     bare = NormalPrior.from_arrays(np.broadcast_to(PLANE, (64, 96, 3)))
     assert priors.resize_normals(bare, GRID).variance is None
 
 
-def test_normals_are_averaged_and_unit() -> None:
+def test_resize_normals_averages_and_normalizes() -> None:
     left, right = np.array([0.6, 0, -0.8]), np.array([-0.6, 0, -0.8])
     normals = np.empty((64, 96, 3))
     normals[:, 0::2], normals[:, 1::2] = left, right
@@ -98,7 +98,7 @@ def test_normals_are_averaged_and_unit() -> None:
     assert np.allclose(resized.variance, 0.02)
 
 
-def test_masks_take_the_nearest_pixel() -> None:
+def test_resize_mask_takes_nearest_pixel() -> None:
     mask = np.zeros((64, 96), dtype=np.bool_)
     mask[:, 48:] = True
     allowed = priors.resize_mask(mask, GRID)
@@ -108,7 +108,7 @@ def test_masks_take_the_nearest_pixel() -> None:
     assert np.array_equal(priors.mask_normals(normal_prior((32, 48)), allowed).valid, allowed)
 
 
-def test_edges_are_distrusted_on_both_sides() -> None:
+def test_inflate_edge_variance_on_both_sides_of_edges() -> None:
     depth = np.full((32, 48), 2.0)
     depth[:, 20:] = 2.1
     depth[:, 30:] = 2.1 * 1.01
@@ -118,7 +118,7 @@ def test_edges_are_distrusted_on_both_sides() -> None:
     assert distrusted.sum() == 2 * 32
 
 
-def test_steps_to_invalid_pixels_are_no_edges() -> None:
+def test_inflate_edge_variance_ignores_steps_to_invalid_pixels() -> None:
     valid = np.ones((32, 48), dtype=np.bool_)
     valid[:, 20] = False
     prior = depth_prior(np.full((32, 48), 2.0), valid)

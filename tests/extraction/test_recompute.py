@@ -1,4 +1,4 @@
-"""What is computed again after a change: exactly what depends on it."""
+"""Tests that a changed input recomputes exactly the dependent provider results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ FULL = {"features": 4, "depth": 4, "normals": 4}
 
 @pytest.fixture
 def done(world):
-    """A world where everything has been computed once."""
+    """Scene whose provider results are all in the cache."""
     world.extract()
     assert world.asked() == FULL
     return world
@@ -34,10 +34,10 @@ def again(world, **changes) -> Counter[str]:
     return world.asked() + Counter(matcher=matcher["computed"])
 
 
-def test_nothing_changed(done) -> None:
+def test_unchanged_run_computes_nothing(done) -> None:
     done.made.clear()
     assert not again(done)
-    assert not done.made  # no network is loaded to find that out
+    assert not done.made  # no provider is created
 
 
 @pytest.mark.parametrize(
@@ -48,28 +48,28 @@ def test_nothing_changed(done) -> None:
         {"depth": ProviderConfig(use="truth", calibration={"relative_std": 0.1})},
     ],
 )
-def test_what_comes_after_the_providers(done, changes) -> None:
+def test_changed_options_after_providers_compute_nothing(done, changes) -> None:
     assert not again(done, **changes)
 
 
 @pytest.mark.parametrize("runtime", [{"workers": 1}, {"workers": 3, "threads": 2}])
-def test_where_it_is_computed(done, runtime) -> None:
+def test_changed_runtime_computes_nothing(done, runtime) -> None:
     assert not again(done, runtime=RuntimeOptions(cache_dir=done.cache, **runtime))
 
 
-def test_options_of_features(done) -> None:
+def test_changed_feature_options_recompute_features_and_matches(done) -> None:
     changed = ProviderConfig(use="truth", options={"flavour": 1})
     assert again(done, features=changed) == {"features": 4, "matcher": 6}
     assert not again(done, features=changed)
-    assert not again(done)  # and the way back
+    assert not again(done)  # the earlier results are still cached
 
 
-def test_options_of_the_matcher(done) -> None:
+def test_changed_matcher_options_recompute_matches(done) -> None:
     matcher = ProviderConfig(use="mutual-nearest", options={"ratio": 0.7})
     assert again(done, matcher=matcher) == {"matcher": 6}
 
 
-def test_options_of_depth_reach_normals_that_need_it(world) -> None:
+def test_changed_depth_options_recompute_normals_from_depth(world) -> None:
     normals = ProviderConfig(use="from-depth")
     first = world.extract(normals=normals)
     assert world.asked() == {"features": 4, "depth": 4}
@@ -81,12 +81,12 @@ def test_options_of_depth_reach_normals_that_need_it(world) -> None:
     assert normals_computed(world.extract(normals=normals)) == 0
     calibrated = ProviderConfig(use="truth", calibration={"relative_std": 0.1})
     assert normals_computed(world.extract(normals=normals, depth=calibrated)) == 4
-    # Another provider that says the same: normals depend on what it says.
+    # Normals depend on the depth values, not on the depth provider.
     same = world.extract(normals=normals, depth=ProviderConfig(use="truth", options={"flavour": 1}))
     assert world.asked()["depth"] == 4 and normals_computed(same) == 0
 
 
-def test_weights(world) -> None:
+def test_changed_weights_recompute_results(world) -> None:
     weights = world.root / "network.bin"
     weights.write_bytes(b"first")
     depth = ProviderConfig(use="truth", options={"weights": str(weights)})
@@ -100,12 +100,12 @@ def test_weights(world) -> None:
     assert again(world, depth=elsewhere) == {"depth": 4}
 
 
-def test_pixels_of_one_image(done) -> None:
+def test_changed_pixels_recompute_results_of_the_image(done) -> None:
     done.write("view2.png", done.truth.renderings["view2.png"].rgb // 2)
     assert again(done) == {"features": 1, "depth": 1, "normals": 1, "matcher": 3}
 
 
-def test_intrinsics_matter_to_those_who_use_them(done) -> None:
+def test_changed_intrinsics_recompute_intrinsics_aware_providers(done) -> None:
     intrinsic = ProviderConfig(use="intrinsic")
     again(done, depth=intrinsic)
     (done.root / "intrinsics.yaml").write_text("1: {params: [141, 140, 80, 60], images: all}")
@@ -113,19 +113,19 @@ def test_intrinsics_matter_to_those_who_use_them(done) -> None:
     assert again(done, depth=intrinsic) == {"depth": 4}
 
 
-def test_masks_reach_everything(done) -> None:
+def test_changed_masks_recompute_all_providers(done) -> None:
     masks = (ProviderConfig(use="left"),)
     assert again(done, masks=masks) == {"mask": 4, **FULL, "matcher": 6}
     assert not again(done, masks=masks)
     wider = (ProviderConfig(use="left", options={"flavour": 5}),)
     assert again(done, masks=wider) == {"mask": 4, **FULL, "matcher": 6}
     same = (ProviderConfig(use="left"), ProviderConfig(use="left", options={"flavour": 9}))
-    # Two masks whose intersection is the old one: views are as before.
+    # The intersection of the two masks equals the earlier mask, so views are unchanged.
     assert again(done, masks=same) == {"mask": 4}
 
 
-def test_version_of_a_plugin(done) -> None:
-    """Providers of another version are asked again."""
+def test_changed_plugin_version_recomputes_results(done) -> None:
+    """Results of a provider with another version are recomputed."""
     entries = done.registry._entries
     for number, entry in enumerate(entries):
         if (entry.spec.kind, entry.spec.name) == ("depth", "truth"):
@@ -133,14 +133,14 @@ def test_version_of_a_plugin(done) -> None:
     assert again(done) == {"depth": 4}
 
 
-def test_seed(done) -> None:
+def test_changed_seed_recomputes_results(done) -> None:
     assert again(done, runtime=RuntimeOptions(cache_dir=done.cache, seed=1)) == {
         **FULL,
         "matcher": 6,
     }
 
 
-def test_files_are_read_again(world) -> None:
+def test_uncached_providers_read_files_again(world) -> None:
     folder = world.root / "depth"
     folder.mkdir()
     for name in world.names:
@@ -152,7 +152,7 @@ def test_files_are_read_again(world) -> None:
     assert (np.median(first), np.median(second)) == pytest.approx((2.0, 3.0))
 
 
-def test_damaged_entry(done, caplog: pytest.LogCaptureFixture) -> None:
+def test_damaged_cache_entry_is_recomputed(done, caplog: pytest.LogCaptureFixture) -> None:
     path = sorted((done.cache / "extraction" / "depth").rglob("*.npz"))[0]
     path.write_bytes(path.read_bytes()[:-100])
     assert again(done) == {"depth": 1}
@@ -160,7 +160,7 @@ def test_damaged_entry(done, caplog: pytest.LogCaptureFixture) -> None:
     assert not again(done)
 
 
-def test_failure_leaves_what_was_done(world) -> None:
+def test_provider_failure_keeps_cached_results(world) -> None:
     def stop() -> None:
         raise KeyboardInterrupt
 
@@ -207,7 +207,7 @@ def start(root: Path) -> subprocess.Popen[str]:
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="needs SIGKILL")
 @pytest.mark.parametrize("name", ["SIGKILL", "SIGINT"])
-def test_stopped_run_goes_on_where_it_was(world, name: str) -> None:
+def test_stopped_run_continues_from_cache(world, name: str) -> None:
     (world.root / "depth").mkdir()
     for image in world.names:
         np.save(world.root / "depth" / f"{image}.npy", world.truth.renderings[image].depth)

@@ -1,4 +1,4 @@
-"""The whole room on an analytic scene: what comes out, and in which order it is made."""
+"""Tests of the whole extraction on a synthetic scene."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def identical(first, second) -> bool:
     return all(a == b for a, b in images + pairs)
 
 
-def test_problem_is_the_truth(world) -> None:
+def test_extract_on_analytic_scene_returns_true_problem(world) -> None:
     problem = world.extract().problem
     assert [image.name for image in problem.images] == world.names
     assert pairs_of(problem) == ALL_PAIRS
@@ -50,11 +50,11 @@ def test_problem_is_the_truth(world) -> None:
             problem.images[0].camera, a, problem.images[0].camera, b, xy_a
         )
         xy_b = problem.images[pair.image_b].keypoints[pair.matches[:, 1]]
-        # A point hidden in one image can have a neighbour as its nearest descriptor.
+        # A point that is occluded in one image can match a neighboring point.
         assert (np.abs(xy_b - truth.xy_b).max(axis=1) < 1e-3).mean() > 0.9
 
 
-def test_priors_are_on_one_grid(world) -> None:
+def test_extract_returns_priors_on_one_grid(world) -> None:
     options = ExtractionOptions(integration_size=80)
     image = world.extract(extraction=options).problem.images[1]
     truth = world.scene.render(image.camera.resized(80, 60), world.poses[image.name])
@@ -65,12 +65,12 @@ def test_priors_are_on_one_grid(world) -> None:
     expected = np.maximum(DepthCalibration().relative_std, 0.02 / image.depth.depth)
     assert np.allclose(np.median(std / expected), 1, atol=0.01)
     edges = image.normals.variance == EDGE_VARIANCE
-    assert 0.01 < edges.mean() < 0.6  # a slanted floor has steep steps on so coarse a grid
+    assert 0.01 < edges.mean() < 0.6  # the slanted floor has large depth steps on the coarse grid
     trusting = ExtractionOptions(integration_size=80, edge_ratio=None)
     assert world.extract(extraction=trusting).problem.images[1].normals.variance.max() < 0.1
 
 
-def test_report(world) -> None:
+def test_extract_reports_pairs_images_and_providers(world) -> None:
     report = world.extract().report
     assert (report["pairs_proposed"], report["pairs_matched"]) == (6, 6)
     assert report["pairs_verified"] == 6
@@ -82,7 +82,7 @@ def test_report(world) -> None:
     assert used["features", "truth"] == (4, 0) and used["depth", "truth"][0] == 4
 
 
-def test_reasons_of_dropped_pairs(world) -> None:
+def test_extract_reports_reasons_of_dropped_pairs(world) -> None:
     world.seeds = world.seeds[:10]
     extraction = world.extract()
     assert not extraction.problem.pairs
@@ -90,23 +90,23 @@ def test_reasons_of_dropped_pairs(world) -> None:
     assert any(reason.get("min_matches") == 15 for reason in reasons)
 
 
-def test_result_does_not_depend_on_the_number_of_workers(world) -> None:
+def test_extract_does_not_depend_on_number_of_workers(world) -> None:
     one = world.extract(runtime=RuntimeOptions(cache_dir=world.root / "one", workers=1))
     many = world.extract(runtime=RuntimeOptions(cache_dir=world.root / "many", workers=3))
     assert identical(one.problem, many.problem)
 
 
-def test_joint_prediction_takes_one_pass(world) -> None:
+def test_joint_depth_and_normals_take_one_pass(world) -> None:
     separate = world.extract().problem
     world.asked()
     joint = world.extract(
         depth=ProviderConfig(use="joint"), normals=ProviderConfig(use="joint")
     ).problem
-    assert world.asked() == {"joint": 4, "depth": 4}  # the joint pass calls depth itself
+    assert world.asked() == {"joint": 4, "depth": 4}  # joint prediction calls depth
     assert identical(separate, joint)
 
 
-def test_dense_matches_stand_behind_the_sparse_ones(world) -> None:
+def test_sampled_dense_matches_follow_sparse_matches(world) -> None:
     sparse = world.extract().problem
     both = world.extract(dense_matcher=ProviderConfig(use="dense")).problem
     for before, after in zip(sparse.images, both.images, strict=True):
@@ -126,7 +126,7 @@ def test_dense_matches_stand_behind_the_sparse_ones(world) -> None:
     assert distance.min() >= 6
 
 
-def test_each_dense_match_has_keypoints_of_its_own(world) -> None:
+def test_sampled_dense_matches_have_separate_keypoints(world) -> None:
     problem = world.extract(
         features=None, matcher=None, dense_matcher=ProviderConfig(use="dense")
     ).problem
@@ -150,8 +150,8 @@ def test_dense_matches_snap_to_features_without_a_sparse_matcher(world) -> None:
     assert 0 < snapped.sum() < len(snapped)
 
 
-def test_depth_of_the_matcher(world) -> None:
-    """The pair whose prediction is most certain gives an image's depth."""
+def test_depth_from_matcher_uses_most_precise_pair(world) -> None:
+    """The depth of an image comes from the pair with the smallest variance."""
     calibration = {"std_scale": 1.0, "relative_std": 0.0, "std_floor": 0.0}
     problem = world.extract(
         dense_matcher=ProviderConfig(use="dense-depth"),
@@ -163,13 +163,13 @@ def test_depth_of_the_matcher(world) -> None:
         assert np.median(std) == pytest.approx(0.1 - 0.01 * furthest[index], rel=1e-3)
 
 
-def test_depth_of_a_matcher_without_depth(world) -> None:
+def test_depth_from_matcher_without_pair_depth_is_a_config_error(world) -> None:
     with pytest.raises(ConfigError, match="'mutual-nearest' predicts no depth"):
         world.extract(depth=ProviderConfig(use="matcher"))
     assert not world.asked()
 
 
-def test_masks_of_providers(world) -> None:
+def test_mask_providers_remove_features_and_priors(world) -> None:
     plain = world.extract().problem
     problem = world.extract(masks=(ProviderConfig(use="left"),)).problem
     for image, full in zip(problem.images, plain.images, strict=True):
@@ -180,7 +180,7 @@ def test_masks_of_providers(world) -> None:
         assert not image.normals.valid[:, middle + 1 :].any()
 
 
-def test_masks_of_providers_and_of_the_user_intersect(world) -> None:
+def test_masks_of_providers_and_user_intersect(world) -> None:
     (world.root / "masks").mkdir()
     for name in world.names:
         drawn = np.zeros((120, 160), np.uint8)
@@ -194,7 +194,7 @@ def test_masks_of_providers_and_of_the_user_intersect(world) -> None:
         assert image.depth.valid.mean() == pytest.approx(0.25, abs=0.02)
 
 
-def test_masked_dense_matches(world) -> None:
+def test_dense_matches_in_masked_areas_are_removed(world) -> None:
     problem = world.extract(
         features=None,
         matcher=None,
@@ -205,7 +205,7 @@ def test_masked_dense_matches(world) -> None:
     assert max(image.keypoints[:, 0].max() for image in problem.images) <= 80
 
 
-def test_retrieval(world) -> None:
+def test_retrieval_mode_matches_similar_images(world) -> None:
     options = PairOptions(mode="retrieval", top_k=1)
     extraction = world.extract(pairs=options, retrieval=ProviderConfig(use="truth"))
     assert pairs_of(extraction.problem) == {(0, 1), (1, 2), (2, 3)}
@@ -213,12 +213,12 @@ def test_retrieval(world) -> None:
         world.extract(pairs=options)
 
 
-def test_auto_matches_all_pairs_of_few_photos(world) -> None:
+def test_auto_mode_with_few_images_matches_all_pairs(world) -> None:
     assert world.extract(pairs=PairOptions(mode="auto", partners=3)).report["pairs_matched"] == 6
 
 
 def test_auto_mode_uses_similarity(world) -> None:
-    """All views share points, the neighbours most; the second time the look is remembered."""
+    """All views share points, neighbors most; the similarity is cached for the second run."""
     options = PairOptions(mode="auto", partners=1, overlap=1)
     first = world.extract(pairs=options)
     assert pairs_of(first.problem) == {(0, 1), (1, 2), (2, 3)}
@@ -227,21 +227,21 @@ def test_auto_mode_uses_similarity(world) -> None:
     assert again.report["pairs"] == first.report["pairs"]
 
 
-def test_auto_by_retrieval(world) -> None:
+def test_auto_mode_uses_retrieval_if_configured(world) -> None:
     options = PairOptions(mode="auto", partners=1, overlap=1)
     extraction = world.extract(pairs=options, retrieval=ProviderConfig(use="truth"))
     assert pairs_of(extraction.problem) == {(0, 1), (1, 2), (2, 3)}
     assert world.asked()["retrieval"] == 4
 
 
-def test_auto_without_features_matches_all(world) -> None:
+def test_auto_mode_without_features_matches_all_pairs(world) -> None:
     changes = {"features": None, "matcher": None, "dense_matcher": ProviderConfig(use="dense")}
     extraction = world.extract(pairs=PairOptions(mode="auto", partners=1), **changes)
     assert extraction.report["pairs_matched"] == 6
 
 
-def test_what_stays_apart_is_tried_again(world, monkeypatch) -> None:
-    """Similarity within two halves only, and names that are not numbered."""
+def test_auto_mode_matches_pairs_between_components(world, monkeypatch) -> None:
+    """Only images within each half are similar, and names have no numbers."""
     likeness = np.eye(4)[[1, 0, 3, 2]] + 1e-3 * np.eye(4)[[2, 3, 0, 1]]
     monkeypatch.setattr(pair_similarity, "diffuse_similarity", lambda scores: likeness)
     monkeypatch.setattr(pairs, "numbered_neighbor_pairs", lambda names, options: [])
@@ -250,7 +250,7 @@ def test_what_stays_apart_is_tried_again(world, monkeypatch) -> None:
     assert {(0, 1), (2, 3)} < pairs_of(extraction.problem)
 
 
-def test_pair_filters_of_plugins(world) -> None:
+def test_pair_filters_of_plugins_remove_pairs(world) -> None:
     class OnlyNeighbours:
         @hookimpl
         def mpsfm_filter_pairs(self, pairs):
@@ -262,7 +262,7 @@ def test_pair_filters_of_plugins(world) -> None:
     assert (extraction.report["pairs_proposed"], extraction.report["pairs_matched"]) == (6, 3)
 
 
-def test_stages_in_order(world) -> None:
+def test_extract_runs_stages_in_order(world) -> None:
     class Recorder:
         def __init__(self) -> None:
             self.events: list[tuple[object, ...]] = []
@@ -303,7 +303,7 @@ def test_normals_from_depth_get_the_calibrated_depth(world) -> None:
     assert normals.valid.mean() > 0.8 and np.median(np.degrees(np.arccos(cosine.clip(-1, 1)))) < 1
 
 
-def test_broken_provider_is_named(world) -> None:
+def test_error_of_broken_provider_names_the_provider(world) -> None:
     def fail() -> None:
         raise ZeroDivisionError("in the network")
 
@@ -312,7 +312,7 @@ def test_broken_provider_is_named(world) -> None:
         world.extract()
 
 
-def test_nan_of_a_provider_is_refused(world) -> None:
+def test_provider_output_with_nan_raises(world) -> None:
     def spoiled() -> DepthPrior:
         values = np.full((4, 4), 2.0, np.float32)
         prior = DepthPrior(values, None, np.ones((4, 4), np.bool_))
@@ -325,10 +325,10 @@ def test_nan_of_a_provider_is_refused(world) -> None:
     assert world.asked()["features"] == 4
     world.break_on.clear()
     world.extract()
-    assert world.asked()["features"] == 0  # what was done before stands
+    assert world.asked()["features"] == 0  # earlier results are cached
 
 
-def test_the_seed_reaches_the_providers(world) -> None:
+def test_seed_is_passed_to_providers(world) -> None:
     seeds = []
 
     def factory(options, context):
@@ -344,7 +344,7 @@ def test_the_seed_reaches_the_providers(world) -> None:
 
 
 @pytest.mark.parametrize("kind", ["features", "depth", "normals"])
-def test_a_photo_on_which_a_provider_fails_may_be_left_out(world, kind: str) -> None:
+def test_on_error_skip_omits_image_of_failed_provider(world, kind: str) -> None:
     def fail() -> None:
         raise ZeroDivisionError("in the network")
 
@@ -355,14 +355,14 @@ def test_a_photo_on_which_a_provider_fails_may_be_left_out(world, kind: str) -> 
     assert "'truth', image 'view2.png': ZeroDivisionError" in found.report["failed"]["view2.png"]
     image = found.problem.images[world.names.index("view2.png")]
     assert not (image.depth.valid.any() and image.normals.valid.any() and len(image.keypoints))
-    # What could not be had is not in the cache: the next run asks again, and has everything.
+    # Failures are not cached, so the next run computes the missing results.
     world.break_on.clear()
     whole = world.extract(runtime=runtime)
     assert whole.report["failed"] == {}
     assert pairs_of(whole.problem) == ALL_PAIRS
 
 
-def test_more_than_half_of_the_photos_failing_ends_the_run(world) -> None:
+def test_on_error_skip_raises_if_most_images_fail(world) -> None:
     def fail() -> None:
         raise ZeroDivisionError("in the network")
 
@@ -373,7 +373,7 @@ def test_more_than_half_of_the_photos_failing_ends_the_run(world) -> None:
         world.extract(runtime=runtime)
 
 
-def test_a_provider_that_hangs_has_a_time_limit(world) -> None:
+def test_hanging_provider_raises_after_timeout(world) -> None:
     released = threading.Event()
     world.break_on["depth", "view2.png"] = lambda: released.wait(60) and None
     try:
@@ -391,7 +391,7 @@ def with_nan() -> DepthPrior:
     return prior
 
 
-def test_nan_in_one_of_many_photos_leaves_that_one_out(world) -> None:
+def test_on_error_skip_omits_image_with_nan(world) -> None:
     world.break_on["depth", "view1.png"] = with_nan
     runtime = RuntimeOptions(cache_dir=world.cache, workers=2, on_error="skip")
     found = world.extract(runtime=runtime)
@@ -401,8 +401,8 @@ def test_nan_in_one_of_many_photos_leaves_that_one_out(world) -> None:
     )
 
 
-def test_a_provider_cannot_change_its_inputs_unnoticed(world) -> None:
-    """Views are read-only; who writes to one is named, and what the others see is as it was."""
+def test_provider_that_writes_to_its_view_raises(world) -> None:
+    """Views are read-only; the error names the provider that writes to a view."""
     seen: dict[str, np.ndarray] = {}
 
     class Scribbles:

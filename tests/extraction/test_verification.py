@@ -1,4 +1,4 @@
-"""Two-view verification against COLMAP itself and against known geometry."""
+"""Tests of two-view verification against COLMAP and against known geometry."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def add_outliers(xy_a: np.ndarray, xy_b: np.ndarray, count: int, camera=CAMERA):
 
 
 @pytest.mark.parametrize("camera_b", [CAMERA, OTHER])
-def test_pose_and_inliers(camera_b) -> None:
+def test_verify_matches_recovers_pose_and_inliers(camera_b) -> None:
     points = correspondences(room_scene(), 300, 0.5, camera_b)
     xy_a, xy_b, good = add_outliers(*points, 100, camera_b)
     found = verify_matches(CAMERA, camera_b, xy_a, xy_b, VerificationOptions())
@@ -55,10 +55,10 @@ def test_pose_and_inliers(camera_b) -> None:
     kept = np.zeros(len(xy_a), dtype=np.bool_)
     kept[found.inliers] = True
     assert kept[good].mean() > 0.99
-    assert kept[~good].mean() < 0.15  # a few lie near their epipolar line by chance
+    assert kept[~good].mean() < 0.15  # a few outliers are near their epipolar line by chance
 
 
-def test_same_as_colmap() -> None:
+def test_verify_matches_equals_colmap() -> None:
     xy_a, xy_b, _ = add_outliers(*correspondences(room_scene(), 200, 0.5), 80)
     options = pycolmap.TwoViewGeometryOptions()
     options.compute_relative_pose = True
@@ -78,7 +78,7 @@ def test_same_as_colmap() -> None:
     assert np.array_equal(found.translation, expected.cam2_from_cam1.translation)
 
 
-def test_deterministic() -> None:
+def test_verify_matches_is_deterministic() -> None:
     xy_a, xy_b, _ = add_outliers(*correspondences(room_scene(), 150, 1.0), 90)
     first, second = (
         verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(), seed=1) for _ in range(2)
@@ -87,7 +87,7 @@ def test_deterministic() -> None:
     assert np.array_equal(first.rotation, second.rotation)
 
 
-def test_planar_scene() -> None:
+def test_verify_matches_of_planar_scene() -> None:
     wall = AnalyticScene((Plane((4.0, 0.0, 0.0), (1.0, 0.2, 0.0)),))
     xy_a, xy_b = correspondences(wall, 100, 0.3)
     found = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
@@ -96,7 +96,7 @@ def test_planar_scene() -> None:
     assert rotation_angle_deg(found.rotation @ relative_pose()[0].T) < 5
 
 
-def test_pure_rotation() -> None:
+def test_verify_matches_of_pure_rotation() -> None:
     angle = np.radians(10)
     turn = np.array(
         [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
@@ -112,7 +112,7 @@ def test_pure_rotation() -> None:
     assert np.linalg.norm(found.translation) < 1e-6
 
 
-def test_too_few_matches() -> None:
+def test_verify_matches_drops_pair_with_too_few_matches() -> None:
     xy = np.zeros((14, 2))
     found = verify_matches(CAMERA, CAMERA, xy, xy, VerificationOptions())
     assert found.drop_reason(14, 15) == PairReason.TOO_FEW_MATCHES.because(
@@ -123,19 +123,19 @@ def test_too_few_matches() -> None:
 
 
 @pytest.mark.parametrize("count", [20, 40, 250])
-def test_random_matches_are_dropped(count: int) -> None:
-    """Also the many that fit some epipolar geometry because there are many."""
+def test_verify_matches_drops_random_matches(count: int) -> None:
+    """Random matches are dropped even if many fit some epipolar geometry by chance."""
     rng = np.random.default_rng(count)
     xy_a, xy_b = rng.uniform(0, 1, (2, count, 2)) * CAMERA.size
     dropped = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
     assert dropped.dropped and not len(dropped.inliers)
     if count > 100:
         lenient = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(max_chance=1.0))
-        assert not lenient.dropped  # what the number of inliers alone would say
+        assert not lenient.dropped  # min_inliers alone accepts the pair
         assert dropped.dropped == PairReason.EXPLAINED_BY_CHANCE.value
 
 
-def test_noisier_keypoints_have_a_larger_threshold() -> None:
+def test_inlier_threshold_scales_with_keypoint_std() -> None:
     xy_a, xy_b = correspondences(room_scene(), 200, 6.0)
     sharp = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
     wide = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions(), std_px=4.0)

@@ -1,4 +1,4 @@
-"""Checkpoints on disk: what they count for, what they cost, and what is wrong with some."""
+"""Tests of mapping checkpoints: validity, damage, full and slow disks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STATE = {"a": np.arange(3), "b": "text"}
 
 
 class Notices(Stages):
-    """Keeps what the user is told."""
+    """Records the messages to the user."""
 
     def __init__(self) -> None:
         super().__init__(Registry())
@@ -46,7 +46,7 @@ def opened(folder: Path, problem: MappingProblem, every_s: float = 0.0, **option
     return checkpoints, notices.texts
 
 
-def test_what_is_saved_is_loaded_by_the_same_run_only(tmp_path: Path, problem) -> None:
+def test_checkpoint_is_loaded_for_the_same_problem_only(tmp_path: Path, problem) -> None:
     checkpoints, _ = opened(tmp_path, problem)
     assert checkpoints.load() is None
     checkpoints.save(serialize(STATE), 1)
@@ -61,7 +61,7 @@ def test_what_is_saved_is_loaded_by_the_same_run_only(tmp_path: Path, problem) -
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
 
 
-def test_a_checkpoint_of_other_code_is_a_new_start(
+def test_checkpoint_of_other_code_is_not_used(
     tmp_path: Path, problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     opened(tmp_path, problem)[0].save(serialize(STATE), 1)
@@ -72,7 +72,7 @@ def test_a_checkpoint_of_other_code_is_a_new_start(
 
 
 @pytest.mark.parametrize("keep", [0, 10, 0.5, -1])
-def test_a_damaged_file_is_a_new_start(tmp_path: Path, problem, keep: float) -> None:
+def test_damaged_checkpoint_is_not_used(tmp_path: Path, problem, keep: float) -> None:
     opened(tmp_path, problem)[0].save(serialize(STATE), 1)
     (path,) = tmp_path.rglob("*.npz")
     data = path.read_bytes()
@@ -82,7 +82,7 @@ def test_a_damaged_file_is_a_new_start(tmp_path: Path, problem, keep: float) -> 
     assert "damaged" in told[0]
 
 
-def test_a_full_disk_ends_no_run(
+def test_checkpoint_on_full_disk_warns_once(
     tmp_path: Path, problem, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def full(*arguments: object) -> None:
@@ -96,7 +96,7 @@ def test_a_full_disk_ends_no_run(
     assert not checkpoints.due()
 
 
-def test_slow_disks_are_asked_less_often(
+def test_checkpoint_interval_grows_on_slow_disk(
     tmp_path: Path, problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     clock = [0.0]

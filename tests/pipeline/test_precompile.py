@@ -1,4 +1,4 @@
-"""Precompilation of kernels in the background, and kernels without a disk cache."""
+"""Tests of background compilation of kernels, and of kernels without a disk cache."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_kernel_without_disk_cache_works_and_warns(
 
 @pytest.mark.slow
 def test_run_after_precompilation_compiles_nothing(tmp_path: Path) -> None:
-    """The sample scene, whose maps are thinned and read from a cache, as those of any photos."""
+    """Depth maps of the sample scene are downsampled and cached, like those of other photos."""
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
     subprocess.run(
         [sys.executable, "-m", "mpsfm_core.pipeline.precompile"], env=environment, check=True

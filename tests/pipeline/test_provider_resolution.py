@@ -1,4 +1,4 @@
-"""What a run needs: chosen, fetched, or told to be missing, before the first photo is decoded."""
+"""Tests that providers and weights are resolved before the first photo is decoded."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ SHA256 = hashlib.sha256(CONTENT).hexdigest()
 
 
 class Room:
-    """Photos of the analytic room, and what a good network would say of them."""
+    """Photos of a synthetic room with ground-truth depth and normals."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -63,7 +63,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Room:
 
 
 class Network:
-    """Stands for any network: knows the room by the names of its photos."""
+    """Fake network that returns ground truth by photo name."""
 
     room: Room
 
@@ -84,7 +84,7 @@ class NamedOptions(Options):
 
 
 def networks(room: Room, url: str, sha256: str | None = SHA256) -> Registry:
-    """A core alone, with a network whose weights lie on a server, and one that has its own."""
+    """Registry of the core, a fake network with weights on a server, and one with local weights."""
     Network.room = room
     registry = Registry()
     registry.register(builtin, name="builtin", distribution="mpsfm-core", version="1")
@@ -114,7 +114,7 @@ Configured = Callable[..., Config]
 
 @pytest.fixture
 def configured(tmp_path: Path) -> Configured:
-    """The shipped default, of which ``strong`` is the strong public network."""
+    """Default configuration with the fake network ``strong`` as first choice."""
     path = tmp_path / "run.yaml"
     path.write_text("extends: default\ndepth: {use: strong, fallback: [compact, flat]}\n")
 
@@ -126,12 +126,12 @@ def configured(tmp_path: Path) -> Configured:
 
 
 def names(provision: ProviderResolution) -> list[str]:
-    """Of the providers, without those of quick matching."""
+    """Return the names of the resolved providers, without those of the fast pass."""
     return [c.provider.name for c in provision.choices if not c.block.startswith("fast_pass.")]
 
 
 class Listener:
-    """Notices and download steps of a run."""
+    """Records the messages and download steps of a run."""
 
     def __init__(self) -> None:
         self.notices: list[str] = []
@@ -146,7 +146,7 @@ class Listener:
         self.progress.append((stage, done, total))
 
 
-def test_first_and_second_use(room: Room, server: Server, configured: Configured) -> None:
+def test_weights_are_downloaded_once(room: Room, server: Server, configured: Configured) -> None:
     registry, listener = networks(room, server.url), Listener()
     registry.register(listener)
     config = configured(registry)
@@ -187,7 +187,7 @@ def gone(server: Server) -> None:
     ],
     ids=["cut connection", "wrong hash", "no such file", "offline"],
 )
-def test_the_run_goes_on_with_our_own_network(
+def test_failed_download_falls_back_to_compact_network(
     room: Room,
     server: Server,
     configured: Configured,
@@ -212,12 +212,12 @@ def test_the_run_goes_on_with_our_own_network(
     assert told["config"]["depth"]["use"] == "compact"
 
 
-def test_no_server(room: Room, configured: Configured) -> None:
+def test_unreachable_server_falls_back(room: Room, configured: Configured) -> None:
     registry = networks(room, "http://127.0.0.1:9")
     assert names(resolve_providers(configured(registry), registry))[2:] == ["compact", "compact"]
 
 
-def test_a_network_that_the_user_names_is_taken_or_missed(
+def test_named_network_without_weights_is_an_error(
     room: Room, server: Server, configured: Configured
 ) -> None:
     cut(server)
@@ -226,7 +226,7 @@ def test_a_network_that_the_user_names_is_taken_or_missed(
         resolve_providers(configured(registry, "depth.use=strong"), registry)
 
 
-def test_the_core_alone_reconstructs(room: Room, tmp_path: Path) -> None:
+def test_core_without_plugins_reconstructs(room: Room, tmp_path: Path) -> None:
     registry = Registry()
     registry.register(builtin, name="builtin", distribution="mpsfm-core", version="1")
     config = load_config("default", [f"runtime.cache_dir={tmp_path}"], registry)
@@ -246,10 +246,10 @@ def test_the_core_alone_reconstructs(room: Room, tmp_path: Path) -> None:
         (("depth.use=strong", "normals.use=from-depth"), ["strong", "from-depth"]),
     ],
 )
-def test_options_say_whose_they_are(
+def test_options_alone_select_the_provider_that_has_them(
     room: Room, server: Server, tmp_path: Path, settings: tuple[str, ...], expected: list[str]
 ) -> None:
-    """With the shipped default and nothing else."""
+    """The default configuration selects the provider by the given options."""
     registry = networks(room, server.url)
     named = weights_from_option("model")
     registry.add(ProviderSpec("depth", "onnx", Network, NamedOptions, weights=named))
@@ -263,7 +263,7 @@ def test_options_say_whose_they_are(
 
 @pytest.fixture
 def unreadable(tmp_path: Path, room: Room) -> Path:
-    """Photos with a good header and no pixels."""
+    """Photos with valid header and without pixel data."""
     folder = tmp_path / "unreadable"
     folder.mkdir()
     for path in room.folder.iterdir():
@@ -290,7 +290,7 @@ def unreadable(tmp_path: Path, room: Room) -> Path:
         (["inputs.masks=nowhere"], "masks folder nowhere does not exist"),
     ],
 )
-def test_what_is_missing_is_told_before_a_photo_is_decoded(
+def test_missing_requirements_are_reported_before_decoding(
     room: Room, server: Server, unreadable: Path, tmp_path: Path, overrides: list[str], message: str
 ) -> None:
     registry = networks(room, server.url)
@@ -306,7 +306,7 @@ def test_what_is_missing_is_told_before_a_photo_is_decoded(
     assert not server.requests
 
 
-def test_a_cheap_fault_is_found_before_a_download(
+def test_wrong_setting_is_reported_before_download(
     room: Room, server: Server, configured: Configured
 ) -> None:
     registry = networks(room, server.url)

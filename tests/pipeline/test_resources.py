@@ -1,4 +1,4 @@
-"""Estimated memory and disk of a run, and what happens if they are short."""
+"""Tests of estimated memory and disk space, and of runs for which they are too small."""
 
 from __future__ import annotations
 
@@ -197,7 +197,7 @@ def test_run_that_fits_with_fewer_workers_is_not_refused(
     photos: Path, set_memory, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Decoded(Exception):
-        """Ends the run at the first image."""
+        """Raised to end the run at the first image."""
 
     def stop(images: ImageSet, index: int) -> None:
         raise Decoded

@@ -1,4 +1,4 @@
-"""How long the stages of a run take."""
+"""Tests of the record of times and memory of stages."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from mpsfm_core.pipeline.stages import StageRecord, Stages
 from mpsfm_core.providers.registry import Registry
 
 
-def test_a_stage_that_runs_twice_is_counted_as_one() -> None:
+def test_stage_that_runs_twice_has_one_record() -> None:
     first = StageRecord(2.0, 300.0)
     assert StageRecord(3.0, 200.0).after(first) == StageRecord(5.0, 300.0)
     assert StageRecord(3.0, None).after(first) == StageRecord(5.0, 300.0)

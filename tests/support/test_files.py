@@ -184,7 +184,10 @@ def test_scratch_of_a_killed_run_is_taken_away(output: Path) -> None:
 
 def test_only_one_run_has_a_folder(output: Path) -> None:
     with lock_output_folder(output):
-        with pytest.raises(InputError, match="another run is writing"), lock_output_folder(output):
+        with (
+            pytest.raises(InputError, match="another run writes to this folder"),
+            lock_output_folder(output),
+        ):
             pass
         assert (output / "notes.txt").exists()
     with lock_output_folder(output):

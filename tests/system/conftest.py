@@ -1,4 +1,4 @@
-"""A small scene of photos with depth files, and the command line as users start it."""
+"""Fixtures of system tests: a small scene of photos and the command line in a subprocess."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class PhotoScene:
 
 @pytest.fixture(scope="session")
 def photo_scene(tmp_path_factory: pytest.TempPathFactory) -> PhotoScene:
-    """Five photos of an analytic room, 15 degrees apart, with exact depth as float files."""
+    """Five photos of a synthetic room, 15 degrees apart, with exact depth as float files."""
     scene = PhotoScene(tmp_path_factory.mktemp("scene"))
     for path in (scene.images, scene.truth, scene.folder / "depth"):
         path.mkdir()
@@ -97,13 +97,13 @@ def photo_scene(tmp_path_factory: pytest.TempPathFactory) -> PhotoScene:
 
 @pytest.fixture(scope="session")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The cache of all commands of the session: the second run of a scene is quick."""
+    """Cache folder of all commands of the test session, so that repeated runs are fast."""
     return tmp_path_factory.mktemp("cache")
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a command ended."""
+    """Exit code and output of a finished command."""
 
     code: int
     out: str
@@ -115,7 +115,7 @@ Mpsfm = Callable[..., Ended]
 
 @pytest.fixture(scope="session")
 def environment(cache: Path) -> Mapping[str, str]:
-    """Environment of the commands: this source tree, our cache, one thread a library."""
+    """Environment of the commands: this source tree, the test cache, single-threaded libraries."""
     paths = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
     return {
         **os.environ,
@@ -128,7 +128,7 @@ def environment(cache: Path) -> Mapping[str, str]:
 
 @pytest.fixture(scope="session")
 def mpsfm(environment: Mapping[str, str]) -> Mpsfm:
-    """Runs ``mpsfm ARGUMENTS`` in a process of its own."""
+    """Function that runs ``mpsfm ARGUMENTS`` in a subprocess."""
 
     def run(
         *arguments: object, extra: Mapping[str, str] | None = None, timeout: float = 300, **options
@@ -152,7 +152,7 @@ def interrupted(environment: Mapping[str, str]) -> Mpsfm:
     ``by``: another signal."""
 
     def heed_interrupts() -> None:
-        # A shell lets what it starts in the background ignore Ctrl-C, these tests with it.
+        # A shell makes background processes ignore Ctrl-C, which the subprocess would inherit.
         signal.signal(signal.SIGINT, signal.SIG_DFL)
 
     def run(*arguments: object, after: str, by: int = signal.SIGINT) -> Ended:
@@ -170,7 +170,7 @@ def interrupted(environment: Mapping[str, str]) -> Mpsfm:
         for line in process.stderr:
             lines.append(line)
             if line.startswith(after):
-                # The whole foreground group gets Ctrl-C, workers included.
+                # Ctrl-C goes to the whole process group, including workers.
                 os.killpg(process.pid, by)
                 break
         out, rest = process.communicate(timeout=120)

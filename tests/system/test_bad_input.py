@@ -1,4 +1,4 @@
-"""What goes wrong ends with one clear message and an exit code; earlier results stay."""
+"""Tests that errors print one message, set the exit code and keep earlier results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mpsfm_core.support.files import lock_output_folder
 
 @pytest.fixture
 def output(tmp_path: Path) -> Path:
-    """A folder with earlier results."""
+    """Output folder with earlier results."""
     folder = tmp_path / "out"
     (folder / "sparse").mkdir(parents=True)
     (folder / "sparse" / "images.bin").write_text("an earlier model")
@@ -38,7 +38,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 
 def check(ended, code: int, *texts: str) -> None:
-    """One line on stderr beside warnings, without a traceback, that says all of ``texts``."""
+    """Check the exit code, and that stderr has one error line that contains all ``texts``."""
     lines = [line for line in ended.err.splitlines() if line.startswith("mpsfm: ")]
     lines = [line for line in lines if not line.startswith("mpsfm: WARNING: ")]
     assert "Traceback" not in ended.err
@@ -48,7 +48,9 @@ def check(ended, code: int, *texts: str) -> None:
         assert text in lines[0]
 
 
-def test_no_images(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
+def test_folder_without_images_is_an_error(
+    photo_scene, mpsfm, output: Path, tmp_path: Path
+) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
     ended = mpsfm("reconstruct", empty, "--output", output, "--config", photo_scene.config)
@@ -57,13 +59,15 @@ def test_no_images(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
     assert ended.code == 2
 
 
-def test_one_image(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
+def test_folder_with_one_image_is_an_error(
+    photo_scene, mpsfm, output: Path, tmp_path: Path
+) -> None:
     shutil.copy(photo_scene.images / "0.png", tmp_path)
     ended = mpsfm("reconstruct", tmp_path, "--output", output, "--config", photo_scene.config)
     check(ended, 2, "only one image", "0.png")
 
 
-def test_an_unreadable_file_if_that_is_to_end_the_run(
+def test_unreadable_image_with_strict_inputs_is_an_error(
     photo_scene, mpsfm, output: Path, tmp_path: Path
 ) -> None:
     images = tmp_path / "images"
@@ -78,24 +82,30 @@ def test_an_unreadable_file_if_that_is_to_end_the_run(
     check(mpsfm(*arguments), 2, "2.png")
 
 
-def test_results_among_the_photos(photo_scene, mpsfm) -> None:
+def test_output_folder_inside_photos_is_an_error(photo_scene, mpsfm) -> None:
     ended = mpsfm(*photo_scene.arguments, "--output", photo_scene.images)
     check(ended, 2, "is the folder of the photos")
 
 
-def test_a_folder_that_another_run_has(photo_scene, mpsfm, output: Path) -> None:
+def test_locked_output_folder_is_an_error(photo_scene, mpsfm, output: Path) -> None:
     with lock_output_folder(output):
-        check(mpsfm(*photo_scene.arguments, "--output", output), 2, "another run is writing")
+        check(
+            mpsfm(*photo_scene.arguments, "--output", output),
+            2,
+            "another run writes to this folder",
+        )
 
 
-def test_intrinsics_of_another_size(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
+def test_intrinsics_of_other_image_size_are_an_error(
+    photo_scene, mpsfm, output: Path, tmp_path: Path
+) -> None:
     intrinsics = tmp_path / "intrinsics.yaml"
     intrinsics.write_text("1: {params: [560, 560, 320, 240], width: 640, height: 480}\n")
     ended = mpsfm(*photo_scene.arguments, "--intrinsics", intrinsics, "--output", output)
     check(ended, 2, str(intrinsics), "640x480", "320x240")
 
 
-def test_missing_weights(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
+def test_missing_weights_are_an_error(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
     pytest.importorskip("mpsfm_onnx")
     config = tmp_path / "config.yaml"
     base = photo_scene.config.read_text().split("depth:")[0]
@@ -107,14 +117,14 @@ def test_missing_weights(photo_scene, mpsfm, output: Path, tmp_path: Path) -> No
     check(ended, 2, "absent.onnx")
 
 
-def test_missing_depth_files(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
+def test_missing_depth_files_are_an_error(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
     ended = mpsfm(
         *photo_scene.arguments, "--output", output, "--set", f"depth.options.directory={tmp_path}"
     )
     check(ended, 2, str(tmp_path))
 
 
-def test_nan_from_a_provider(photo_scene, mpsfm, install_plugin, output: Path) -> None:
+def test_nan_from_provider_is_an_error(photo_scene, mpsfm, install_plugin, output: Path) -> None:
     module = install_plugin(
         "mpsfm-nan",
         """
@@ -155,8 +165,8 @@ def test_nan_from_a_provider(photo_scene, mpsfm, install_plugin, output: Path) -
     check(ended, 1, "'nan'", ".png", "depth", "finite")
 
 
-def test_a_full_disk(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
-    # With the cache filled, the results are the only big files of the second run.
+def test_full_disk_keeps_earlier_results(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
+    # With a filled cache, the second run writes no large files except the results.
     assert mpsfm(*photo_scene.arguments, "--output", tmp_path / "first", "--quiet").code == 0
 
     def small_files() -> None:
@@ -175,14 +185,16 @@ def test_a_full_disk(photo_scene, mpsfm, output: Path, tmp_path: Path) -> None:
         ("extraction", signal.SIGTERM),
     ],
 )
-def test_ctrl_c(
+def test_ctrl_c_keeps_earlier_results(
     photo_scene, interrupted, output: Path, stage: str, by: signal.Signals, cache: Path
 ) -> None:
     ended = interrupted(*photo_scene.arguments, "--output", output, after=stage, by=by)
     check(ended, 130, "interrupted")
 
 
-def test_an_output_folder_that_cannot_be(photo_scene, mpsfm, tmp_path: Path) -> None:
+def test_output_folder_that_cannot_be_created_is_an_error(
+    photo_scene, mpsfm, tmp_path: Path
+) -> None:
     (tmp_path / "file").write_text("x")
     ended = mpsfm(*photo_scene.arguments, "--output", tmp_path / "file")
     check(ended, 2, "file", "cannot be the output folder")

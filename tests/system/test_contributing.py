@@ -1,4 +1,4 @@
-"""The plugin in CONTRIBUTING.md works as it stands there."""
+"""Tests that the plugin in CONTRIBUTING.md works as printed."""
 
 from __future__ import annotations
 
@@ -31,19 +31,17 @@ class Network(torch.nn.Module):
 
 
 def blocks() -> dict[str, str]:
-    """The guide's code by the file name that stands before it."""
+    """Return the code blocks of the guide by the preceding file name."""
     pattern = r"`(my_depth/\w+\.py)`(?:(?!`my_depth/).)*?```python\n(.*?)```"
     return dict(re.findall(pattern, GUIDE.read_text(encoding="utf-8"), re.DOTALL))
 
 
-def test_it_is_short() -> None:
+def test_guide_plugin_is_short() -> None:
     code = "\n".join(blocks().values())
     assert 0 < len([line for line in code.splitlines() if line.strip()]) < 50
 
 
-def test_it_predicts_depth_that_the_validator_accepts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_guide_plugin_predicts_valid_depth(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     torch = pytest.importorskip("torch")
     package = tmp_path / "my_depth"
     package.mkdir()

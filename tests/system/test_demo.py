@@ -1,4 +1,4 @@
-"""``mpsfm demo`` and the sample scene's promise: low overlap, and yet the right poses."""
+"""Tests of ``mpsfm demo``: accurate poses of a scene with low overlap."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PRIOR_FILES = [
 ]
 
 
-def test_the_demo_needs_nothing_but_the_photos(mpsfm, tmp_path: Path) -> None:
+def test_demo_needs_only_photos(mpsfm, tmp_path: Path) -> None:
     output = tmp_path / "demo"
     ended = mpsfm("demo", "--output", output)
     assert ended.code == 0, ended.err
@@ -30,12 +30,12 @@ def test_the_demo_needs_nothing_but_the_photos(mpsfm, tmp_path: Path) -> None:
     providers = json.loads((output / "summary.json").read_text())["providers"]
     depth = {line["block"]: line for line in providers}["depth"]
     assert f"depth: {depth['name']}" in ended.err
-    # 92 % with our own network; a constant depth, where that is not installed, leads to 58 %.
+    # 92 % with mpsfm-compact; 58 % with constant depth if the plugin is not installed.
     wanted = 80 if depth["name"] == "compact" else 40
     assert evaluate(read_poses(output), read_poses(SCENE / "gt"))["auc"]["5"] > wanted
 
 
-def test_with_the_priors_of_the_scene_the_poses_are_right(mpsfm, tmp_path: Path) -> None:
+def test_demo_with_scene_priors_has_accurate_poses(mpsfm, tmp_path: Path) -> None:
     output = tmp_path / "demo"
     ended = mpsfm("demo", "--output", output, *PRIOR_FILES)
     assert ended.code == 0, ended.err
@@ -44,19 +44,19 @@ def test_with_the_priors_of_the_scene_the_poses_are_right(mpsfm, tmp_path: Path)
     assert report["auc"]["5"] > 80
     assert report["trajectory"]["rotation_median_deg"] < 0.5
     assert report["trajectory"]["ate_median"] < 0.05
-    # The priors' scales spread by 4 %; their consensus is the metre of the model.
+    # The scales of the depth priors spread by 4 %; their consensus gives the metric scale.
     assert report["trajectory"]["scale"] == pytest.approx(1, abs=0.08)
 
 
-def test_a_scene_of_the_same_layout_can_be_given(mpsfm, tmp_path: Path) -> None:
+def test_demo_accepts_other_scene(mpsfm, tmp_path: Path) -> None:
     ended = mpsfm("demo", "--output", tmp_path / "out", "--scene", tmp_path, "--quiet")
     assert ended.code == 2
     assert str(tmp_path / "images") in ended.err
     assert not (tmp_path / "out").exists()
 
 
-def test_without_priors_it_falls_apart(mpsfm, tmp_path: Path) -> None:
-    """What makes the scene a demo: without lifting hardly anything can be registered."""
+def test_demo_without_lifting_registers_few_images(mpsfm, tmp_path: Path) -> None:
+    """Without lifting keypoints by depth priors, at most three images are registered."""
     output = tmp_path / "demo"
     lifting = ("--set", "mapping.registration.lifting=false")
     ended = mpsfm("demo", "--output", output, *PRIOR_FILES, *lifting)

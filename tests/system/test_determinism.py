@@ -1,4 +1,4 @@
-"""Same photos, same settings: what may differ between two runs, and by how much the results do."""
+"""Tests of the reproducibility of results across workers, caches and processors."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ extraction from a cache: degrees, and parts of the longest baseline."""
 
 
 def run(photo_scene, output: Path, workers: int = 1, cache: Path | None = None) -> dict[str, str]:
-    """What a run with an empty cache, or that one, leaves."""
+    """Return the result folder of a run with an empty or the given cache."""
     mpsfm_core.reconstruct(
         photo_scene.images,
         output,
@@ -38,7 +38,7 @@ def run(photo_scene, output: Path, workers: int = 1, cache: Path | None = None) 
 
 @pytest.fixture(scope="module")
 def alone(photo_scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run with one worker, its cache beside it."""
+    """Result of a run with one worker; the cache is next to the result folder."""
     output = tmp_path_factory.mktemp("alone") / "out"
     run(photo_scene, output)
     assert len(read_poses(output)) == 5
@@ -46,16 +46,18 @@ def alone(photo_scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("workers", [2, 4])
-def test_workers_change_no_bit(photo_scene, alone: Path, tmp_path: Path, workers: int) -> None:
+def test_result_does_not_depend_on_workers(
+    photo_scene, alone: Path, tmp_path: Path, workers: int
+) -> None:
     assert run(photo_scene, tmp_path / "out", workers) == content(alone)
 
 
-def test_the_cache_changes_no_bit(photo_scene, alone: Path, tmp_path: Path) -> None:
+def test_result_does_not_depend_on_cache(photo_scene, alone: Path, tmp_path: Path) -> None:
     cache = alone.with_name("cache")
     assert run(photo_scene, tmp_path / "out", cache=cache) == content(alone)
 
 
-def test_the_order_of_files_on_the_disk_changes_no_bit(
+def test_result_does_not_depend_on_file_order(
     photo_scene, alone: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked = []
@@ -93,7 +95,7 @@ KERNELS = {
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="kernels of x86-64 processors")
 @pytest.mark.parametrize("kernels", KERNELS)
 @pytest.mark.parametrize("extraction", MOST)
-def test_kernels_for_another_processor_change_poses_by_rounding(
+def test_kernels_of_other_processor_change_poses_by_rounding(
     photo_scene, mpsfm, alone: Path, tmp_path: Path, kernels: str, extraction: str
 ) -> None:
     cache = alone.with_name("cache") if extraction == "cached" else tmp_path / "cache"

@@ -1,4 +1,4 @@
-"""From the formats of others to a reconstruction, and from a reconstruction to theirs."""
+"""Tests of imports from and exports to formats of other programs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mpsfm_core.evaluation import evaluate, read_poses
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 
-def test_matches_come_back_from_a_database_of_ours(photo_scene, mpsfm, tmp_path: Path) -> None:
+def test_exported_database_imports_the_same_matches(photo_scene, mpsfm, tmp_path: Path) -> None:
     first = mpsfm(*photo_scene.arguments, "--output", tmp_path / "first")
     assert first.code == 0, first.err
     written = mpsfm("export", tmp_path / "first", "--to", "colmap-db")
@@ -31,7 +31,7 @@ def test_matches_come_back_from_a_database_of_ours(photo_scene, mpsfm, tmp_path:
     assert evaluate(read_poses(output), read_poses(photo_scene.truth))["auc"]["1"] > 80
 
 
-def test_formats_are_listed_and_mistakes_explained(mpsfm, tmp_path: Path) -> None:
+def test_export_lists_formats_and_explains_errors(mpsfm, tmp_path: Path) -> None:
     listed = mpsfm("export", tmp_path)
     assert listed.code == 0
     assert "gsplat" in listed.out
@@ -42,8 +42,8 @@ def test_formats_are_listed_and_mistakes_explained(mpsfm, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_video_becomes_a_folder_for_splatting(mpsfm, tmp_path: Path) -> None:
-    """In two commands, without a network and without intrinsics."""
+def test_video_exports_to_gsplat(mpsfm, tmp_path: Path) -> None:
+    """Two commands convert a video to gsplat data, without network and intrinsics."""
     size = (320, 240)
     camera = PinholeCamera(*size, 384.0, 384.0, 160.0, 120.0)
     scene = room_scene()

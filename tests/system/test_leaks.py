@@ -1,4 +1,4 @@
-"""One process reconstructs again and again, and holds no more in the end."""
+"""Test that repeated reconstructions in one process do not leak memory."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ allocator does that at first: 80 runs grew no further, nor do 200 (benchmarks/re
 
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="memory is given back on Linux")
-def test_a_process_holds_no_more_after_many_reconstructions(photo_scene, tmp_path: Path) -> None:
+def test_repeated_reconstructions_do_not_leak(photo_scene, tmp_path: Path) -> None:
     listed = tmp_path / "list.txt"
     listed.write_text("1.png\n2.png\n3.png\n")
     settings = ("extraction.integration_size=64", "inputs.max_image_size=160")

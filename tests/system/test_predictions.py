@@ -1,4 +1,4 @@
-"""What a run was said to take, beside what it took."""
+"""Test that estimated memory and disk space agree with measured values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .conftest import CAMERA
 
 @pytest.fixture(scope="module")
 def two_rooms(photo_scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The photos of the scene, and as many of another room."""
+    """Photos of the scene, and the same number of photos of another room."""
     folder = tmp_path_factory.mktemp("rooms")
     for name in ("images", "depth"):
         shutil.copytree(photo_scene.folder / name, folder / name)
@@ -34,7 +34,7 @@ def two_rooms(photo_scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="was measured on Linux")
 @pytest.mark.parametrize("groups", [1, 2])
-def test_a_run_takes_what_it_was_said_to(
+def test_measured_resources_agree_with_estimate(
     photo_scene, two_rooms: Path, mpsfm, tmp_path: Path, groups: int
 ) -> None:
     folder = photo_scene.folder if groups == 1 else two_rooms

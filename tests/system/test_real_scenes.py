@@ -1,4 +1,4 @@
-"""Whole reconstructions of real photos with a small real depth network."""
+"""Tests of reconstructions of real photos with the depth network FastDepth."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture
 def reconstruct(mpsfm, shared_data: Path, tmp_path: Path):
-    """Reconstructs a scene of the shared data with FastDepth; gives the output folder."""
+    """Function that reconstructs a scene with FastDepth and returns the result folder."""
     pytest.importorskip("mpsfm_onnx")
 
     def run(scene: str, *settings: str, images: Path | None = None) -> Path:
@@ -56,7 +56,7 @@ def test_kitchen_with_hardly_any_overlap(reconstruct) -> None:
     assert model.compute_mean_reprojection_error() < 2
 
 
-def test_a_room_with_motion_blur(reconstruct, shared_data: Path, tmp_path: Path) -> None:
+def test_room_with_motion_blur(reconstruct, shared_data: Path, tmp_path: Path) -> None:
     pytest.importorskip("mpsfm_kornia")
     room = shared_data / "data" / "hololens_room"
     names = read_scene(room).chosen(["all"])[0].images

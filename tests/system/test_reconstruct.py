@@ -1,4 +1,4 @@
-"""``mpsfm reconstruct`` and the Python front door, from photos to files."""
+"""Tests of ``mpsfm reconstruct`` and of the Python API, from photos to result files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def output(photo_scene, mpsfm, tmp_path_factory: pytest.TempPathFactory) -> Path
     return folder
 
 
-def test_the_contract_of_the_output_folder(output: Path) -> None:
+def test_output_folder_contains_documented_files(output: Path) -> None:
     names = {path.name for path in output.iterdir()}
     report = {"views", "report.html"}
     assert names == {"sparse", "points.ply", "dense.ply", "depth", "summary.json"} | report
@@ -38,11 +38,11 @@ def test_the_contract_of_the_output_folder(output: Path) -> None:
     }
 
 
-def test_poses_and_depth_are_right(output: Path, photo_scene) -> None:
+def test_poses_and_depth_are_accurate(output: Path, photo_scene) -> None:
     report = evaluate(read_poses(output), read_poses(photo_scene.truth))
     assert report["registered"] == 5
     assert report["auc"]["1"] > 80
-    # Exact metric depth: the model is in metres.
+    # The depth is exact and metric, so the model is in meters.
     assert report["trajectory"]["scale"] == pytest.approx(1, abs=0.02)
     for number in range(5):
         with np.load(output / "depth" / f"{number}.png.npz") as refined:
@@ -53,14 +53,14 @@ def test_poses_and_depth_are_right(output: Path, photo_scene) -> None:
         assert np.median(error) < 0.02
 
 
-def test_the_model_opens_and_names_the_photos(output: Path) -> None:
+def test_model_opens_in_pycolmap_with_photo_names(output: Path) -> None:
     model = pycolmap.Reconstruction(str(output / "sparse"))
     assert sorted(image.name for image in model.images.values()) == [f"{i}.png" for i in range(5)]
     assert model.num_points3D() > 100
     assert model.compute_mean_reprojection_error() < 2
 
 
-def test_the_summary_says_what_was_used_and_what_came_out(output: Path) -> None:
+def test_summary_lists_providers_and_results(output: Path) -> None:
     summary = json.loads((output / "summary.json").read_text())
     assert summary["status"] == "success"
     assert summary["images"]["unregistered"] == {}
@@ -80,7 +80,7 @@ def test_the_summary_says_what_was_used_and_what_came_out(output: Path) -> None:
     assert best["images"] == 5
 
 
-def test_a_guessed_focal_length_is_refined_and_told(photo_scene, mpsfm, tmp_path: Path) -> None:
+def test_default_focal_length_is_refined_and_reported(photo_scene, mpsfm, tmp_path: Path) -> None:
     (camera,) = pycolmap.Reconstruction(str(photo_scene.truth)).cameras.values()
     guess = 1.06 * camera.focal_length_x
     ended = mpsfm(
@@ -100,7 +100,7 @@ def test_a_guessed_focal_length_is_refined_and_told(photo_scene, mpsfm, tmp_path
     assert f"focal length refined from {guess:.0f} (default) to {told[1]:.0f} px" in ended.out
 
 
-def test_refined_focal_lengths_of_several_cameras_are_told_as_a_range() -> None:
+def test_refined_focal_lengths_of_several_cameras_are_printed_as_range() -> None:
     known = {"focal_length_from": "intrinsics", "focal_length_px": 500.0}
     guessed = {"focal_length_from": "exif", "focal_length_px": 1000.0}
     longer = {**guessed, "refined_focal_length_px": 1030.0}
@@ -111,7 +111,7 @@ def test_refined_focal_lengths_of_several_cameras_are_told_as_a_range() -> None:
     assert _refined_focal_lengths([known, guessed]) == ""
 
 
-def test_python_gives_the_same_poses_without_writing(
+def test_python_api_without_output_gives_same_poses(
     output: Path, photo_scene, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MPSFM_CACHE", str(cache))
@@ -130,7 +130,9 @@ def test_python_gives_the_same_poses_without_writing(
         np.testing.assert_allclose(translation, written[name][1], atol=1e-9)
 
 
-def test_an_image_list_chooses_and_quiet_is_quiet(photo_scene, mpsfm, tmp_path: Path) -> None:
+def test_image_list_selects_photos_and_quiet_prints_nothing(
+    photo_scene, mpsfm, tmp_path: Path
+) -> None:
     listed = tmp_path / "list.txt"
     listed.write_text("1.png\n2.png\n3.png\n")
     output = tmp_path / "out"
@@ -140,7 +142,7 @@ def test_an_image_list_chooses_and_quiet_is_quiet(photo_scene, mpsfm, tmp_path: 
     assert {image.name for image in model.images.values()} == {"1.png", "2.png", "3.png"}
 
 
-def test_a_setting_reaches_the_run(photo_scene, mpsfm, tmp_path: Path) -> None:
+def test_set_option_changes_the_run(photo_scene, mpsfm, tmp_path: Path) -> None:
     ended = mpsfm(
         *photo_scene.arguments, "--output", tmp_path / "out", "--set", "results.dense_cloud=false"
     )
@@ -148,7 +150,7 @@ def test_a_setting_reaches_the_run(photo_scene, mpsfm, tmp_path: Path) -> None:
     assert not (tmp_path / "out" / "dense.ply").exists()
 
 
-def test_the_seed_of_the_run_is_that_of_the_mapper(
+def test_runtime_seed_is_passed_to_mapper(
     photo_scene, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MPSFM_CACHE", str(cache))
@@ -167,7 +169,7 @@ def test_the_seed_of_the_run_is_that_of_the_mapper(
 
 
 @pytest.mark.parametrize("file", [".", "transforms.json"], ids=["COLMAP", "nerfstudio"])
-def test_known_cameras_stay_and_give_consistent_depth(
+def test_known_poses_stay_fixed_and_give_consistent_depth(
     photo_scene, mpsfm, tmp_path: Path, file: str
 ) -> None:
     output = tmp_path / "out"
@@ -187,7 +189,7 @@ def test_known_cameras_stay_and_give_consistent_depth(
         np.testing.assert_allclose(written[name][1], translation, atol=1e-9)
 
 
-def test_a_partial_model_is_continued_with_its_camera(photo_scene, mpsfm, tmp_path: Path) -> None:
+def test_partial_model_is_extended_with_its_camera(photo_scene, mpsfm, tmp_path: Path) -> None:
     model = pycolmap.Reconstruction(str(photo_scene.truth))
     for number in (4, 5):
         model.deregister_frame(number)
@@ -222,7 +224,7 @@ def test_one_known_pose_is_wrong_input(photo_scene, mpsfm, tmp_path: Path) -> No
     assert "has a pose of 0.png only, two are needed" in ended.err
 
 
-def test_poses_without_a_photo_are_told(
+def test_poses_without_photo_are_reported(
     photo_scene, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     listed = tmp_path / "list.txt"
@@ -239,14 +241,14 @@ def test_poses_without_a_photo_are_told(
 
 
 @pytest.mark.parametrize(("poses", "found"), [("fixed", False), ("start", True)])
-def test_fixed_poses_are_taken_to_be_right(
+def test_densify_treats_fixed_poses_as_independent_of_depth(
     photo_scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, poses: str, found: bool
 ) -> None:
     told = []
 
-    def observed(*arguments, posed_by_depth: bool):
-        told.append(posed_by_depth)
-        return densify(*arguments, posed_by_depth=posed_by_depth)
+    def observed(*arguments, poses_use_depth: bool):
+        told.append(poses_use_depth)
+        return densify(*arguments, poses_use_depth=poses_use_depth)
 
     monkeypatch.setattr("mpsfm_core.pipeline.run.densify", observed)
     listed = tmp_path / "list.txt"
@@ -263,7 +265,7 @@ def test_fixed_poses_are_taken_to_be_right(
 
 @pytest.fixture(scope="module")
 def unrelated(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three photos of noise, with depth files: nothing matches."""
+    """Three photos of noise with depth files; no pair has matches."""
     folder = tmp_path_factory.mktemp("noise")
     (folder / "images").mkdir()
     rng = np.random.default_rng(0)
@@ -274,7 +276,7 @@ def unrelated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_nothing_to_reconstruct_exits_with_3_and_gives_reasons(
+def test_failed_reconstruction_exits_with_3_and_gives_reasons(
     photo_scene, unrelated: Path, mpsfm, tmp_path: Path
 ) -> None:
     output = tmp_path / "out"
@@ -303,7 +305,7 @@ def test_nothing_to_reconstruct_exits_with_3_and_gives_reasons(
     assert (output / "sparse" / "images.bin").read_text() == "earlier"
 
 
-def test_python_raises_when_nothing_can_be_reconstructed(
+def test_python_api_raises_if_reconstruction_fails(
     photo_scene, unrelated: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MPSFM_CACHE", str(cache))

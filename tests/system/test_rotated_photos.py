@@ -1,4 +1,4 @@
-"""COLMAP's own models of photos with an EXIF orientation, through cameras, poses and exports."""
+"""Tests of COLMAP models of photos with EXIF orientation: cameras, poses, exports."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TURNS = {
     6: Image.Transpose.ROTATE_90,
     8: Image.Transpose.ROTATE_270,
 }
-"""EXIF orientation -> how upright pixels are stored."""
+"""Function by EXIF orientation that converts upright pixels to stored pixels."""
 
 pytestmark = pytest.mark.slow
 
@@ -85,7 +85,7 @@ def test_colmap_model_of_rotated_photos_equals_that_of_upright_ones(
 
 
 def check_colors(folder: Path) -> None:
-    """The pictures show the colors of the points where the model has them."""
+    """The photos have the colors of the model's 3D points at the projections of the points."""
     model = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
     for image in model.images.values():
         with Image.open(folder / "images" / image.name) as picture:

@@ -1,4 +1,4 @@
-"""The sample scene of the demo: complete, small, consistent, and honest about its priors."""
+"""Tests of the sample scene: files, size, consistency and uncertainty of its priors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def verify() -> ModuleType:
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     with pytest.MonkeyPatch.context() as patch:
-        # A dataclass resolves its annotations through sys.modules.
+        # dataclasses look up annotations in sys.modules
         patch.setitem(sys.modules, spec.name, module)
         spec.loader.exec_module(module)
     return module
@@ -38,7 +38,7 @@ def views(verify: ModuleType) -> list[Any]:
     return verify.load_views(SCENE)
 
 
-def test_every_image_has_its_files_and_the_scene_is_small() -> None:
+def test_sample_scene_is_complete_and_small() -> None:
     stems = {path.stem for path in (SCENE / "images").glob("*.jpg")}
     assert len(stems) == 8
     for folder in ("gt_depth", "gt_normals", "priors/depth", "priors/normals"):
@@ -47,7 +47,7 @@ def test_every_image_has_its_files_and_the_scene_is_small() -> None:
     assert sum(p.stat().st_size for p in files) < 8e6
 
 
-def test_intrinsics_fit_the_model_and_the_images() -> None:
+def test_sample_intrinsics_equal_model_and_image_size() -> None:
     model = pycolmap.Reconstruction(SCENE / "gt")
     declared = yaml.safe_load((SCENE / "intrinsics.yaml").read_text())[1]
     assert declared["images"] == "all"
@@ -58,16 +58,14 @@ def test_intrinsics_fit_the_model_and_the_images() -> None:
         assert pixels.shape == (camera.height, camera.width, 3)
 
 
-def test_depth_of_one_view_lands_on_the_depth_of_another(
-    verify: ModuleType, views: list[Any]
-) -> None:
+def test_sample_depth_maps_are_consistent(verify: ModuleType, views: list[Any]) -> None:
     errors = verify.depth_errors(views)
     assert errors.size > 1e6
     assert np.median(errors) < 0.0005
 
 
-def test_normals_agree_with_depth(verify: ModuleType, views: list[Any]) -> None:
-    step = 8  # far enough that millimetre steps of the stored depth do not matter
+def test_sample_normals_agree_with_depth(verify: ModuleType, views: list[Any]) -> None:
+    step = 8  # pixels; over this distance, depth steps of a millimeter are negligible
     middle, before, after = slice(step, -step), slice(None, -2 * step), slice(2 * step, None)
     angles = []
     for view in views:
@@ -83,13 +81,13 @@ def test_normals_agree_with_depth(verify: ModuleType, views: list[Any]) -> None:
     assert np.median(np.concatenate(angles)) < 1.0
 
 
-def test_images_agree_with_poses(verify: ModuleType, views: list[Any]) -> None:
+def test_sample_images_agree_with_poses(verify: ModuleType, views: list[Any]) -> None:
     sift = cv2.SIFT_create(nfeatures=3000)
     a, b = views[1], views[2]
     images = [cv2.imread(str(SCENE / "images" / v.name), cv2.IMREAD_GRAYSCALE) for v in (a, b)]
     (points_a, words_a), (points_b, words_b) = (sift.detectAndCompute(i, None) for i in images)
     pairs = cv2.BFMatcher(crossCheck=True).match(words_a, words_b)
-    # OpenCV's keypoints have the centre of the first pixel at (0, 0).
+    # In OpenCV, the center of the first pixel is (0, 0).
     x_a = np.array([points_a[m.queryIdx].pt for m in pairs]) + 0.5
     x_b = np.array([points_b[m.trainIdx].pt for m in pairs]) + 0.5
     distance = verify.epipolar_distance(a, b, x_a, x_b)
@@ -98,7 +96,7 @@ def test_images_agree_with_poses(verify: ModuleType, views: list[Any]) -> None:
     assert np.median(right) < 0.5
 
 
-def test_overlap_is_low(verify: ModuleType, views: list[Any]) -> None:
+def test_sample_scene_has_low_overlap(verify: ModuleType, views: list[Any]) -> None:
     two, three = verify.overlaps(views)
     count = len(views)
     for i in range(count):
@@ -107,7 +105,7 @@ def test_overlap_is_low(verify: ModuleType, views: list[Any]) -> None:
     assert three < 0.04
 
 
-def test_priors_are_what_the_core_accepts(views: list[Any]) -> None:
+def test_sample_priors_are_valid(views: list[Any]) -> None:
     for view in views:
         depth, normals = view.depth_prior, view.normal_prior
         kept = DepthPrior.from_arrays(depth["depth"], depth["variance"], depth["valid"])
@@ -120,9 +118,7 @@ def test_priors_are_what_the_core_accepts(views: list[Any]) -> None:
         np.testing.assert_allclose(length, 1, atol=1e-3)
 
 
-def test_priors_are_wrong_and_their_variances_say_how_much(
-    verify: ModuleType, views: list[Any]
-) -> None:
+def test_sample_prior_variances_match_their_errors(verify: ModuleType, views: list[Any]) -> None:
     relative, score = map(np.concatenate, zip(*map(verify.depth_scores, views), strict=True))
     assert 0.04 < verify.rms(relative) < 0.12
     assert 0.75 < verify.rms(score) < 1.25
@@ -133,7 +129,7 @@ def test_priors_are_wrong_and_their_variances_say_how_much(
     assert 0.02 < np.std(scales) < 0.1
 
 
-def test_degradation_is_seeded_and_honest_on_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_degraded_depth_is_seeded_with_calibrated_variance(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(SCENE)
     truth_of = importlib.import_module("generator.cameras").Truth
     priors = importlib.import_module("generator.priors")

@@ -1,4 +1,4 @@
-"""The tutorial and the third-party package that it ends with."""
+"""Tests of the plugin tutorial and of its example package."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from mpsfm_core.testing.contract import list_checks, check_id
+from mpsfm_core.testing.contract import check_id, list_checks
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "third-party-depth"
@@ -21,7 +21,7 @@ SCENE = ROOT / "examples" / "sample_scene"
 TUTORIAL = ROOT / "docs" / "tutorial-plugin.md"
 
 
-def test_the_tutorial_shows_the_files_of_the_example() -> None:
+def test_tutorial_contains_files_of_example() -> None:
     pattern = r"`([\w./]+\.(?:py|yaml))`:\n\n```\w+\n(.*?)```"
     shown = dict(re.findall(pattern, TUTORIAL.read_text(encoding="utf-8"), re.DOTALL))
     assert len(shown) == 5
@@ -32,7 +32,7 @@ def test_the_tutorial_shows_the_files_of_the_example() -> None:
     assert len(changes) == 2 and all(change in project for change in changes)
 
 
-def test_every_check_stands_in_the_documentation() -> None:
+def test_every_contract_check_is_documented() -> None:
     document = (ROOT / "docs" / "contract.md").read_text(encoding="utf-8")
     shown = dict(re.findall(r"^\| `([a-z-]+)` \| (.*) \|$", document, re.MULTILINE))
     for check in list_checks():
@@ -43,13 +43,13 @@ def test_every_check_stands_in_the_documentation() -> None:
 
 @pytest.fixture(scope="module")
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
-    """The example, installed from its own folder; the environment that sees it."""
+    """Install the example plugin; return the environment variables that make it importable."""
     site = tmp_path_factory.mktemp("site")
     source = tmp_path_factory.mktemp("source")
     for path in (p for p in EXAMPLE.rglob("*") if p.is_file() and "__pycache__" not in p.parts):
         copy = source / path.relative_to(EXAMPLE)
         copy.parent.mkdir(parents=True, exist_ok=True)
-        copy.write_bytes(path.read_bytes())  # building leaves folders behind
+        copy.write_bytes(path.read_bytes())  # building creates folders in the source tree
     options = ("--no-deps", "--no-index", "--no-build-isolation", "--quiet")
     run([sys.executable, "-m", "pip", "install", *options, "--target", site, source], os.environ)
     path = os.pathsep.join(map(str, (site, ROOT, *sys.path)))
@@ -57,14 +57,16 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Mapping[str, str]:
 
 
 @pytest.mark.slow
-def test_it_keeps_its_contract(installed: Mapping[str, str], tmp_path: Path) -> None:
+def test_example_plugin_passes_contract(installed: Mapping[str, str], tmp_path: Path) -> None:
     tests = EXAMPLE / "tests"
     printed = run([sys.executable, "-m", "pytest", "-q", "--rootdir", tests, tests], installed)
     assert " passed" in printed and "failed" not in printed
 
 
 @pytest.mark.slow
-def test_it_is_trained_as_said(installed: Mapping[str, str], tmp_path: Path) -> None:
+def test_example_plugin_is_trained_as_documented(
+    installed: Mapping[str, str], tmp_path: Path
+) -> None:
     weights = tmp_path / "room.npz"
     printed = run([sys.executable, EXAMPLE / "train.py", SCENE, weights], installed)
     errors = [float(line.rsplit(":", 1)[1]) for line in printed.splitlines()]
@@ -73,8 +75,8 @@ def test_it_is_trained_as_said(installed: Mapping[str, str], tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_it_reconstructs_by_its_name(installed: Mapping[str, str], tmp_path: Path) -> None:
-    """The last step of the tutorial, with its result: AUC 67, 93 and 98 %, 0.5 cm."""
+def test_example_plugin_reconstructs(installed: Mapping[str, str], tmp_path: Path) -> None:
+    """The last step of the tutorial reaches the printed result: AUC 67, 93 and 98 %, 0.5 cm."""
     mpsfm = [sys.executable, "-m", "mpsfm_core"]
     cameras = ("--intrinsics", SCENE / "intrinsics.yaml", "--config", EXAMPLE / "config.yaml")
     cache = ("--set", f"runtime.cache_dir={tmp_path / 'cache'}", "--set", "runtime.workers=1")

@@ -1,4 +1,4 @@
-"""The wheels of all distributions, in an environment that has nothing else of ours."""
+"""Test of the wheels of all packages in an environment without the source tree."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run(*command: object, folder: Path) -> str:
 
 
 def build(folder: Path) -> dict[str, Path]:
-    """Distribution -> its wheel; from copies of the sources, as building leaves files there."""
+    """Build the wheel of each package from a copy of its source; return wheels by name."""
     sources = {path.name: folder / path.name for path in (*PLUGINS, ROOT / "meta")}
     for path in (*PLUGINS, ROOT / "meta"):
         shutil.copytree(path, sources[path.name], ignore=NOT_PACKED)
@@ -48,7 +48,7 @@ def build(folder: Path) -> dict[str, Path]:
 
 
 def install(wheels: dict[str, Path], folder: Path) -> Path:
-    """An environment with the wheels, and with what is here but ours; returns its scripts."""
+    """Create an environment with the wheels and the installed dependencies; return its scripts."""
     venv.create(folder)
     names = {"base": str(folder), "platbase": str(folder)}
     scripts = Path(sysconfig.get_path("scripts", vars=names))
@@ -64,7 +64,7 @@ def install(wheels: dict[str, Path], folder: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_the_wheels_of_all_distributions_run_the_demo(
+def test_wheels_of_all_packages_run_the_demo(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MPSFM_CACHE", str(tmp_path / "cache"))
