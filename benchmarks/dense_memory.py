@@ -3,9 +3,9 @@
     python -m benchmarks.dense_memory [--photos 16 160] [--output FILE]
 
 The photos are those of rendered_kitchen, with true poses and with true depth at a quarter of the
-photo size. Photos beyond the number of photos in the scene are views of distant copies of the
-kitchen. Each number of photos runs in its own process. The table lists peak resident memory, and
-resident memory before the dense stage starts.
+photo size. If the scene has fewer photos, its photos are used again with shifted poses. Each number
+of photos runs in its own process. The table lists peak resident memory, and resident memory before
+the dense stage starts.
 """
 
 from __future__ import annotations

@@ -8,11 +8,11 @@ descriptors. Each view of the hall detects half of its points, and as many outli
 descriptor noise is half the norm of a descriptor. At most a quarter of the keypoints are
 repeatable, as for XFeat on rendered_kitchen (18 to 25 %).
 
-A pair is true if its two-view overlap (mpsfm_core/evaluation/overlap.py) is above a limit.
-*Matched* pairs can contribute to a reconstruction. A real pair counts as matched if its overlap is
-at least 0.15 and its verified LighterGlue matches give a rotation error below 10 degrees. A pair of
-the hall counts as matched if it has 30 common points with similar descriptors. Writes
-benchmarks/results/pairs.md.
+A pair is true if its two-view overlap (mpsfm_core/evaluation/overlap.py) is above a limit. The
+column *matched* counts true pairs that can contribute to a reconstruction. A real pair counts as
+matched if its overlap is at least 0.15 and its verified LighterGlue matches give a rotation error
+below 10 degrees. A pair of the hall counts as matched if it has 30 common points with similar
+descriptors. Writes benchmarks/results/pairs.md.
 """
 
 from __future__ import annotations

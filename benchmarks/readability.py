@@ -50,7 +50,7 @@ def allocate_draws(sentences: dict[str, list[Sentence]], num: int) -> dict[str, 
     """Divide the number of drawn sentences among the kinds of prose by their share of words.
 
     Args:
-        sentences: All sentences, by kind of prose.
+        sentences: All sentences of the repository, by kind of prose.
         num: Total number of sentences to draw.
 
     Returns:
@@ -74,7 +74,7 @@ def draw_sentences(root: Path, num: int, seed: int) -> list[tuple[str, Sentence]
 
     Args:
         root: Folder of the repository.
-        num: Number of sentences to draw.
+        num: Number of sentences to draw at random.
         seed: Seed of the random generator.
 
     Returns:

@@ -1,8 +1,9 @@
 """Comparison of RoMa in ``vismatch-roma`` with the repository of RoMa's authors.
 
-Our provider runs the copy of RoMa in vismatch. The authors' repository is called through ``match``
-and ``to_pixel_coordinates``. Both networks have the original architecture and the same random
-weights, and run in one Python environment, because RoMa cannot be exported to ONNX.
+Our provider runs the copy of RoMa in vismatch. The reference is the function ``match`` of the
+repository of RoMa's authors, with ``to_pixel_coordinates``. Both networks have the original
+architecture and the same random weights, and run in one Python environment, because RoMa cannot be
+exported to ONNX.
 """
 
 from __future__ import annotations
