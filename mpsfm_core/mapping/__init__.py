@@ -1,1 +1,1 @@
-"""The prior-aware incremental mapper: pure numerics, no files, no plugins, no printing."""
+"""Prior-aware incremental mapper, without file access, plugins or console output."""

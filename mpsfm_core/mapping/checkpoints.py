@@ -1,4 +1,4 @@
-"""Checkpoints of the mapper: an interrupted run continues with the same bits."""
+"""Checkpoints of the mapper. A resumed run has bit-identical results."""
 
 from __future__ import annotations
 
@@ -12,40 +12,41 @@ from mpsfm_core.mapping.serialization import CheckpointArrays, deserialize, seri
 
 
 class CheckpointStore(Protocol):
-    """Storage of checkpoints; decides where they are kept and which one fits a problem.
+    """Interface of the checkpoint storage, which selects the location and checks the problem.
 
-    The mapper saves between two registrations. Saving changes no result.
+    The mapper saves checkpoints between two image registrations. Saving a checkpoint does not
+    change the reconstruction.
     """
 
     def load(self) -> CheckpointArrays | None:
-        """Return the last checkpoint of this problem and these options, or None."""
+        """Return the last checkpoint of the same mapping problem and options, or None."""
 
     def unreadable(self, reason: str) -> None:
-        """Handle a checkpoint that cannot be restored; the mapper starts again."""
+        """Handle a checkpoint that cannot be restored, before the mapper starts again."""
 
     def due(self) -> bool:
-        """Return whether a checkpoint is to be saved now."""
+        """Return True if the mapper shall save a checkpoint now."""
 
     def save(self, state: CheckpointArrays, registered: int) -> None:
         """Save a checkpoint.
 
         Args:
-            state: Arrays of the checkpoint.
-            registered: Number of registered images of the current component.
+            state: Arrays of the checkpoint, by name.
+            registered: Number of images that are registered in the current component.
         """
 
 
 class MapperProgress(NamedTuple):
-    """Content of a checkpoint."""
+    """Content of a mapper checkpoint."""
 
     runs: list[MapperRun]
     """Completed runs."""
     mapper: object | None
-    """The mapper of the interrupted run; None with runs means that all runs are complete."""
+    """The mapper of the interrupted run. None means that all mapper runs are complete."""
 
 
 class Checkpointer:
-    """Saves and restores the progress of the mapper."""
+    """Writer and reader of the checkpoints of the mapper."""
 
     def __init__(
         self, store: CheckpointStore | None, problem: MappingProblem, events: MappingEvents
@@ -54,7 +55,7 @@ class Checkpointer:
         self._shared = (problem, events)
 
     def load(self) -> MapperProgress:
-        """Restore the last checkpoint; empty progress if there is none or it is unreadable."""
+        """Restore the last checkpoint, or return empty progress if none can be read."""
         if self._store is None or (arrays := self._store.load()) is None:
             return MapperProgress([], None)
         try:
@@ -65,12 +66,12 @@ class Checkpointer:
         return MapperProgress(runs, mapper)
 
     def save_if_due(self, progress: MapperProgress, num_registered: int) -> None:
-        """Save a checkpoint if one is due."""
+        """Save a checkpoint of the mapper if the storage requests one."""
         if self._store is not None and self._store.due():
             self._save(progress, num_registered)
 
     def save_completed(self, runs: list[MapperRun]) -> None:
-        """Save the completed runs, for an interruption of a later stage."""
+        """Save the completed mapper runs, in case a later pipeline stage is interrupted."""
         if self._store is not None:
             self._save(MapperProgress(runs, None), max(run.size for run in runs))
 

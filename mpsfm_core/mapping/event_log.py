@@ -1,4 +1,4 @@
-"""Log of a mapper run: forwards events and collects reasons and times for the report."""
+"""Log of a mapper run that forwards events and collects rejection reasons and times."""
 
 from __future__ import annotations
 
@@ -31,28 +31,28 @@ class EventLog:
         self._counts: dict[str, int] = defaultdict(int)
 
     def registered(self, image: int, count: int) -> None:
-        """Forward the registration of an image, the ``count``-th of its component."""
+        """Forward the registration of an image as the ``count``-th image of its component."""
         images = self._problem.images
         self._events.image_registered(images[image].name, count, len(images))
 
     def scene_changed(self, scene: Scene) -> None:
-        """Forward a change of the scene; the state is copied only if a receiver requests it."""
+        """Forward a change of the scene. Its state is only copied if a receiver requests it."""
         self._events.scene_changed(lambda: capture_scene_state(scene))
 
     def rejected(self, image: int, reason: Reason) -> None:
-        """Record why an image was not registered or was deregistered, and forward it."""
+        """Record and forward the reason why an image was rejected or deregistered."""
         name = self._problem.images[image].name
         self.image_reasons[name] = reason
         self._events.image_rejected(name, reason)
 
     def pair_rejected(self, pair: VerifiedPair, reason: Reason) -> None:
-        """Record why a pair cannot initialize a component."""
+        """Record the reason why an image pair cannot initialize a component."""
         names = [self._problem.images[image].name for image in (pair.image_a, pair.image_b)]
         self._pair_reasons[" ".join(names)] = reason
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:
-        """Add the time that the context takes to a step."""
+        """Add the run time of the ``with`` block to a named step."""
         start = time.perf_counter()
         try:
             yield
@@ -61,14 +61,14 @@ class EventLog:
             self._counts[step] += 1
 
     def report(self, models: Iterable[Reconstruction]) -> MappingReport:
-        """Return the report of the run, without reasons for the images of ``models``."""
+        """Return the report of the run, with rejection reasons for images outside of ``models``."""
         names = {image.name for model in models for image in model.images}
         reasons = {name: reason for name, reason in self.image_reasons.items() if name not in names}
         return MappingReport(reasons, self._pair_reasons, dict(self._seconds), dict(self._counts))
 
 
 def _initial_reasons(problem: MappingProblem) -> dict[str, Reason]:
-    """Return why each image would stay unregistered if the mapper never tried it."""
+    """Return the reason for each image that the mapper would not even try to register."""
     matched = {index for pair in problem.pairs for index in (pair.image_a, pair.image_b)}
     reasons = {}
     for index, image in enumerate(problem.images):

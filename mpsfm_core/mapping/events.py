@@ -1,4 +1,4 @@
-"""Interface for progress events of the mapper."""
+"""Interface of the progress events that the mapper emits."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from mpsfm_core.data.decisions import Reason
 
 
 class MappingEvents(Protocol):
-    """Receiver of progress events; the pipeline forwards them to plugins and progress bars."""
+    """Receiver of the mapper's progress events, which the pipeline forwards to plugins."""
 
     def image_registered(self, name: str, registered: int, total: int) -> None:
-        """Handle the registration of an image, the ``registered``-th of its component."""
+        """Handle the registration of an image as the ``registered``-th image of its component."""
 
     def image_rejected(self, name: str, reason: Reason) -> None:
         """Handle a failed registration, or the deregistration of an image."""
 
     def scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """Handle a change of poses or points; calling ``scene`` copies the current state."""
+        """Handle a change of poses or points. Calling ``scene`` copies the current state."""
 
 
 class NullMappingEvents:
-    """Receiver that ignores all events."""
+    """Receiver that ignores all events of the mapper."""
 
     def image_registered(self, name: str, registered: int, total: int) -> None:
         """Ignore the event."""

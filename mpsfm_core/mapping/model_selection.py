@@ -1,7 +1,8 @@
-"""Selection among mapper runs with different seeds.
+"""Selection of one result among mapper runs with different seeds.
 
-The run whose largest component explains the most match scores wins. A match is explained if both
-of its keypoints observe the same point. Among equal runs, depth agreement decides.
+The run with the largest component in terms of explained match scores is selected. A match is
+explained if both of its keypoints observe the same 3D point. Among runs with equal explained
+ratios, the depth agreement decides.
 """
 
 from __future__ import annotations
@@ -17,21 +18,21 @@ from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
 
 MAX_RATIO_DIFFERENCE = 0.01
-"""Difference of the explained match ratios below which two runs are equal. [ours]"""
+"""Difference of the explained match ratios below which two runs count as equal. [ours]"""
 
 
 class MapperRun(NamedTuple):
-    """Result of the mapper with one seed."""
+    """Result of one mapper run with one seed."""
 
     models: Sequence[Reconstruction]
-    """Components, the largest first."""
+    """Reconstructed components of the run, sorted by decreasing size."""
     explained_ratios: Sequence[float]
-    """Share of the summed match scores that each component explains."""
+    """Share of the summed match scores that each component explains, in [0, 1]."""
     report: MappingReport
 
     @property
     def largest_explained_ratio(self) -> float:
-        """Share of the match scores that the largest component explains."""
+        """Share of the match scores that the largest component explains, in [0, 1]."""
         return self.explained_ratios[0] if self.explained_ratios else 0.0
 
     @property
@@ -41,7 +42,7 @@ class MapperRun(NamedTuple):
 
 
 def is_settled(runs: Sequence[MapperRun], min_explained_ratio: float) -> bool:
-    """Return whether the last run explains enough matches, or equals an earlier run."""
+    """Return True if the last run explains enough matches, or equals an earlier run."""
     *earlier, last = runs
     is_explained = sum(last.explained_ratios) >= min_explained_ratio
     return is_explained or any(_are_equal(run, last) for run in earlier)
@@ -50,8 +51,8 @@ def is_settled(runs: Sequence[MapperRun], min_explained_ratio: float) -> bool:
 def select_run(runs: Sequence[MapperRun], options: ConsistencyOptions) -> MapperRun:
     """Select the run whose largest component explains the most matches.
 
-    Among runs that explain equally many, the result that most runs share wins; among several of
-    these, the one with the best depth agreement.
+    Among runs with equal explained ratios, the result that most runs share is selected, and among
+    several such results the one with the best depth agreement.
     """
     max_ratio = max(run.largest_explained_ratio for run in runs)
     candidates = [
@@ -76,7 +77,7 @@ def _are_equal(a: MapperRun, b: MapperRun) -> bool:
 
 
 def sum_run_times(report: MappingReport, runs: Sequence[MapperRun]) -> MappingReport:
-    """Return the report of one run with the step times of all runs."""
+    """Return the report of one run, with the step times summed over all runs."""
     seconds: Counter[str] = Counter()
     counts: Counter[str] = Counter()
     for run in runs:
@@ -88,13 +89,13 @@ def sum_run_times(report: MappingReport, runs: Sequence[MapperRun]) -> MappingRe
 def compute_explained_ratios(
     models: Sequence[Reconstruction], problem: MappingProblem
 ) -> list[float]:
-    """Compute the share of the summed scores of all matches that each model explains."""
+    """Compute the share of all summed match scores that each model explains, in [0, 1]."""
     total = compute_total_score(problem) or 1.0
     return [compute_explained_score(model, problem) / total for model in models]
 
 
 def compute_explained_score(model: Reconstruction, problem: MappingProblem) -> float:
-    """Sum the scores of the matches whose keypoints observe the same point of a model."""
+    """Sum the scores of the matches whose keypoints observe the same 3D point of a model."""
     point_ids = {image.index: image.point_ids for image in model.images}
     total = 0.0
     for pair in problem.pairs:
@@ -107,5 +108,5 @@ def compute_explained_score(model: Reconstruction, problem: MappingProblem) -> f
 
 
 def compute_total_score(problem: MappingProblem) -> float:
-    """Sum the scores of all matches."""
+    """Sum the scores of all matches of the problem."""
     return sum(float(pair.scores.sum(dtype=float)) for pair in problem.pairs)

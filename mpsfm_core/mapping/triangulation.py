@@ -1,4 +1,4 @@
-"""Triangulation of tracks: continue, create, complete and merge, with lifting from depth.
+"""Triangulation of tracks (continue, create, complete, merge), and lifting from depth.
 
 The operations are those of COLMAP's ``IncrementalTriangulator`` (``Continue``, ``Create``,
 ``Complete``, ``Merge``), vectorized over the edges of the correspondence graph. If the
@@ -16,7 +16,7 @@ from mpsfm_core.mapping.scene.scene import Scene
 
 
 def triangulate_image(scene: Scene, image: int, options: TriangulationOptions) -> None:
-    """Continue tracks into a newly registered image and create new ones with its neighbors."""
+    """Continue tracks into a newly registered image, and create tracks with its neighbors."""
     edges = _get_registered_edges(scene, image)
     max_error_px = _max_angle_error_px(scene, image, options)
     extend_tracks(scene, image, edges, max_error_px)
@@ -30,12 +30,12 @@ def complete_and_merge_tracks(
     images: list[int] | None = None,
     create: bool = False,
 ) -> int:
-    """Add missing observations to tracks and merge tracks of the same point.
+    """Add missing observations to tracks, and merge tracks that belong to the same point.
 
     Args:
         scene: The scene.
-        options: ``max_error_px`` limits the reprojection errors.
-        images: Images whose tracks are completed; by default all registered images.
+        options: ``max_error_px`` limits the reprojection errors in pixels.
+        images: Images whose tracks are completed. The default is all registered images.
         create: Also create tracks from matches without a point (COLMAP's ``Retriangulate``).
 
     Returns:
@@ -61,8 +61,8 @@ def extend_tracks(
     Args:
         scene: The scene.
         image: The image.
-        edges: Source and target keypoints (e,) of its matches to registered images.
-        max_error_px: Largest reprojection error in the image.
+        edges: Source and target keypoints (e,) of the matches of the image to registered images.
+        max_error_px: Largest reprojection error in pixels in the image.
     """
     tracks = scene.tracks
     source, target = edges
@@ -89,9 +89,9 @@ def create_tracks(
 
     Args:
         scene: The scene.
-        edges: Source and target keypoints (e,) of matches to registered images.
-        max_error_px: Largest reprojection error of an inlier.
-        options: Angles for triangulation and lifting.
+        edges: Source and target keypoints (e,) of the matches of the image to registered images.
+        max_error_px: Largest reprojection error in pixels of an inlier.
+        options: Options with the angle limits for triangulation and for lifting.
     """
     tracks = scene.tracks
     source, target = edges
@@ -125,18 +125,20 @@ def triangulate_or_lift(
 ) -> tuple[Float64, Bool]:
     """Triangulate a point for each match, or lift it from depth if the angle is low.
 
-    A point is lifted from the target if its depth is valid, because the target has been refined
-    longer. If it is not valid, the point is lifted from the source.
+    A point is lifted from the depth map of the target image if its depth is valid there, because
+    that map has been refined more often. If the depth in the target image is not valid, the point
+    is lifted from the source image.
 
     Args:
         scene: The scene.
         source: (m,) keypoints.
-        target: (m,) keypoints that they match.
-        max_error_px: Largest reprojection error in both images.
-        options: ``min_angle_deg`` separates triangulation from lifting.
+        target: (m,) target keypoints that match the source keypoints.
+        max_error_px: Largest reprojection error in pixels in both images.
+        options: ``min_angle_deg`` is the triangulation angle below which points are lifted.
 
     Returns:
-        Points (m, 3), and a mask (m,) of those in front of both cameras within the error.
+        Points (m, 3) in the world frame, and a mask (m,) of points in front of both cameras with
+        small reprojection errors.
     """
     image_of = scene.graph.image_of
     centers = scene.centers()
@@ -152,18 +154,18 @@ def triangulate_or_lift(
     has_depth[lifts] = source_valid | target_valid
     angle_deg = triangulation_angle_deg(center_a, center_b, points)
     valid = _reprojects(scene, source, target, points, max_error_px) & (~lifts | has_depth)
-    # A lift must not replace the point of rays that miss each other at a wide angle.
+    # A lifted point must not replace the point of rays that miss each other at a wide angle.
     valid &= ~lifts | (angle_deg < 2 * options.min_angle_deg) | ~np.isfinite(angle_deg)
     return points, valid
 
 
 def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int]) -> None:
-    """Merge the points of matched keypoints if their mean fits all observations.
+    """Merge the points of matched keypoints if their mean fits all observations of both points.
 
     Args:
         scene: The scene.
-        options: ``max_error_px`` limits the reprojection errors.
-        images: Images whose matches are considered.
+        options: ``max_error_px`` limits the reprojection errors in pixels.
+        images: Images whose matches are considered for merging.
     """
     tracks, graph = scene.tracks, scene.graph
     edges = [graph.edges_of(image) for image in images]
@@ -205,7 +207,7 @@ def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int])
 
 
 def lift_low_parallax(scene: Scene, options: TriangulationOptions) -> None:
-    """Replace points of low triangulation angle by lifts from their most certain depth map."""
+    """Replace points of low parallax by points lifted from the most certain depth map."""
     tracks = scene.tracks
     observations = tracks.observations()
     points = tracks.point_of[observations]
@@ -225,13 +227,13 @@ def triangulate_midpoints(
     """Triangulate by the midpoint method (Hartley and Sturm 1997).
 
     Args:
-        center_a: (3,) or (m, 3) camera centers.
-        ray_a: (m, 3) directions, not necessarily of unit length.
-        center_b: (3,) or (m, 3) camera centers.
-        ray_b: (m, 3) directions in the same frame.
+        center_a: (3,) or (m, 3) centers of the first cameras.
+        ray_a: (m, 3) ray directions of the first cameras, not necessarily of unit length.
+        center_b: (3,) or (m, 3) centers of the second cameras.
+        ray_b: (m, 3) ray directions of the second cameras, in the same frame.
 
     Returns:
-        (m, 3) midpoints between the closest points of both rays; NaN for parallel rays.
+        (m, 3) midpoints between the closest points of both rays, with NaN for parallel rays.
     """
     aa, bb = (ray_a * ray_a).sum(axis=1), (ray_b * ray_b).sum(axis=1)
     ab = (ray_a * ray_b).sum(axis=1)
@@ -255,14 +257,14 @@ def _get_registered_edges(scene: Scene, image: int) -> tuple[Int64, Int64]:
 
 
 def _max_angle_error_px(scene: Scene, image: int, options: TriangulationOptions) -> float:
-    """Convert ``max_angle_error_deg`` to pixels at the principal point."""
+    """Convert ``max_angle_error_deg`` to a distance in pixels at the principal point."""
     return float(scene.intrinsics[image, 0] * np.tan(np.radians(options.max_angle_error_deg)))
 
 
 def _reprojects(
     scene: Scene, source: Int64, target: Int64, points: Float64, max_error_px: float
 ) -> Bool:
-    """Return (m,) whether points project within the error to both keypoints of their match."""
+    """Return (m,) True for points that project close to both keypoints of their match."""
     valid: Bool = np.asarray(np.isfinite(points).all(axis=1))
     for keypoints in (source, target):
         with np.errstate(invalid="ignore"):
@@ -272,12 +274,12 @@ def _reprojects(
 
 
 def _first_occurrences(values: Int64) -> Int64:
-    """Return the positions, ascending, at which a value occurs for the first time."""
+    """Return the positions, ascending, at which each value occurs for the first time."""
     return np.sort(np.unique(values, return_index=True)[1])
 
 
 def _pairs_within_groups(groups: Int64) -> tuple[Int64, Int64]:
-    """Return all ordered pairs of positions with equal value, each with itself too.
+    """Return all ordered pairs of positions with equal values, also of a position and itself.
 
     Args:
         groups: (m,) sorted values.
@@ -288,7 +290,7 @@ def _pairs_within_groups(groups: Int64) -> tuple[Int64, Int64]:
 
 
 def _expand_ranges(first: Int64, counts: Int64) -> tuple[Int64, Int64]:
-    """Expand ranges ``first[r] .. first[r] + counts[r] - 1``; return row and item of each."""
+    """Expand ranges ``first[r] .. first[r] + counts[r] - 1``, and return row and item of each."""
     rows = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     return rows, first[rows] + within

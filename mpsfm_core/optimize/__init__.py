@@ -1,1 +1,1 @@
-"""The numerical engines: depth integration, bundle adjustment, covariances."""
+"""Numerical optimization: depth integration, bundle adjustment and covariances."""

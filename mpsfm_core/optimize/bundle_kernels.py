@@ -1,9 +1,9 @@
 """Compiled kernels of bundle adjustment: linearization, Schur complement, back-substitution.
 
-A kernel works on a range of points and writes only to the data of that range. Therefore ranges run
-in threads without the GIL, and results do not depend on the number of threads. Kernels allocate no
-memory: the caller passes buffers, and numba's reference counting is off (``_nrt=False``), which is
-1.7 times faster.
+A kernel works on a range of points and writes only to the data of that range. Ranges of points
+therefore run in threads without the GIL, and results do not depend on the number of threads.
+Kernels allocate no memory: the caller passes buffers, and numba's reference counting is off
+(``_nrt=False``), which is 1.7 times faster.
 
 Observations are sorted by point, then by image. Each variable image and focal length has a slot.
 Camera-side vectors hold 7 parameters per image slot (rotation, translation, log scale of the depth
@@ -25,22 +25,23 @@ from mpsfm_core.support import jit
 Int32 = NDArray[np.int32]
 
 MIN_DEPTH = 1e-9
-"""Depth up to which a point does not project. [COLMAP: machine epsilon]"""
+"""Minimum depth of a point that projects into an image. [COLMAP: machine epsilon]"""
 MAX_SLOPE = 1e6
-"""Slope of a ray above which a point does not project; keeps all derivatives finite. [ours]"""
+"""Maximum slope of a ray of a point that projects into an image, which keeps all derivatives
+finite. [ours]"""
 MIN_DEPTH_RATIO = 0.1
-"""Smallest ratio of depth after and before a step of a point. Without this limit the linearized log
-depth would move distant points behind the camera. [ours]"""
+"""Minimum ratio of the depths of a point after and before a step. Without this minimum, the
+linearized log depth would move distant points behind the camera. [ours]"""
 STEP_REDUCTION = 0.25
-"""Factor on a step of a point that violates the limit. [ours]"""
+"""Factor on the step of a point that violates MIN_DEPTH_RATIO. [ours]"""
 MIN_STEP_LENGTH = 0.01
 """Relative step length below which a point is not moved. [ours]"""
 MAX_POINT_STEPS = 10
-"""Number of steps of each point with fixed cameras after a joint step. Points with outliers
-converge slowly under robust losses; these steps halve the run time.
+"""Number of steps of each point with fixed cameras after a joint step of points and cameras. Points
+with outliers converge slowly under robust losses, and the additional steps halve the run time.
 [tuned: benchmarks.bundle_adjustment]"""
 POINT_STEP_DAMPING = 1e-6
-"""Damping of these steps. [ours]"""
+"""Damping of the steps of single points with fixed cameras. [ours]"""
 NUM_IMAGE_PARAMS, NUM_FOCAL_PARAMS = np.int64(7), np.int64(1)
 """Number of parameters of an image (pose and log scale of its depth map) and of a focal length."""
 LOG_SCALE_IDX = 6
@@ -50,21 +51,21 @@ _ONLY = np.int64(0)
 
 
 class BundleObservations(NamedTuple):
-    """Observations sorted by point, then image."""
+    """Observations of all points, sorted by point, then by image."""
 
     start: Int64
     """(p + 1,) the observations of point p are ``start[p]:start[p + 1]``."""
     image: Int32
     xy: Float64
     weight: Float64
-    """Inverse standard deviation of the keypoint."""
+    """Inverse standard deviation of the keypoint of each observation, in 1 / pixels."""
     log_depth: Float64
     depth_weight: Float64
-    """Inverse standard deviation of the log depth; 0 without depth."""
+    """Inverse standard deviation of the log depth of each observation, 0 without depth."""
 
 
 class ParameterLayout(NamedTuple):
-    """Slots of the variable parameters; slot -1 is constant.
+    """Slots of the variable parameters, where slot -1 means constant.
 
     An image has a pose slot if its pose, its log scale or both are variable.
     """
@@ -75,11 +76,11 @@ class ParameterLayout(NamedTuple):
     variable_point: Bool
     variable_scale: Bool
     pair: Int32
-    """(s, s) row in :attr:`ReducedCameraSystem.blocks` of pose slots ``i <= j``, or -1."""
+    """(s, s) row of the pose slots ``i <= j`` in :attr:`ReducedCameraSystem.blocks`, or -1."""
 
 
 class RobustLosses(NamedTuple):
-    """Loss codes and scales, for whitened residuals."""
+    """Codes and scales of the robust losses, for whitened residuals."""
 
     reprojection_loss: int
     reprojection_scale: float
@@ -88,7 +89,7 @@ class RobustLosses(NamedTuple):
 
 
 class BundleData(NamedTuple):
-    """Data that is constant during an adjustment."""
+    """Data that is constant during a bundle adjustment."""
 
     obs: BundleObservations
     layout: ParameterLayout
@@ -96,27 +97,27 @@ class BundleData(NamedTuple):
 
 
 class BundleParameters(NamedTuple):
-    """Parameters of bundle adjustment."""
+    """Variables of bundle adjustment."""
 
     rotations: Float64
-    """(n, 3, 3) rotation of ``cam_from_world``."""
+    """(n, 3, 3) rotations of ``cam_from_world``."""
     translations: Float64
-    """(n, 3) translation of ``cam_from_world``."""
+    """(n, 3) translations of ``cam_from_world``."""
     log_scales: Float64
-    """(n,) log of the factor on the depth map of each image."""
+    """(n,) log of the scale factor on the depth map of each image."""
     intrinsics: Float64
-    """(k, 4) fx, fy, cx, cy in pixels."""
+    """(k, 4) camera parameters fx, fy, cx, cy in pixels."""
     points: Float64
-    """(p, 3) world points."""
+    """(p, 3) points in the world frame."""
 
 
 class ReducedCameraSystem(NamedTuple):
-    """Reduced camera system of a range of points, or its sum over all ranges."""
+    """Reduced camera system of a range of points, or the sum over all ranges."""
 
     blocks: Float64
-    """(pairs, 7, 7) blocks of pairs of images; diagonal blocks hold the upper triangle."""
+    """(pairs, 7, 7) blocks of image pairs. Diagonal blocks only have their upper triangle."""
     border: Float64
-    """(focals, 7 poses) coupling of focal lengths and images."""
+    """(focals, 7 poses) coupling between focal lengths and images."""
     corner: Float64
     """(focals, focals) block of the focal lengths."""
     gradient: Float64
@@ -124,11 +125,11 @@ class ReducedCameraSystem(NamedTuple):
     diagonal: Float64
     """(d,) diagonal of the Gauss-Newton matrix before the elimination of points."""
     rhs: Float64
-    """(d,) change of the gradient by the elimination."""
+    """(d,) change of the gradient by the elimination of points."""
 
 
 class EliminationBuffers(NamedTuple):
-    """Working memory of one range for tracks of up to ``longest`` observations."""
+    """Working memory of one range of points, for tracks of up to ``longest`` observations."""
 
     slots: Int64
     """(longest,) pose slots of the current point."""
@@ -200,10 +201,10 @@ def counting_sort(keys: Int32, previous: Int64, start: Int64, order: Int64) -> N
     """Sort the rows ``previous`` by ``keys[row]`` (stable counting sort).
 
     Args:
-        keys: Key of each row.
+        keys: Sort key of each row.
         previous: Rows in their previous order.
-        start: (keys + 2,) zeros; receives the first position of each key.
-        order: Receives the sorted rows.
+        start: (keys + 2,) zeros, which receive the first position of each key.
+        order: Array that receives the sorted rows.
     """
     for row in previous:
         start[keys[row] + 2] += 1
@@ -224,7 +225,7 @@ def number_covisible_poses(
         obs: Observations.
         pose_slot: (n,) pose slot of each image.
         variable: (p,) bool.
-        pair: (s, s) filled with -1; receives the numbers on and above the diagonal.
+        pair: (s, s) array of -1, which receives the numbers on and above the diagonal.
 
     Returns:
         Number of pairs.
@@ -251,7 +252,7 @@ def number_covisible_poses(
 def linearize_observation(
     k: int, p: int, bundle: BundleData, state: BundleParameters
 ) -> LinearizedObservation:
-    """Linearize observation ``k`` of point ``p``; cost and derivatives are 0 if invisible."""
+    """Linearize observation ``k`` of point ``p``, with cost and derivatives 0 if invisible."""
     obs, robust = bundle.obs, bundle.robust
     image = obs.image[k]
     rotation, points = state.rotations, state.points

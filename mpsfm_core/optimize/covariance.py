@@ -1,4 +1,4 @@
-"""Covariances of 3D points, and the variance of their depth."""
+"""Covariances of 3D points, and the variance of their depth in a camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from mpsfm_core.optimize.bundle_problem import BundleProblem, prepare_bundle, ra
 from mpsfm_core.optimize.options import BundleOptions
 
 DAMPING = 1e-8
-"""Damping of the information of each coordinate, which makes it invertible. [COLMAP damping]"""
+"""Damping of the information matrix of a point, which makes the matrix invertible. [COLMAP
+damping]"""
 
 
 def compute_point_covariances(
@@ -21,12 +22,12 @@ def compute_point_covariances(
     """Compute the covariance of each point for fixed cameras.
 
     The covariance is the inverse of the block of the point in the normal equations, with the IRLS
-    weights of the robust losses, as in COLMAP's ``estimate_ba_covariance``. An unobserved
-    direction has variance ``1 / DAMPING``.
+    weights of the robust losses, as in COLMAP's ``estimate_ba_covariance``. Unobserved directions
+    have the variance ``1 / DAMPING``.
 
     Args:
-        problem: The problem; which parameters are variable has no effect.
-        options: Losses and number of threads.
+        problem: The bundle adjustment problem, whose points are all treated as variable.
+        options: Options with the robust losses and the number of threads.
 
     Returns:
         (p, 3, 3) float64 covariances in the world frame, in squared world units.
@@ -50,16 +51,17 @@ def compute_point_covariances(
 
 
 def propagate_depth_variance(covariances: Float64, rotations: Float64) -> Float64:
-    """Propagate point covariances to the variance of depth in a camera.
+    """Propagate the covariances of points to the variance of their depth in a camera.
 
-    The variance is the last diagonal entry of ``R S R^T``; the published code has ``R^T S R``.
+    The variance is the last diagonal entry of ``R S R^T``, whereas the published code uses ``R^T S
+    R``.
 
     Args:
-        covariances: (m, 3, 3) covariances S in the world frame.
+        covariances: (m, 3, 3) covariances S in the world frame, in squared world units.
         rotations: (m, 3, 3) or (3, 3) rotation R of ``cam_from_world``.
 
     Returns:
-        (m,) float64 variance of z in squared world units.
+        (m,) float64 variance of the depth z in squared world units.
     """
     axis = rotations[..., 2, :]
     variance: Float64 = np.einsum("...a,...ab,...b->...", axis, covariances, axis)

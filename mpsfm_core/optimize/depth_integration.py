@@ -38,33 +38,35 @@ from mpsfm_core.optimize.subsampling import (
 )
 
 _FILLED_LOG_VARIANCE = 1.0
-"""Variance of the log depth of pixels that have a normal but no prior: weak, but determined."""
+"""Variance of the log depth of pixels that have a normal but no prior, which only makes the system
+non-singular."""
 _COARSE_COLUMNS = 300
-"""Half the width from which maps are first refined on every second pixel; it takes 0.8 of the time
+"""Half of the map width from which maps are first refined on every second pixel, which is faster
 and reaches a lower energy. [tuned: benchmarks.depth_integration]"""
 _FINE_ITERATIONS = 3
-"""Maximum number of re-weightings after the coarse refinement. [ours]"""
+"""Maximum number of IRLS re-weightings on the whole map after the coarse refinement. [ours]"""
 _MAX_EXTRAPOLATION = 100.0
-"""Largest ratio of integrated depth to known depth; grazing normals would exceed it. [ours]"""
+"""Maximum ratio of integrated to known depth, which would be exceeded at grazing normals. [ours]"""
 POINT_MAX_RATIO = 1.5
-"""Largest ratio of the depth of a point and the scaled prior for which the point counts.
-[reference]"""
+"""Maximum ratio between the depth of a triangulated point and the scaled prior for which the point
+is used. [reference]"""
 _FIXED_WEIGHT = 1e15
-"""Weight that fixes known depth, against couplings below 1e12."""
+"""Weight that fixes pixels of known depth, relative to couplings below 1e12."""
 
 
 class Anchors(NamedTuple):
-    """Triangulated points that constrain single pixels of a map.
+    """Triangulated points that constrain single pixels of a depth map.
 
-    Points outside the map, on invalid pixels, or with non-positive depth or variance are ignored.
+    Points outside of the map, on invalid pixels, or with non-positive depth or variance are
+    ignored.
     """
 
     xy: Float64
-    """(n, 2) pixels of the grid of the map; the nearest pixel is constrained."""
+    """(n, 2) positions in pixels of the depth map. The nearest pixel is constrained."""
     depth: Float64
-    """(n,) depth z in the unit of the scaled prior."""
+    """(n,) depth z of the points in the unit of the scaled prior."""
     variance: Float64
-    """(n,) variance of the depth."""
+    """(n,) variance of the depth of the points, in squared units of the scaled prior."""
 
 
 NO_ANCHORS = Anchors(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
@@ -72,38 +74,39 @@ NO_ANCHORS = Anchors(np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 @dataclass(frozen=True, eq=False)
 class RefinedDepth:
-    """Refined depth map, and the summary of its refinement."""
+    """Refined depth map with a summary of its refinement."""
 
     log_depth: Float64
     """(h, w) float64 natural logarithm of depth in the unit of the scaled prior."""
     valid: Bool
-    """(h, w) bool; False without prior and without connected normal (the value is the median)."""
+    """(h, w) bool, False for pixels with neither a prior nor a connected normal, whose
+    value is the median."""
     scale: float
-    """Scale of the prior."""
+    """Scale of the depth prior during the refinement."""
     initial_energy: float
-    """Energy of the initial map with the same anchors."""
+    """Energy of the initial map for the same anchors."""
     energy: float
-    """Energy of the refined map; at most ``initial_energy``."""
+    """Energy of the refined map, at most ``initial_energy``."""
     point_energy: float
-    """Mean energy of an anchor."""
+    """Mean energy of one anchor in the refined map."""
     iterations: int
-    """Number of re-weightings on the whole map."""
+    """Number of IRLS re-weightings on the whole map."""
     cg_iterations: int
     """Number of conjugate-gradient iterations on the whole map."""
     converged: bool
-    """Whether the tolerance stopped the refinement."""
+    """True if the refinement stopped because of its tolerance."""
     skipped: bool
-    """Whether the map was not refined again, because the anchors fit about as well as before; the
-    energies are those of the last refinement."""
+    """True if the map was not refined again, because the anchors fit about as well as before. The
+    energies are then those of the last refinement."""
 
     @property
     def depth(self) -> Float32:
-        """(h, w) float32 depth."""
+        """(h, w) float32 depth in the unit of the scaled prior."""
         return np.exp(self.log_depth).astype(np.float32)
 
 
 class _Solver:
-    """Majorises the energy of one image, and steps towards the minimum of a majorizer."""
+    """Majorize-minimize solver for the energy of one image."""
 
     def __init__(self, terms: EnergyTerms) -> None:
         self._terms = terms
@@ -120,19 +123,19 @@ class _Solver:
 
 
 class DepthIntegrator:
-    """Depth integration of one image for changing points and scales.
+    """Depth integration of one image, for changing anchors and depth scales.
 
     Pixels with a normal but without depth are integrated from their surroundings. Instances are
     immutable, so that several threads may use them.
 
     Args:
-        depth: Depth prior with variance, on the grid of ``camera``.
-        normals: Normal prior with variance, on the same grid.
-        camera: Intrinsics of the grid.
+        depth: Depth prior with variance, at the resolution of ``camera``.
+        normals: Normal prior with variance, at the resolution of ``camera``.
+        camera: Intrinsics in pixels of the depth and normal priors.
         options: Options of the integration.
 
     Raises:
-        DataError: The grids differ or a variance is missing.
+        DataError: The priors and the camera differ in size, or a prior has no variance.
     """
 
     def __init__(
@@ -177,14 +180,14 @@ class DepthIntegrator:
         scale: float = 1.0,
         start: RefinedDepth | None = None,
     ) -> RefinedDepth:
-        """Refine the map for new anchors or a new scale.
+        """Refine the depth map for new anchors or a new scale of the prior.
 
         Args:
             anchors: Triangulated points.
             scale: Scale of the depth prior.
-            start: Earlier result of this instance, which is rescaled and used as initial map. It is
-                returned unrefined if the anchors fit about as well as before. None starts from the
-                scaled prior.
+            start: Earlier result of this instance, which is rescaled and used as initial map. The
+                earlier result is returned unrefined if the anchors fit about as well as before.
+                None starts from the scaled prior.
         """
         if start is None:
             solver = _Solver(self._terms(anchors, scale))
@@ -199,13 +202,13 @@ class DepthIntegrator:
         return self._descend(z, solver.majorize(z), solver, scale)
 
     def variance(self, refined: RefinedDepth, anchors: Anchors = NO_ANCHORS) -> Float32:
-        """Compute the marginal variance of the refined log depth; takes 10 to 15 refinements.
+        """Compute the marginal variance of the refined log depth.
 
         The variance is the exact diagonal of the inverse Gauss-Newton Hessian with the present IRLS
-        weights. Multiply by depth^2 for the variance of depth.
+        weights. Multiply the variance by depth^2 for the variance of depth.
 
         Returns:
-            (h, w) float32; infinite where invalid.
+            (h, w) float32 variance, infinite where depth is invalid.
         """
         terms = self._terms(anchors, refined.scale)
         here = majorize(refined.log_depth, terms)
@@ -219,7 +222,7 @@ class DepthIntegrator:
         anchors: Anchors,
         scale: float,
     ) -> RefinedDepth:
-        """Descend from the scaled prior, or from the result of the coarse grid."""
+        """Minimize the energy from the scaled prior, or from the result of a coarser grid."""
         if self._coarse is None:
             return self._descend(prior, here, solver, scale)
         coarse = self._coarse.refine(
@@ -242,7 +245,7 @@ class DepthIntegrator:
         scale: float,
         max_iterations: int | None = None,
     ) -> RefinedDepth:
-        """Minimize by IRLS from z; every accepted step decreases the energy."""
+        """Minimize the energy by IRLS from the map z. Every accepted step decreases the energy."""
         options = self.options
         limit = options.max_iterations if max_iterations is None else max_iterations
         initial_energy = here.energy
@@ -290,7 +293,7 @@ class DepthIntegrator:
         )
 
     def _point_terms(self, anchors: Anchors, prior: Float64) -> PointTerms:
-        """Convert anchors to log depth of pixels, without unusable anchors and outliers."""
+        """Convert anchors to the log depth of pixels, without unusable anchors and outliers."""
         height, width = prior.shape
         columns, rows = np.asarray(anchors.xy, np.float64).reshape(-1, 2).T
         depth, variance = np.asarray(anchors.depth), np.asarray(anchors.variance)
@@ -321,7 +324,7 @@ class DepthIntegrator:
 
 
 def _reachable(depth_valid: Bool, normals_valid: Bool) -> Bool:
-    """Return pixels with depth, and pixels with a normal that connect to one of them."""
+    """Return pixels with depth, and pixels with a normal that connects them to depth."""
     active: Bool = depth_valid | normals_valid
     if depth_valid.all():
         return active

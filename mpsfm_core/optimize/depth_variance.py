@@ -1,10 +1,11 @@
 """Marginal variances: the exact diagonal of the inverse of a five-point grid operator.
 
-Selected inversion by nested dissection (George, 1973). Separator lines halve the grid until small
-blocks remain. Blocks and then separators are eliminated bottom-up, each leaving a dense Schur
-complement on its boundary. Top-down, the entries of the inverse on these boundaries follow. Parts
-of equal size are processed together as stacked dense matrices. For n pixels this takes O(n^1.5)
-operations and O(n log n) memory.
+The algorithm is selected inversion by nested dissection (George, 1973). Separator lines halve the
+grid until small blocks remain. Blocks and then separators are eliminated bottom-up. Each
+elimination leaves a dense Schur complement on the boundary of the eliminated part. A top-down pass
+then computes the entries of the inverse on these boundaries. Parts of equal size are processed
+together as stacked dense matrices. For n pixels this takes O(n^1.5) operations and O(n log n)
+memory.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from threadpoolctl import threadpool_limits
 from mpsfm_core.data import Float32, Float64, Int64
 
 _BLOCK_SIDE = 6
-"""Largest side of a block that is not divided. [ours, fastest of 3 to 12]"""
+"""Maximum side in pixels of a block that is not divided. [ours, fastest of 3 to 12]"""
 
 _Pixel = tuple[int, int]
 
@@ -34,48 +35,48 @@ class _Part(NamedTuple):
 
 
 class _Child(NamedTuple):
-    """One half of every part of a group."""
+    """One half of every part of a group, separated by a line of pixels."""
 
     group: int
     """Number of the group that contains the halves."""
     members: slice
-    """Halves within that group."""
+    """Indices of the halves within their group."""
     where: Int64
     """Indices of the boundary pixels of a half among the inner and outer pixels of the part."""
 
 
 class _Group(NamedTuple):
-    """Parts of equal shape."""
+    """Parts of the grid that have equal shape."""
 
     origins: Int64
-    """(m, 2) top left pixel of each part."""
+    """(m, 2) top left pixel of each part of the group."""
     inner: list[_Pixel]
-    """Pixels to eliminate, relative to the origin."""
+    """Pixels that are eliminated, relative to the top left pixel of the part."""
     outer: list[_Pixel]
-    """Boundary pixels around the part, relative to the origin."""
+    """Boundary pixels around the part, relative to the top left pixel of the part."""
     children: list[_Child]
-    """Two halves, or none."""
+    """Two halves of each part, or no halves."""
 
 
 class _Elimination(NamedTuple):
-    """Elimination of the inner pixels of the parts of a group."""
+    """Result of the elimination of the inner pixels of the parts of a group."""
 
     inverse: Float64
-    """(m, s, s) inverse of the inner block."""
+    """(m, s, s) inverses of the blocks of inner pixels."""
     gain: Float64
-    """(m, s, b) inverse @ coupling of inner to outer pixels."""
+    """(m, s, b) products of inverse block and coupling of inner to outer pixels."""
 
 
 def compute_inverse_diagonal(east: Float32, south: Float32, mass: Float32) -> Float64:
     """Compute ``diag(A^-1)`` of the operator A that ``multigrid`` describes.
 
     Args:
-        east: (h, w) couplings to the next pixel to the right.
-        south: (h, w) couplings to the next pixel below.
-        mass: (h, w) masses; every connected set of pixels needs a positive one.
+        east: (h, w) couplings of each pixel to the next pixel to the right.
+        south: (h, w) couplings of each pixel to the next pixel below.
+        mass: (h, w) masses of the pixels. Every connected set of pixels needs a positive mass.
 
     Returns:
-        (h, w) float64; infinite for pixels without couplings and mass.
+        (h, w) float64 variances, infinite for pixels without couplings and mass.
     """
     planes = np.zeros((2, mass.shape[0] + 1, mass.shape[1] + 1))
     planes[0, :-1, :-2] = east[:, :-1]
@@ -94,7 +95,7 @@ def compute_inverse_diagonal(east: Float32, south: Float32, mass: Float32) -> Fl
 
 
 def _dissect(height: int, width: int) -> list[_Group]:
-    """Dissect the grid into groups, parents before children; the first is the whole grid."""
+    """Dissect the grid into groups of parts, parents before children, beginning with the grid."""
     groups: list[_Group] = []
     level = {_Part(height, width): [np.zeros((1, 2), np.int64)]}
     while level:
@@ -123,7 +124,7 @@ def _dissect(height: int, width: int) -> list[_Group]:
 
 
 def _halve(part: _Part) -> tuple[list[_Pixel], list[tuple[_Pixel, _Part]]]:
-    """Return the separator of a part, and offsets and shapes of the separated halves."""
+    """Return the separator of a part, and the offsets and shapes of the separated halves."""
     height, width = part.height, part.width
     if max(height, width) <= _BLOCK_SIDE:
         return [(r, c) for r in range(height) for c in range(width)], []
@@ -143,7 +144,7 @@ def _halve(part: _Part) -> tuple[list[_Pixel], list[tuple[_Pixel, _Part]]]:
 
 
 def _surrounding(part: _Part) -> list[_Pixel]:
-    """Return the boundary pixels around a part."""
+    """Return the boundary pixels around a part of the grid."""
     rows, columns = range(part.height), range(part.width)
     return (
         [(-1, c) for c in columns if part.top]
@@ -154,7 +155,7 @@ def _surrounding(part: _Part) -> list[_Pixel]:
 
 
 def _eliminate(groups: list[_Group], planes: Float64, diagonal: Float64) -> list[_Elimination]:
-    """Eliminate bottom-up; the Schur complement of a part is added to the matrix of its parent."""
+    """Eliminate bottom-up, adding the Schur complement of each part to the matrix of its parent."""
     eliminations: dict[int, _Elimination] = {}
     remainders: dict[int, Float64] = {}
     for number in reversed(range(len(groups))):
@@ -173,7 +174,7 @@ def _eliminate(groups: list[_Group], planes: Float64, diagonal: Float64) -> list
 
 
 def _add_stencil(front: Float64, group: _Group, planes: Float64, diagonal: Float64) -> None:
-    """Add the rows of the operator that belong to the inner pixels."""
+    """Add the operator rows of the inner pixels to the matrix of a part."""
     index = {pixel: k for k, pixel in enumerate(group.inner + group.outer)}
     rows, columns = group.origins.T
     for k, (r, c) in enumerate(group.inner):
@@ -191,7 +192,7 @@ def _add_stencil(front: Float64, group: _Group, planes: Float64, diagonal: Float
 def _recover(
     groups: list[_Group], eliminations: list[_Elimination], shape: tuple[int, int]
 ) -> Float64:
-    """Recover variances top-down: boundary covariances give those of the inner pixels."""
+    """Recover variances top-down, from boundary covariances to those of the inner pixels."""
     variance = np.empty(shape)
     around = [np.empty((len(g.origins), len(g.outer), len(g.outer))) for g in groups]
     for group, (inverse, gain), outer in zip(groups, eliminations, around, strict=True):

@@ -11,8 +11,8 @@ r_+ and r_- are the one-sided residuals of bilateral normal integration (Cao et 
 
     r_+ = s (z[p + e] - z[p]) + n,    s = f (n . ray),    n = n_x or n_y
 
-``var_r = var_n |e - ray n / (n . ray)|^2`` propagates an isotropic normal variance. With sharpness
-k::
+``var_r = var_n |e - ray n / (n . ray)|^2`` propagates an isotropic variance of the normal n to the
+residual. With sharpness k::
 
     soft_min(a, b, limit) = -log((exp(-k a) + exp(-k b) + exp(-k limit)) / (2 + exp(-k limit))) / k
 
@@ -35,20 +35,22 @@ from mpsfm_core.support import jit
 _kernel, _helper = jit.kernel(fastmath=True), jit.helper(fastmath=True)
 
 _MISSING = 1e30
-"""Squared residual of a side without a neighbor."""
+"""Squared residual assigned to the side of a pixel that has no neighbor."""
 _SQRT_3 = 1.7320508075688772
 _MIN_NORMAL_VARIANCE = 1e-4
-"""Smallest variance of a normal, (0.6 deg)^2; smaller ones spoil the condition of the system."""
+"""Minimum variance of a normal, (0.6 deg)^2. Smaller variances make the linear system
+ill-conditioned."""
 MIN_LOG_VARIANCE = 1e-6
-"""Smallest variance of log depth, (0.1 %)^2."""
+"""Minimum variance of log depth, (0.1 %)^2."""
 MAX_LOG_VARIANCE = 1e2
-"""Largest variance of log depth; beyond, depth carries no information."""
+"""Maximum variance of log depth, beyond which depth carries no information."""
 _MIN_FACING = 2e-3
-"""Smallest -n . ray; normals beyond 89.9 deg carry no information about the slope of depth."""
+"""Minimum of -n . ray for unit normals n. Normals beyond 89.9 deg carry no information about the
+slope of depth."""
 
 
 class EnergyLosses(NamedTuple):
-    """Soft minimum in squared residuals, and scales of the losses in standard deviations."""
+    """Sharpness of the soft minimum, and scales of the losses in standard deviations."""
 
     sharpness: float
     normal_limit: float
@@ -57,7 +59,7 @@ class EnergyLosses(NamedTuple):
 
 
 class NormalTerms(NamedTuple):
-    """Normal residuals with a frame of one pixel, (2, h + 2, w + 2): along x, then along y."""
+    """Normal residuals along x and y, with a frame of one pixel, (2, h + 2, w + 2)."""
 
     slope: Float32
     """s of each pixel."""
@@ -66,11 +68,11 @@ class NormalTerms(NamedTuple):
     weight: Float32
     """w_n / var_r; 0 without a normal."""
     link: Bool
-    """Whether the pixel and the next one along the axis may be linked."""
+    """True if a pixel and the next pixel along the axis may be linked."""
 
 
 class PriorTerms(NamedTuple):
-    """Depth prior: log depth (h, w), precision 1 / var_log_d (h, w), and weight w_d."""
+    """Depth prior with log depth (h, w), precision 1 / var_log_d (h, w), and weight w_d."""
 
     log_depth: Float64
     precision: Float32
@@ -78,7 +80,7 @@ class PriorTerms(NamedTuple):
 
 
 class PointTerms(NamedTuple):
-    """Sparse points (n,): pixel, log depth and precision 1 / var_log_D."""
+    """Sparse points (n,) with pixel, log depth and precision 1 / var_log_D."""
 
     rows: Int64
     columns: Int64
@@ -87,7 +89,7 @@ class PointTerms(NamedTuple):
 
 
 class EnergyTerms(NamedTuple):
-    """Terms of the energy of one image."""
+    """Terms of the depth integration energy of one image."""
 
     normals: NormalTerms
     prior: PriorTerms
@@ -100,9 +102,9 @@ class QuadraticMajorizer(NamedTuple):
 
     energy: float
     point_energy: float
-    """Mean energy of a sparse point."""
+    """Mean energy of one sparse point."""
     gradient: Float64
-    """(h, w) half the gradient of the energy."""
+    """(h, w) half of the gradient of the energy."""
     east: Float32
     south: Float32
     mass: Float32
@@ -111,7 +113,7 @@ class QuadraticMajorizer(NamedTuple):
 def build_normal_terms(
     normals: NormalPrior, camera: PinholeCamera, active: Bool, weight: float
 ) -> NormalTerms:
-    """Build the residuals of a normal map with variance between active pixels (h, w)."""
+    """Build the residuals of a normal map with variance between the active pixels (h, w)."""
     shape = (2, active.shape[0] + 2, active.shape[1] + 2)
     link = np.zeros(shape, np.bool_)
     link[0, 1:-1, 1:-2] = active[:, :-1] & active[:, 1:]
@@ -119,7 +121,7 @@ def build_normal_terms(
     terms = NormalTerms._make([*np.zeros((3, *shape), np.float32), link])
     usable = normals.valid & active
     assert normals.variance is not None
-    # a read-only array is another type to numba, which would compile the kernel again
+    # numba would compile the kernel again for a read-only array
     values, variance = (
         np.require(a, None, ("C", "W")) for a in (normals.normals, normals.variance)
     )
@@ -135,7 +137,7 @@ def compute_mean_point_energy(z: Float64, points: PointTerms, scale: float) -> f
 
 
 def majorize(z: Float64, terms: EnergyTerms) -> QuadraticMajorizer:
-    """Compute the energy of a map of log depth (h, w) and its majorizer at that map."""
+    """Compute the energy of a map of log depth (h, w), and its majorizer at that map."""
     framed = np.zeros((z.shape[0] + 2, z.shape[1] + 2))
     framed[1:-1, 1:-1] = z
     gradient = np.zeros_like(framed)

@@ -1,6 +1,6 @@
-"""Robust losses in the convention of Ceres.
+"""Robust losses in the convention of Ceres, ``(rho(s), rho'(s))`` of squared residuals s.
 
-A loss maps the squared residual ``s`` and the scale ``a``, in the unit of the residual, to
+A loss maps the squared residual ``s`` and the loss scale ``a``, in the unit of the residual, to
 ``(rho(s), rho'(s))``. An objective is ``sum(rho(s)) / 2``, and ``rho'`` is the weight in
 iteratively re-weighted least squares (IRLS). The functions accept numpy arrays and, in kernels,
 scalars. :func:`evaluate_loss` selects a function by its :class:`Loss`.
@@ -23,7 +23,7 @@ from mpsfm_core.support import jit
 
 @register_jitable
 def trivial(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
-    """Evaluate ``rho = s``, the quadratic loss; the scale has no effect."""
+    """Evaluate ``rho = s``, the quadratic loss, on which the scale has no effect."""
     return s, 0.0 * s + 1.0
 
 
@@ -36,14 +36,14 @@ def soft_l1(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
 
 @register_jitable
 def cauchy(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
-    """Evaluate ``rho = a^2 log(1 + s / a^2)``; the influence of large residuals vanishes."""
+    """Evaluate ``rho = a^2 log(1 + s / a^2)``, where large residuals lose influence."""
     ratio = s / (scale * scale)
     return scale * scale * np.log1p(ratio), 1.0 / (1.0 + ratio)
 
 
 @register_jitable
 def truncated(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
-    """Evaluate ``rho = min(s, a^2)``; residuals above the scale have no influence."""
+    """Evaluate ``rho = min(s, a^2)``, where residuals above the scale have no influence."""
     return np.minimum(s, scale * scale), (s < scale * scale) * 1.0
 
 
@@ -55,12 +55,12 @@ LOSSES: Mapping[Loss, Callable[[NDArray[Any], float], tuple[Any, Any]]] = Mappin
         Loss.TRUNCATED: truncated,
     }
 )
-"""Functions by :class:`Loss`, for numpy arrays; kernels use :func:`evaluate_loss`."""
+"""Loss functions by :class:`Loss`, for numpy arrays. Kernels use :func:`evaluate_loss`."""
 
 
 @jit.helper()
 def evaluate_loss(loss: int, s: float, scale: float) -> Any:
-    """Evaluate ``(rho, rho')`` of a squared residual; ``loss`` is a :class:`Loss` as int."""
+    """Evaluate ``(rho, rho')`` of a squared residual for a :class:`Loss` given as int."""
     if loss == 1:
         return soft_l1(s, scale)
     if loss == 2:

@@ -50,35 +50,37 @@ from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample,
 from mpsfm_core.support import jit
 
 NUM_ERROR_STEPS = 4
-"""Samples of the depth error on either side of 0, evenly spaced up to ``max_deviation``. [ours]"""
+"""Number of samples of the depth error on either side of 0, evenly spaced up to ``max_deviation``.
+[ours]"""
 PIXEL_STRIDE = 2
 """Distance in pixels between the compared pixels of the subsampled maps. [ours]"""
 MIN_SIGNIFICANCE = 3.0
-"""If a quarter of the pixels puts the violation ratio so many standard deviations from the limit,
-the other pixels are skipped. [ours]"""
+"""Number of standard deviations between the violation ratio of a quarter of the pixels and the
+limit at which all other pixels are skipped. [ours]"""
 OVERLAP_GRID = 16
-"""Columns and rows of the pixels that measure overlap. [ours]"""
+"""Columns and rows of the pixel grid that measures the overlap of two images. [ours]"""
 MIN_OVERLAP_RATIO = 0.05
-"""Share of these pixels that must project into another image for a comparison. [ours]"""
+"""Minimum share of grid pixels that project into another image for a comparison of both images.
+[ours]"""
 
 
 class DepthViolation(NamedTuple):
-    """The largest contradiction between an image and the other images."""
+    """Largest depth violation between an image and all other images."""
 
     ratio: float
-    """Violation ratio, summed over both directions, in [0, 2]."""
+    """Violation ratio of the image pair, summed over both directions, in [0, 2]."""
     other_image: int
-    """The image that contradicts it, or -1 if no image overlaps."""
+    """Index of the image that contradicts the checked image, or -1 if no image overlaps."""
 
 
 class DepthConsistencyCheck:
-    """Depth consistency check of a scene; caches the subsampled depth maps until they change.
+    """Depth consistency check of a scene, which caches subsampled depth maps.
 
     Args:
         scene: The scene.
-        options: Thresholds of the check.
-        fill_holes: Fill holes of one or two pixels in the depth maps, as sensors leave them.
-            Without filling, a slightly wrong pose looks through the holes. [ours]
+        options: Thresholds of the depth consistency check.
+        fill_holes: Fill holes of one or two pixels in sensor depth maps. Without filling, a
+            slightly wrong pose sees other surfaces through the holes.
     """
 
     def __init__(
@@ -92,11 +94,12 @@ class DepthConsistencyCheck:
     def check_image(
         self, image: int, std_factor: float = 1.0, limit: float = math.nan
     ) -> DepthViolation:
-        """Return the largest violation ratio of an image with the images that it overlaps most.
+        """Return the largest violation ratio of an image with the images that overlap it most.
 
         Args:
             image: A registered image.
-            std_factor: Measured standard deviation of depth, relative to the declared one.
+            std_factor: Measured standard deviation of depth relative to the declared standard
+                deviation.
             limit: See :meth:`measure_violation_ratio`.
         """
         violations = [
@@ -108,12 +111,12 @@ class DepthConsistencyCheck:
     def find_conflicting_images(
         self, images: Sequence[int] | Int64, limit: float, std_factor: float = 1.0
     ) -> list[tuple[int, float]]:
-        """Find registered images to deregister so that no contradiction with ``images`` remains.
+        """Find registered images to deregister such that no contradiction with ``images`` remains.
 
-        The image with the most contradictions goes first (greedy vertex cover).
+        Images with the most contradictions are deregistered first (greedy vertex cover).
 
         Args:
-            images: Images to compare with the images that they overlap with.
+            images: Images that are compared with all images that they overlap.
             limit: Violation ratio above which two images contradict each other.
             std_factor: See :meth:`check_image`.
 
@@ -257,25 +260,25 @@ def count_visible_points(
 
 
 class _DepthGrid(NamedTuple):
-    """A subsampled depth map."""
+    """Subsampled depth map of one image."""
 
     depth: Float32
-    """(h, w) depth."""
+    """(h, w) depth in world units."""
     log_std: Float32
-    """(h, w) standard deviation of log depth."""
+    """(h, w) standard deviation of the log depth."""
     valid: Bool
-    """(h, w) whether the depth is known."""
+    """(h, w) True where depth is known."""
     nearest: Float32
-    """(h, w) smallest depth in the 3x3 neighborhood."""
+    """(h, w) smallest depth in the 3 x 3 neighborhood, in world units."""
     intrinsics: Float64
     """(4,) fx, fy, cx, cy in pixels of the grid."""
 
 
 class _DepthMapState(NamedTuple):
-    """The inputs of a grid, by which the cache recognizes a change.
+    """Inputs of a subsampled depth map, by which the cache detects a change.
 
-    The points that measure the local standard deviation also change, but the map is refined
-    whenever they do.
+    The points that measure the local standard deviation are not compared, because the depth map is
+    refined whenever these points change.
     """
 
     refined: RefinedDepth | None

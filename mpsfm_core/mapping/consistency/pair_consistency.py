@@ -43,17 +43,18 @@ from mpsfm_core.mapping.registration.correspondences import find_correspondences
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 
 MAX_ROTATION_ERROR_DEG = 30.0
-"""Largest angle between the rotation of a pair and that of consistent pairs. It allows for errors
-of some degrees along a chain of pairs. [ours]"""
+"""Maximum angle between the rotation of a pair and the rotation that consistent pairs imply. This
+maximum allows for errors of some degrees along a chain of pairs. [ours]"""
 
 
 class PairConsistency(NamedTuple):
-    """Result of the check of one pair."""
+    """Result of the depth consistency check of one image pair."""
 
     rotation: Float64
-    """(3, 3) ``b_from_a`` of the best consistent pose; of the best pose if none is consistent."""
+    """(3, 3) rotation ``b_from_a`` of the best consistent pose, or of the best pose if no pose is
+    consistent."""
     support_ratio: float
-    """Support of the best consistent pose relative to the best pose; 0 if none is consistent."""
+    """Support of the best consistent pose relative to the best pose, 0 if no pose is consistent."""
 
 
 class PairConsistencyCheck:
@@ -71,7 +72,7 @@ class PairConsistencyCheck:
 
         Args:
             problem: The problem.
-            candidates: (n,) bool, images whose pairs are checked; other pairs stay unchanged.
+            candidates: (n,) bool, images whose pairs are checked. All other pairs stay unchanged.
         """
         min_matches = self._options.registration.min_inliers
         results = {
@@ -99,7 +100,7 @@ class PairConsistencyCheck:
         return replace(problem, pairs=tuple(pairs))
 
     def check_pair(self, pair: VerifiedPair) -> PairConsistency:
-        """Check a pair; without any pose hypothesis, the verified pose counts as consistent."""
+        """Check a pair, whose verified pose counts as consistent if there is no pose hypothesis."""
         verified = scale_verified_pair(self._scene, pair, self._options.initialization)
         if verified is not None and self._is_consistent(verified):
             return PairConsistency(pair.rotation, 1.0)
@@ -122,12 +123,12 @@ class PairConsistencyCheck:
         return PairConsistency(_b_from_a(pair, consistent), support_ratio)
 
     def _find_best_consistent(self, hypotheses: Sequence[InitialPair]) -> InitialPair | None:
-        """Return the best supported pose that passes the depth check."""
+        """Return the best supported pose that passes the depth consistency check, or None."""
         ranked = sorted(hypotheses, key=_get_support, reverse=True)
         return next((initial for initial in ranked if self._is_consistent(initial)), None)
 
     def _is_consistent(self, initial: InitialPair) -> bool:
-        """Return whether a relative pose passes the depth check."""
+        """Return True if a relative pose passes the depth consistency check."""
         scene, limit = self._scene, self._options.consistency.max_violations_pair
         empty = scene.snapshot()
         register_first_image(scene, initial.reference)
@@ -141,7 +142,7 @@ class PairConsistencyCheck:
         return ratio <= limit
 
     def _estimate_scale(self, initial: InitialPair) -> float:
-        """Estimate the scale of the other image's prior from the depth of matched points."""
+        """Estimate the scale of the other image's depth prior from the depth of matched points."""
         scene, pose = self._scene, initial.pose
         correspondences = find_correspondences(
             scene, initial.image, [initial.reference], self._options.registration
@@ -157,15 +158,15 @@ class PairConsistencyCheck:
 def _average_consistent_pairs(
     rotation_of: Mapping[VerifiedPair, Float64], num_images: int
 ) -> tuple[csr_array, Float64]:
-    """Build the match graph of consistent pairs and average their relative rotations.
+    """Build the match graph of consistent pairs, and average their relative rotations.
 
     Args:
-        rotation_of: ``b_from_a`` (3, 3) of each consistent pair.
+        rotation_of: Relative rotation ``b_from_a`` (3, 3) of each consistent pair.
         num_images: Number of images.
 
     Returns:
-        The number of matches of each two images, a sparse matrix (n, n), and the rotations
-        (n, 3, 3) of the images in one frame per connected component.
+        A sparse matrix (n, n) of the number of matches of every two images, and the rotations (n,
+        3, 3) of the images in one frame per connected component.
     """
     a = np.array([pair.image_a for pair in rotation_of], dtype=np.int64)
     b = np.array([pair.image_b for pair in rotation_of], dtype=np.int64)

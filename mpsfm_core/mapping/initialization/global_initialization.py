@@ -36,52 +36,56 @@ from mpsfm_core.mapping.triangulation import triangulate_midpoints
 MIN_ANGLE_DEG = 1.5
 """Smallest triangulation angle of a match that measures a baseline. [COLMAP min_angle]"""
 MIN_MATCHES = 10
-"""Smallest number of such matches of a pair. [ours]"""
+"""Minimum number of matches of a pair with a triangulation angle above MIN_ANGLE_DEG. [ours]"""
 MAX_ROTATION_ERROR_DEG = 5.0
-"""Largest angle between a measured and a resulting relative rotation. [ours]"""
+"""Maximum angle between a measured and an estimated relative rotation. [ours]"""
 MAX_CENTER_ERROR = 0.3
-"""Largest distance between a measured and a resulting relative center, relative to the baseline.
-It allows for errors of direction of several degrees. [ours]"""
+"""Maximum distance between a measured and an estimated relative camera center, relative to the
+baseline. It corresponds to direction errors of several degrees. [ours]
+"""
 PLANAR_WEIGHT = 0.1
-"""Weight of a match if a homography also explains the pair: the relative pose may be the wrong one
-of two. [tuned: benchmarks.accuracy on rendered_kitchen]"""
+"""Weight of a match if a homography also explains the pair, because a planar scene has two possible
+relative poses. [tuned: benchmarks.accuracy on rendered_kitchen]
+"""
 NUM_ITERATIONS = 20
-"""Iterations of IRLS. [ours]"""
+"""Number of IRLS iterations. [ours]"""
 DAMPING = 1e-9
-"""Damping of the Laplacian relative to its largest diagonal entry; it fixes the gauge."""
+"""Damping of the graph Laplacian relative to its largest diagonal entry, which fixes the gauge."""
 
 
 class GlobalPoses(NamedTuple):
-    """Poses of the images of one component."""
+    """Poses of the images of one component, estimated by global initialization."""
 
     images: Int64
-    """(m,) images."""
+    """(m,) indices of the images of the component."""
     rotations: Float64
-    """(m, 3, 3) ``cam_from_world``."""
+    """(m, 3, 3) rotations ``cam_from_world``."""
     translations: Float64
-    """(m, 3) ``cam_from_world``."""
+    """(m, 3) translations ``cam_from_world``."""
     scales: Float64
-    """(m,) scales of the depth priors."""
+    """(m,) scales of the depth priors, in world units per unit of the prior."""
 
 
 class _RelativePoses(NamedTuple):
-    """Measured relative poses of (m,) pairs."""
+    """Measured relative poses of m image pairs."""
 
     a: Int64
-    """(m,) first image."""
+    """(m,) index of the first image of each pair."""
     b: Int64
-    """(m,) second image."""
+    """(m,) index of the second image of each pair."""
     rotation: Float64
-    """(m, 3, 3) ``b_from_a``."""
+    """(m, 3, 3) relative rotations ``b_from_a``."""
     translation: Float64
-    """(m, 3) ``b_from_a``, of length 1."""
+    """(m, 3) relative translations ``b_from_a``, of length 1."""
     log_length: Float64
     """(m, 2) logarithm of the baseline in the unit of the depth prior of ``a`` and of ``b``."""
     weight: Float64
-    """(m,) number of matches, reduced if depth does not fit the points."""
+    """(m,) number of matches of each pair, reduced if depth priors do not fit the triangulated
+    points.
+    """
 
     def select(self, rows: Bool) -> _RelativePoses:
-        """Return some of the pairs."""
+        """Return the relative poses of the pairs that ``rows`` (m,) selects."""
         fields: list[Any] = [values[rows] for values in self]
         return _RelativePoses(*fields)
 
@@ -90,11 +94,11 @@ def estimate_global_poses(scene: Scene, candidates: Bool) -> GlobalPoses | None:
     """Estimate the poses of the largest component of consistent pairs.
 
     Args:
-        scene: The scene with its verified pairs; it stays unchanged.
+        scene: The scene with its verified pairs, which is not changed.
         candidates: (n,) bool, images that may be registered.
 
     Returns:
-        None if no pairs are consistent along cycles.
+        The poses, or None if no pairs are consistent along cycles of the view graph.
     """
     pairs = [p for p in scene.problem.pairs if candidates[p.image_a] and candidates[p.image_b]]
     num_images = scene.num_images
@@ -131,13 +135,13 @@ def average_rotations(
 ) -> Float64:
     """Average relative rotations: IRLS in the tangent space with a Cauchy loss.
 
-    Follows Chatterjee and Govindu, Efficient and Robust Large-Scale Rotation Averaging, ICCV 2013,
-    with another loss. The maximum spanning tree gives the initial rotations. The edges must form
-    one connected component.
+    The method is that of Chatterjee and Govindu, Efficient and Robust Large-Scale Rotation
+    Averaging, ICCV 2013, with a Cauchy loss. The maximum spanning tree gives the initial rotations.
+    The edges must form one connected component.
 
     Args:
-        a: (m,) first image of each edge.
-        b: (m,) second image of each edge.
+        a: (m,) index of the first image of each edge.
+        b: (m,) index of the second image of each edge.
         b_from_a: (m, 3, 3) relative rotations ``R[b] @ R[a].T``.
         weights: (m,) weights of the edges.
         num_images: Number of images.
@@ -161,14 +165,14 @@ def average_differences(
     """Solve ``x[b] - x[a] = differences`` robustly: IRLS with a Cauchy loss.
 
     Args:
-        a: (m,) first node of each edge.
-        b: (m,) second node of each edge.
-        differences: (m, ...) measured differences.
+        a: (m,) index of the first node of each edge.
+        b: (m,) index of the second node of each edge.
+        differences: (m, ...) measured differences ``x[b] - x[a]``.
         weights: (m,) weights of the edges.
         num_nodes: Number of nodes.
 
     Returns:
-        (num_nodes, ...) values of mean 0; nodes without edges share one value.
+        (num_nodes, ...) values with mean 0. Nodes without edges share one value.
     """
     measured = differences.reshape(len(differences), -1)
     robust_weights = np.ones(len(a))
@@ -183,7 +187,7 @@ def average_differences(
 def _solve_differences(
     a: Int64, b: Int64, differences: Float64, weights: Float64, num_nodes: int
 ) -> Float64:
-    """Return values (n, d) with the least-squares differences: normal equations of a Laplacian."""
+    """Solve for values (n, d) with least-squares differences, by the normal equations."""
     ends = np.concatenate([a, b])
     degree = np.bincount(ends, np.concatenate([weights, weights]), minlength=num_nodes)
     diagonal = degree + DAMPING * degree.max()
@@ -199,7 +203,7 @@ def _solve_differences(
 
 
 def _cauchy_weights(errors: Float64) -> Float64:
-    """Return the IRLS weights of a Cauchy loss whose scale is the robust std of the errors."""
+    """Return the IRLS weights of a Cauchy loss, whose scale is the robust std of the errors."""
     scale = max(MAD_TO_STD * float(np.median(errors)), 1e-12)
     weights: Float64 = 1 / (1 + (errors / scale) ** 2)
     return weights
@@ -228,7 +232,7 @@ def _measure_relative_poses(scene: Scene, pairs: list[VerifiedPair]) -> _Relativ
     """Measure the baseline of each pair by the depth priors of both images.
 
     The log length is the median over the matches of ``log(depth prior / triangulated depth)``. The
-    median absolute deviation from it gives the Cauchy weight of the pair.
+    median absolute deviation from the log length gives the Cauchy weight of the pair.
     """
     empty = np.zeros(0, np.int64)
     a = np.array([pair.image_a for pair in pairs], dtype=np.int64)
@@ -267,9 +271,9 @@ def _measure_relative_poses(scene: Scene, pairs: list[VerifiedPair]) -> _Relativ
 
 
 def _select_largest_cyclic_component(edges: _RelativePoses, num_images: int) -> Bool:
-    """Return (m,) the edges on cycles that belong to the largest component of such edges.
+    """Return (m,) True for the edges on cycles in the largest component of such edges.
 
-    An edge on no cycle always agrees with the result, so nothing verifies it.
+    An edge that is on no cycle always agrees with the result, so other edges cannot verify it.
     """
     selected = find_cycle_edges(edges.a, edges.b, num_images)
     if selected.any():
@@ -283,12 +287,12 @@ def _select_largest_cyclic_component(edges: _RelativePoses, num_images: int) -> 
 def find_cycle_edges(a: Int64, b: Int64, num_nodes: int) -> Bool:
     """Find the edges that are not bridges, by random labels on the cycle space.
 
-    Each edge outside a spanning forest gets a random label, which runs through the cycle that it
-    closes. An edge of the forest is a bridge if the XOR of the labels through it is 0.
+    Each edge outside of a spanning forest has a random label, which is added by XOR along the cycle
+    that the edge closes. An edge of the forest is a bridge if its accumulated label is 0.
 
     Args:
-        a: (m,) first node of each edge.
-        b: (m,) second node; no pair of nodes occurs twice.
+        a: (m,) index of the first node of each edge.
+        b: (m,) index of the second node of each edge. No pair of nodes occurs twice.
         num_nodes: Number of nodes.
 
     Returns:
@@ -314,7 +318,7 @@ def find_cycle_edges(a: Int64, b: Int64, num_nodes: int) -> Bool:
 
 
 def label_components(a: Int64, b: Int64, num_nodes: int) -> Int64:
-    """Label the connected components of a graph; return (num_nodes,) the label of each node."""
+    """Label the connected components of a graph, and return the label of each node."""
     matrix = coo_matrix((np.ones(len(a)), (a, b)), shape=(num_nodes, num_nodes))
     labels: Int64 = connected_components(matrix, directed=False)[1]
     return labels

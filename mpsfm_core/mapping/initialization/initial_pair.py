@@ -1,7 +1,8 @@
 """Selection and relative pose of the initial image pair (paper section 3.1).
 
-With lifting, the relative pose is estimated as that of any next image, in a scene with one
-registered image. Without lifting, it is the pose of the verified pair, scaled by depth.
+If points are lifted from depth, the second image is registered like any next image, in a scene with
+one registered image. Without lifted points, the relative pose is that of the verified pair, scaled
+by depth.
 """
 
 from __future__ import annotations
@@ -26,21 +27,22 @@ from mpsfm_core.mapping.triangulation import triangulate_midpoints
 
 
 class InitialPair(NamedTuple):
-    """Two images with their relative pose.
+    """Two images with their relative pose, from which a component is initialized.
 
-    The camera of the reference image is the world frame, and its depth prior defines the unit.
+    The camera frame of the reference image is the world frame, and the unit is that of its depth
+    prior.
     """
 
     reference: int
-    """Image whose camera is the world frame."""
+    """Index of the image whose camera frame is the world frame."""
     image: int
-    """The other image."""
+    """Index of the other image of the pair."""
     pose: ScoredPose
-    """Pose of the other image."""
+    """Pose ``cam_from_world`` of the other image, with its support."""
 
 
 class InitialPairSelector:
-    """Ranking of initial pairs; the relative pose of each pair is estimated once."""
+    """Ranking of initial image pairs, which estimates the relative pose of each pair once."""
 
     def __init__(self, options: MapperOptions) -> None:
         self._options = options
@@ -49,14 +51,14 @@ class InitialPairSelector:
     def rank_pairs(
         self, pose_estimator: AbsolutePoseEstimator, candidates: Bool
     ) -> list[VerifiedPair]:
-        """Rank the pairs to initialize from (COLMAP's ``FindInitialImagePair``).
+        """Rank the image pairs for initialization (COLMAP's ``FindInitialImagePair``).
 
         Pairs are ranked by their number of matches. The first ``num_compared`` pairs are ranked
         again by the support of their relative poses.
 
         Args:
-            pose_estimator: Estimator on a scene without registered images.
-            candidates: (n,) bool, images that may be in an initial pair.
+            pose_estimator: Pose estimator on a scene without registered images.
+            candidates: (n,) bool, images that may be part of the initial pair.
         """
         options = self._options.initialization
         pairs = [
@@ -77,7 +79,7 @@ class InitialPairSelector:
     def estimate_pair(
         self, pose_estimator: AbsolutePoseEstimator, pair: VerifiedPair
     ) -> InitialPair | Reason:
-        """Return the best supported relative pose of a pair, or why the pair is rejected."""
+        """Return the best supported relative pose of a pair, or the reason of its rejection."""
         if pair not in self._results:
             scene, options = pose_estimator.scene, self._options
             if options.registration.lifting:
@@ -91,12 +93,12 @@ class InitialPairSelector:
         return self._results[pair]
 
     def reject_pair(self, pair: VerifiedPair, reason: Reason) -> None:
-        """Record why a pair cannot initialize a component."""
+        """Record the reason why a pair cannot initialize a component."""
         self._results[pair] = reason
 
 
 def register_first_image(scene: Scene, image: int) -> None:
-    """Register an image at the origin of the world, with its depth prior as the unit."""
+    """Register an image at the origin of the world, with the unit of its depth prior."""
     scene.register(image, np.eye(3), np.zeros(3))
     scene.maps[image].set_scale(1.0)
 
@@ -116,10 +118,10 @@ def estimate_initial_pairs(
     """Estimate relative poses of a pair from depth-lifted points, for each reference image.
 
     Args:
-        pose_estimator: Estimator on a scene without registered images.
+        pose_estimator: Pose estimator on a scene without registered images.
         pair: The verified pair.
-        options: Options of the correspondences.
-        refine: Refine the poses by bundle adjustment.
+        options: Options of the collection of 2D-3D correspondences.
+        refine: Also refine the poses by bundle adjustment.
     """
     estimate = pose_estimator.estimate_poses if refine else pose_estimator.estimate_unrefined_poses
     return [
@@ -137,7 +139,7 @@ def refine_initial_pairs(
     initial_pairs: Sequence[InitialPair],
     options: RegistrationOptions,
 ) -> list[InitialPair]:
-    """Refine relative poses of a pair by bundle adjustment; poses that lose support stay."""
+    """Refine relative poses of a pair by bundle adjustment, except poses that lose support."""
     return [
         InitialPair(reference, image, pose)
         for reference, image, correspondences in _register_each_reference(
@@ -154,7 +156,7 @@ def refine_initial_pairs(
 def _register_each_reference(
     scene: Scene, pair: VerifiedPair, options: RegistrationOptions
 ) -> Iterator[tuple[int, int, PoseCorrespondences]]:
-    """Yield reference, other image and its correspondences, with only the reference registered."""
+    """Yield reference, other image and correspondences, with only the reference registered."""
     empty = scene.snapshot()
     for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
         register_first_image(scene, reference)
@@ -165,13 +167,13 @@ def _register_each_reference(
 def scale_verified_pair(
     scene: Scene, pair: VerifiedPair, options: InitializationOptions
 ) -> InitialPair | None:
-    """Scale the pose of a verified pair so that triangulated points agree with the depth prior.
+    """Scale the pose of a verified pair such that triangulated depth agrees with the prior.
 
     The scale is the median over the points whose triangulation angle is at least
     ``high_parallax_deg``.
 
     Returns:
-        None if the pair has no translation, or if no such point has known depth.
+        The scaled pose, or None if the pair has no translation or no such point with known depth.
     """
     length = np.linalg.norm(pair.translation)
     if length < 1e-12:

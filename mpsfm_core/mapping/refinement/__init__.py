@@ -1,1 +1,1 @@
-"""Bundle adjustment, depth integration, filtering, and the noise they assume."""
+"""Bundle adjustment, depth refinement, filtering, and measurement of their noise."""

@@ -1,11 +1,13 @@
-"""Measurement of the noise of depth priors from the agreement of views.
+"""Measurement of the noise of depth priors from the agreement of image pairs.
 
-A prior declares a variance per pixel. The depth of a matched keypoint, projected into the other
-view, is compared with the prior of that view. These residuals show whether the declared variance
-is too large or too small, and how much errors of neighboring pixels correlate. Bundle adjustment
-treats observations as independent, so that correlated observations need a larger variance.
+A depth prior declares a variance for each pixel. The depth of a matched keypoint is projected into
+the other image of the pair, and compared with the depth prior of that image. These residuals show
+whether the declared variance is too large or too small, and how much errors of neighboring pixels
+correlate. Bundle adjustment treats observations as independent, so that correlated observations
+need a larger variance.
 
-:func:`measure_local_depth_noise` measures the noise locally, from well-constrained points.
+Bundle adjustment treats observations as independent, so correlated observations need a larger
+variance.
 """
 
 from __future__ import annotations
@@ -22,71 +24,74 @@ from mpsfm_core.geometry.statistics import MAD_TO_STD, group_medians
 from mpsfm_core.mapping.scene.scene import Scene
 
 CELLS = 4
-"""Cells per side of the grid in which residuals are grouped. [ours]"""
+"""Rows and columns of the grid of image cells within which errors of depth are correlated.
+[ours]"""
 MIN_RESIDUALS = 25
-"""Number of residuals below which the declared variance is kept. [ours]"""
+"""Minimum number of residuals for a measurement. With fewer residuals the declared variance
+applies. [ours]"""
 MIN_INDEPENDENT = 0.05
-"""Smallest share of the variance of depth that is independent. [ours]"""
+"""Minimum share of the variance of depth that is independent between pixels. [ours]"""
 POSE_UNKNOWNS = 6
 """Degrees of freedom per additional pose."""
 MULTIPLIER_RANGE = (0.1, 10.0)
 """Range of the multiplier of the declared standard deviation. [ours]"""
 MIN_CONSTRAINED_ANGLE_DEG = 2.0
-"""Triangulation angle from which rays constrain a point well without depth. Two views suffice: a
-wrong pose moves points of the whole image; a local error is an error of the prior. [ours]"""
+"""Minimum triangulation angle of a point that rays constrain well without depth. Two images
+suffice, because a wrong pose moves the points of the whole image, while a local error is an error
+of the prior. [ours]"""
 NUM_NEIGHBORS = 7
-"""Number of well-constrained points whose median error counts, so that four of them have to
-contradict a prior. [ours]"""
+"""Number of nearest well-constrained points whose median error is used. Four of these points must
+contradict a prior to change its noise. [ours]"""
 MAX_NEIGHBOR_DISTANCE = 1 / 8
-"""Largest distance of these points relative to the width of a map, beyond which errors of depth
-priors do not correlate. [ours]"""
+"""Maximum distance between a pixel and a well-constrained point, relative to the width of the depth
+map. Errors of depth priors do not correlate at larger distances. [ours]"""
 GRID_SIZE = 16
-"""Columns and rows of the grid on which noise is measured, half that distance apart. [ours]"""
+"""Columns and rows of the grid of nodes on which the local noise is measured. [ours]"""
 
 
 class DepthNoise(NamedTuple):
-    """Noise of the depth priors relative to their declaration."""
+    """Measured noise of the depth priors, relative to the declared variance."""
 
     multiplier: float = 1.0
-    """Factor on the declared standard deviation."""
+    """Factor between the measured and the declared standard deviation."""
     correlation: float = 1.0
-    """Correlation of errors in the same cell, in [0, 1]."""
+    """Correlation of the depth errors in one image cell, in [0, 1]."""
     design_effect: float = 1.0
-    """Factor by which the variance of a mean exceeds that of independent observations (Kish, Survey
-    Sampling, 1965)."""
+    """Ratio of the variance of a mean to that of independent observations (Kish, Survey Sampling,
+    1965)."""
 
     @property
     def std_factor(self) -> float:
-        """Factor on the declared std with which observations count as independent."""
+        """Factor on the declared std such that observations can be treated as independent."""
         return self.multiplier * float(np.sqrt(self.design_effect))
 
     @property
     def loss_factor(self) -> float:
-        """Factor on a loss scale for residuals in units of that std.
+        """Factor on a loss scale for residuals in units of the corrected std.
 
-        An outlier differs from its neighbors, so the scale counts in units of the independent part
-        of the error.
+        An outlier differs from its neighbors, so the loss scale refers to the independent part of
+        the error.
         """
         if self.design_effect == 1.0:
-            return 1.0  # independent errors, or no measurement
+            return 1.0  # the errors are independent, or were not measured
         independent = max(1.0 - self.correlation, MIN_INDEPENDENT)
         return float(np.sqrt(independent / self.design_effect))
 
     def independent_pixels(self, num_pixels: int) -> float:
-        """Return the number of independent measurements that a map of ``num_pixels`` counts as."""
+        """Return the effective number of independent measurements in a map of ``num_pixels``."""
         return num_pixels / (1.0 + (num_pixels / CELLS**2 - 1.0) * self.correlation)
 
 
 def measure_depth_noise(scene: Scene) -> DepthNoise:
-    """Measure the noise from the scaled priors of all pairs of registered views.
+    """Measure the noise of the scaled depth priors from all pairs of registered images.
 
-    The median residual of a pair is subtracted, because the scales of its images, which are
-    parameters of bundle adjustment, may cause it. The variance is the sum of squares divided by the
-    degrees of freedom: effective number of residuals minus fitted scales and poses. The declared
-    variance counts as one more residual (a unit information prior).
+    The median residual of a pair is subtracted, because it may be caused by the depth scales, which
+    bundle adjustment estimates. The variance is the sum of squares divided by the degrees of
+    freedom, which are the effective number of residuals minus the fitted scales and poses. The
+    declared variance counts as one additional residual (a unit information prior).
 
     Returns:
-        The noise; the declared one if too few residuals exist.
+        The measured noise, or the declared noise if too few residuals exist.
     """
     residuals, groups = _cross_view_residuals(scene)
     if len(residuals) < MIN_RESIDUALS:
@@ -104,7 +109,7 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
 
 
 def find_well_constrained_keypoints(scene: Scene, image: int) -> Bool:
-    """Return (k,) bool, keypoints of an image whose points rays constrain without depth."""
+    """Return (k,) True for keypoints whose points rays constrain well without depth."""
     points = scene.tracks.point_of[scene.graph.keypoints_of(image)]
     is_observed = points >= 0
     is_constrained = np.zeros(len(points), dtype=np.bool_)
@@ -116,20 +121,20 @@ def find_well_constrained_keypoints(scene: Scene, image: int) -> Bool:
 def measure_local_depth_noise(
     scene: Scene, image: int, is_constrained: Bool, min_factor: float
 ) -> Float32:
-    """Measure the standard deviation of a prior relative to its declaration, per pixel.
+    """Measure the standard deviation of a depth prior relative to its declaration, per pixel.
 
-    The error at a grid node is the median error of the nearest well-constrained points. It counts
-    as one observation, and ``min_factor`` as another one (a unit information prior). Missing
-    neighbors count as errors of ``min_factor``.
+    The error at a grid node is the median error of the nearest well-constrained points. The median
+    error counts as one observation, and ``min_factor`` as another one (a unit information prior).
+    Missing neighbors count as errors of ``min_factor``.
 
     Args:
         scene: The scene.
         image: A registered image.
         is_constrained: (k,) bool, keypoints from :func:`find_well_constrained_keypoints`.
-        min_factor: Factor for the whole scene, and lower bound of the result.
+        min_factor: Measured factor of the whole scene, which is the lower bound of the result.
 
     Returns:
-        (h, w) float32 factor.
+        (h, w) float32 factor on the declared standard deviation.
     """
     graph, tracks, depth_map = scene.graph, scene.tracks, scene.maps[image]
     rows, columns = depth_map.valid.shape
@@ -154,9 +159,9 @@ def measure_local_depth_noise(
 
 
 def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
-    """Return whitened log-depth differences (m,) of matches, and the group of each.
+    """Return whitened log-depth differences (m,) of matches, and the group of each match.
 
-    A group is a cell of the first view together with the second view.
+    A group contains the matches of one cell of the first image with one second image.
     """
     graph, tracks = scene.graph, scene.tracks
     point = tracks.point_of[graph.source]

@@ -1,4 +1,4 @@
-"""Filtering of observations and points, and detection of images without enough points."""
+"""Filtering of observations and points, and detection of images with too few points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mpsfm_core.mapping.options import TriangulationOptions
 from mpsfm_core.mapping.scene.scene import Scene
 
 MIN_IMAGE_POINTS = 3
-"""Number of points below which an image has no determined pose."""
+"""Minimum number of points that determine the pose of an image."""
 
 
 def filter_points(
@@ -19,15 +19,17 @@ def filter_points(
 ) -> int:
     """Remove outlier observations, and points that neither parallax nor depth determines.
 
-    A point with a small triangulation angle stays only if one of its images has valid depth there.
+    A point with a small triangulation angle is only kept if one of its images has valid depth at
+    the point.
 
     Args:
         scene: The scene.
-        options: ``max_error_px`` and ``min_angle_deg`` are used.
-        images: Filter only points that one of these images observes; None filters all points.
+        options: The options ``max_error_px`` and ``min_angle_deg`` are used.
+        images: Filter only points that at least one of these images observes. None filters all
+            points.
 
     Returns:
-        Number of removed observations.
+        The number of removed observations.
     """
     tracks, graph = scene.tracks, scene.graph
     points = _find_points(scene, images)
@@ -47,7 +49,7 @@ def filter_points(
 
 
 def _find_points(scene: Scene, images: list[int] | None) -> Int64:
-    """Return the points (m,) that some images observe, ascending; all points for None."""
+    """Return the points (m,), ascending, that some images observe, or all points for None."""
     tracks = scene.tracks
     if images is None:
         return np.arange(len(tracks.xyz))
@@ -63,7 +65,7 @@ def find_lost_images(scene: Scene) -> list[int]:
 
 
 def find_disconnected_images(scene: Scene) -> list[int]:
-    """Return the registered images that no chain of points connects to the largest component."""
+    """Return the registered images that shared points do not connect to the largest component."""
     observations = scene.tracks.observations()
     points = scene.tracks.point_of[observations]
     images = scene.graph.image_of[observations]

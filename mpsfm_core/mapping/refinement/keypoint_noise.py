@@ -1,12 +1,13 @@
-"""Measurement of the noise of keypoints: normal errors, or errors with heavy tails.
+"""Measurement of the keypoint noise, which decides between normal and heavy-tailed errors.
 
-Two models of the epipolar errors of matches compete by likelihood. If the errors are normal, a loss
-near least squares is efficient. If they have heavy tails, as learned keypoints often have, the
-Cauchy loss of the options is kept. A Cauchy loss of scale ``c`` is the likelihood of Student's t
-distribution with ``nu`` degrees of freedom and scale ``s``, ``c^2 = nu s^2``.
+Two models of the epipolar errors of matches are compared by their likelihood. If the errors are
+normal, a loss near least squares is statistically efficient. If the errors have heavy tails, as
+those of learned keypoints often have, the Cauchy loss of the options is used. A Cauchy loss of
+scale ``c`` is the likelihood of Student's t distribution with ``nu`` degrees of freedom and scale
+``s``, ``c^2 = nu s^2``.
 
 Reprojection errors of points would be biased, because a robustly fitted point passes through some
-of its keypoints. Epipolar errors depend on the poses alone.
+of its keypoints. Epipolar errors do not depend on points, but only on the poses.
 """
 
 from __future__ import annotations
@@ -20,26 +21,28 @@ from mpsfm_core.data import Float64, Int64
 from mpsfm_core.mapping.scene.scene import Scene
 
 MAX_MATCHES = 4000
-"""Number of matches that are evaluated, evenly spaced. [ours]"""
+"""Maximum number of matches that are evaluated, evenly spaced. [ours]"""
 MIN_MATCHES = 100
-"""Number of matches below which the loss is kept. [ours]"""
+"""Minimum number of matches for a measurement. With fewer matches the loss of the options applies.
+[ours]"""
 MAX_RESIDUAL = 4.0
-"""Largest residual in standard deviations of a keypoint; larger ones are filtered as outliers.
+"""Maximum residual in standard deviations of a keypoint. Larger residuals are filtered as outliers.
 [COLMAP filter_max_reproj_error]"""
 EFFICIENT_SCALE = 3.644
-"""Scale of the Cauchy loss, in standard deviations of normal errors of two coordinates, with 98 %
-efficiency (2.549 has 95 %; Holland and Welsch, Communications in Statistics A6, 1977).
-[tuned: benchmarks.everyday]"""
+"""Scale of the Cauchy loss with 98 % efficiency, in standard deviations of normal errors of two
+coordinates (2.549 has 95 %, Holland and Welsch, Communications in Statistics A6, 1977). [tuned:
+benchmarks.everyday]"""
 DEGREES_OF_FREEDOM = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0])
-"""Degrees of freedom that the fit of Student's t distribution tries."""
+"""Degrees of freedom of Student's t distribution among which the best fit is selected."""
 
 
 def measure_loss_scale(scene: Scene, default_scale: float) -> float:
-    """Measure the scale of the Cauchy loss that suits the matches of registered images.
+    """Measure the scale of the Cauchy loss that fits the matches of registered images.
 
     Args:
         scene: The scene.
-        default_scale: Scale for keypoints with heavy tails, and without enough matches.
+        default_scale: Scale of the loss for heavy-tailed errors, and if there are not enough
+            matches.
 
     Returns:
         The scale in standard deviations of a keypoint, at least ``default_scale``.
@@ -59,7 +62,7 @@ def compute_normal_log_likelihood(residuals: Float64, std: float) -> float:
 
     Args:
         residuals: (m,) float64 residuals below ``MAX_RESIDUAL``.
-        std: Standard deviation of the distribution.
+        std: Standard deviation of the normal distribution.
     """
     norm = std * np.sqrt(np.pi / 2) * erf(MAX_RESIDUAL / (std * np.sqrt(2)))
     return float(-0.5 * (residuals**2).mean() / std**2 - np.log(norm))
@@ -70,16 +73,16 @@ def compute_student_log_likelihood(residuals: Float64, scale: float) -> float:
 
     Args:
         residuals: (m,) float64 residuals below ``MAX_RESIDUAL``.
-        scale: Scale of the corresponding Cauchy loss.
+        scale: Scale of the Cauchy loss that corresponds to the distribution.
     """
     spread = np.log1p((residuals / scale) ** 2).mean()
     return float((-(DEGREES_OF_FREEDOM + 1) / 2 * spread - _log_norms(scale)).max())
 
 
 def compute_epipolar_residuals(scene: Scene) -> Float64:
-    """Compute Sampson errors (m,) of matches of registered images below ``MAX_RESIDUAL``.
+    """Compute the Sampson errors (m,), below ``MAX_RESIDUAL``, of matches of registered images.
 
-    The unit is the standard deviation of a keypoint.
+    Sampson errors are in standard deviations of a keypoint.
     """
     source, target = _sample_matches(scene)
     centers, images = scene.centers(), scene.graph.image_of
@@ -93,7 +96,7 @@ def compute_epipolar_residuals(scene: Scene) -> Float64:
 
 
 def _sample_matches(scene: Scene) -> tuple[Int64, Int64]:
-    """Return the keypoints of matches of registered images, each match once."""
+    """Return the keypoints of matches between registered images, each match once."""
     graph = scene.graph
     is_used = scene.registered[graph.image_of[graph.source]]
     is_used &= scene.registered[graph.image_of[graph.target]] & (graph.source < graph.target)
@@ -103,7 +106,7 @@ def _sample_matches(scene: Scene) -> tuple[Int64, Int64]:
 
 
 def _propagate_variance(scene: Scene, keypoints: Int64, normals: Float64) -> Float64:
-    """Return the variance (m,) of ``ray . normal`` from the noise of the keypoint of the ray."""
+    """Return the variance (m,) of ``ray . normal`` from the noise of the ray's keypoint."""
     images = scene.graph.image_of[keypoints]
     local = np.einsum("nij,nj->ni", scene.rotations[images], normals)
     slope = local[:, :2] / scene.intrinsics[images, :2]

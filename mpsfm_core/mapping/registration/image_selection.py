@@ -1,4 +1,4 @@
-"""Selection of the next image and of the registered images that it is registered with."""
+"""Selection of the next image to register, and of its reference images."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from mpsfm_core.mapping.scene.scene import Scene
 
 
 def compute_pair_scores(scene: Scene, criterion: str) -> Float64:
-    """Compute how well each two images match.
+    """Compute the matching score of every two images.
 
     Args:
         scene: The scene with its verified pairs.
-        criterion: "match-scores" sums the matcher's scores; any other value counts the matches.
+        criterion: "match-scores" sums the matcher's scores, and any other value counts the matches.
 
     Returns:
-        (n, n) symmetric float64, 0 for images without verified matches.
+        (n, n) symmetric float64 scores, 0 for images without verified matches.
     """
     scores = np.zeros((scene.num_images, scene.num_images))
     for row, pair in enumerate(scene.problem.pairs):
@@ -30,16 +30,16 @@ def compute_pair_scores(scene: Scene, criterion: str) -> Float64:
 def rank_next_images(
     scene: Scene, scores: Float64, candidates: Bool, options: RegistrationOptions
 ) -> list[tuple[int, int]]:
-    """Rank the unregistered candidates, best first (COLMAP's ``FindNextImages``).
+    """Rank the unregistered candidate images, best first (COLMAP's ``FindNextImages``).
 
     Args:
         scene: The scene with the registered images.
         scores: (n, n) from :func:`compute_pair_scores`.
         candidates: (n,) bool, images that may be registered.
-        options: ``next_view`` selects the ranking.
+        options: The option ``next_view`` selects the ranking criterion.
 
     Returns:
-        Each image with the registered image that it matches best.
+        Each candidate with the registered image that it matches best.
     """
     images = np.flatnonzero(candidates & ~scene.registered)
     registered = scene.registered_images()
@@ -56,8 +56,8 @@ def rank_next_images(
 def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: Float64) -> list[int]:
     """Return the image and the registered images that share most 3D points with it.
 
-    If fewer than ``num_neighbors`` images share points, the best matching images follow. COLMAP's
-    ``FindLocalBundle`` also ranks by shared points.
+    If fewer than ``num_neighbors`` images share points, the best matching images are added.
+    COLMAP's ``FindLocalBundle`` also ranks by shared points.
     """
     tracks, graph = scene.tracks, scene.graph
     points = tracks.point_of[graph.keypoints_of(image)]
@@ -75,7 +75,7 @@ def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: Floa
 
 
 def _count_visible_points(scene: Scene) -> Int64:
-    """Count for each image (n,) the keypoints that match a registered image."""
+    """Count the keypoints of each image (n,) that match a registered image."""
     graph = scene.graph
     matched = scene.registered[graph.image_of[graph.target]]
     keypoints = np.unique(graph.source[matched])

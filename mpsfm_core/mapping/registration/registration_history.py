@@ -1,4 +1,4 @@
-"""Record of registration attempts: avoids repetition and finds misplaced registered images."""
+"""Record of registration attempts, which avoids repetition and detects misregistered images."""
 
 from __future__ import annotations
 
@@ -18,18 +18,19 @@ deregistered. [ours]"""
 
 
 class _Attempt(NamedTuple):
-    """The last attempt to estimate the pose of an image."""
+    """Last attempt to estimate the pose of an image."""
 
     references: list[int]
     pose: ScoredPose | None
 
 
 class RegistrationHistory:
-    """Registration attempts within one component.
+    """Record of the registration attempts within one component.
 
     Attributes:
-        excluded_references: (n, n) bool; image ``i`` is not registered with reference ``j``,
-            because their matches led to a pose that contradicts the depth of the scene.
+        excluded_references: (n, n) bool, True if image ``i`` must not be registered with reference
+            image ``j``, because their matches led to a pose that contradicts the depth of the
+            scene.
     """
 
     def __init__(self, num_images: int, options: RegistrationOptions) -> None:
@@ -42,17 +43,17 @@ class RegistrationHistory:
         self._deregistered: set[int] = set()
 
     def count_searches(self, image: int) -> int:
-        """Return how often the pose of an image was estimated."""
+        """Return the number of times that the pose of an image was estimated."""
         return self._num_searches[image]
 
     def get_last_pose(self, image: int) -> ScoredPose | None:
-        """Return the best pose of the last attempt at an image."""
+        """Return the best pose of the last registration attempt of an image."""
         return self._last_attempts[image].pose if image in self._last_attempts else None
 
     def is_exhausted(self, image: int, references: list[int]) -> bool:
-        """Return whether another search with the same references would repeat the last one.
+        """Return True if a search with the same reference images would repeat the last search.
 
-        The first searches differ because each draws other subsets of the matches.
+        The first searches for an image differ, because each draws other subsets of the matches.
         """
         is_resampled = self._num_searches[image] >= self._options.max_resampled_attempts
         last = self._last_attempts.get(image)
@@ -61,25 +62,27 @@ class RegistrationHistory:
     def record_attempt(
         self, image: int, references: list[int], best: ScoredPose | None, *, searched: bool
     ) -> None:
-        """Record an attempt and the best pose after it; ``searched`` if poses were estimated."""
+        """Record a registration attempt, its best pose, and whether poses were estimated."""
         self._num_searches[image] += searched
         self._last_attempts[image] = _Attempt(references, best)
 
     def record_contradiction(self, registered_image: int, new_image: int) -> None:
-        """Record that the depth of a new image contradicts the depth of a registered image."""
+        """Record that the depth of a rejected image contradicts the depth of a registered image."""
         self._contradicting[registered_image].add(new_image)
 
     def pop_contradicted_image(self, registered: Bool) -> tuple[int, int] | None:
-        """Return the image that most unregistered images contradict, and their number.
+        """Return the registered image that most rejected images contradict, and their number.
 
-        The depth check rejects the new image, but the registered image can be the wrong one. Each
-        image is returned once. Returning an image clears the record of contradictions.
+        The depth check rejects the new image, but the pose of the registered image may be the wrong
+        one. Each registered image is returned at most once. Returning an image clears its record of
+        contradictions.
 
         Args:
-            registered: (n,) bool, the images that are registered now.
+            registered: (n,) bool, the images that are registered at present.
 
         Returns:
-            None if fewer than :data:`MIN_CONTRADICTING_IMAGES` images contradict every image.
+            The image and the number, or None if fewer than :data:`MIN_CONTRADICTING_IMAGES` images
+            contradict every registered image.
         """
         counts = {
             image: int((~registered[list(new_images)]).sum())
@@ -94,7 +97,7 @@ class RegistrationHistory:
         return worst, counts[worst]
 
     def get_rejection(self, image: int, pose: ScoredPose) -> Reason | None:
-        """Return why this pose was rejected in the present scene, or None if it was not."""
+        """Return the reason why a pose was rejected in the present scene, or None."""
         return self._rejected_poses.get(_pose_key(image, pose))
 
     def reject_pose(self, image: int, pose: ScoredPose, reason: Reason) -> None:
@@ -102,11 +105,11 @@ class RegistrationHistory:
         self._rejected_poses[_pose_key(image, pose)] = reason
 
     def clear_pose_rejections(self) -> None:
-        """Allow rejected poses again, because the scene has changed."""
+        """Allow rejected poses again after the scene has changed."""
         self._rejected_poses.clear()
 
     def clear(self) -> None:
-        """Allow all attempts again, because the scene has been refined or corrected."""
+        """Allow all registration attempts again after the scene was refined or corrected."""
         self.excluded_references[:] = False
         self._last_attempts.clear()
         self.clear_pose_rejections()

@@ -1,4 +1,4 @@
-"""Schedule of the acceptance thresholds while no image can be registered."""
+"""Schedule that relaxes the acceptance thresholds of poses if no image can be registered."""
 
 from __future__ import annotations
 
@@ -7,14 +7,15 @@ from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
 
 RELAXATION_FACTOR = 1.2
-"""Factor of the thresholds from one step to the next. [reference]"""
+"""Factor between the thresholds of two steps of the schedule. [reference]"""
 
 
 class ThresholdSchedule:
-    """Acceptance thresholds that relax step by step and reset when an image is registered.
+    """Acceptance thresholds that relax stepwise, and are reset when an image is registered.
 
-    As the inlier thresholds relax, the depth threshold tightens by the same factor: a pose with
-    fewer inliers needs a better depth agreement. (The reference relaxes both.)
+    As the inlier thresholds relax, the depth threshold tightens by the same factor, because a pose
+    with fewer inliers needs a better depth agreement. The reference implementation relaxes all
+    thresholds.
     """
 
     def __init__(self, options: RegistrationOptions) -> None:
@@ -23,24 +24,24 @@ class ThresholdSchedule:
 
     @property
     def min_inliers(self) -> int:
-        """Inliers that a pose needs now."""
+        """Minimum number of inliers that a pose needs at the present step."""
         return int(self._options.min_inliers / self._factor)
 
     @property
     def min_inlier_ratio(self) -> float:
-        """Share of the correspondences that must be inliers now."""
+        """Minimum inlier ratio that a pose needs at the present step."""
         return self._options.min_pose_inlier_ratio / self._factor
 
     def tighten_violations(self, max_violations: float) -> float:
-        """Return the present limit of the violation ratio, given its initial value."""
+        """Return the limit of the violation ratio at the present step from its initial value."""
         return max_violations / self._factor
 
     def check_support(self, pose: ScoredPose, *, confident: bool = False) -> Reason | None:
-        """Return why a pose has too little support, or None if the support suffices.
+        """Return the reason why a pose has too little support, or None if the support suffices.
 
         Args:
             pose: The pose with its inliers.
-            confident: Require the inlier ratio ``confident_inlier_ratio`` of the options.
+            confident: Also require the inlier ratio ``confident_inlier_ratio`` of the options.
         """
         min_inliers = self.min_inliers
         min_ratio = self._options.confident_inlier_ratio if confident else self.min_inlier_ratio
@@ -56,14 +57,14 @@ class ThresholdSchedule:
         return None
 
     def relax(self) -> bool:
-        """Relax the inlier thresholds by one step; return False after the last step."""
+        """Relax the inlier thresholds by one step, and return False after the last step."""
         if self._num_relaxations == self._options.max_relaxations:
             return False
         self._num_relaxations += 1
         return True
 
     def reset(self) -> None:
-        """Return to the initial thresholds."""
+        """Reset all thresholds to their initial values."""
         self._num_relaxations = 0
 
     @property

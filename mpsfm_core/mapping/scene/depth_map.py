@@ -11,20 +11,20 @@ from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample,
 
 
 class DepthMap:
-    """Depth of an image in world units: the scaled prior, or the refined map once it exists.
+    """Depth of an image in world units: the scaled prior, or the refined map if it exists.
 
     Attributes:
-        prior: Depth prior in its own unit.
+        prior: Depth prior of the image, in its own unit.
         normals: Normal prior.
-        camera: Intrinsics of the grid of the map.
-        scale: World units per unit of the prior.
-        active: Whether the scale is estimated.
-        refined: Refined depth, or None.
-        log_std: (h, w) float32 standard deviation of the log depth of the prior; 0 where invalid.
-        keypoints: (n, 2) float64 keypoints in pixels of the grid.
-        keypoint_valid: (n,) bool, whether the prior is valid around the keypoint.
+        camera: Intrinsics in pixels of the depth map.
+        scale: Scale of the prior, in world units per unit of the prior.
+        active: True if the scale of the prior has been estimated.
+        refined: Refined depth of the image, or None.
+        log_std: (h, w) float32 standard deviation of the log depth of the prior, 0 where invalid.
+        keypoints: (n, 2) float64 keypoints in pixels of the depth map.
+        keypoint_valid: (n,) bool, True if the prior is valid around the keypoint.
         keypoint_log_std: (n,) float64 standard deviation of the log depth at the keypoints.
-        typical_log_std: Median of ``keypoint_log_std`` where valid; NaN without valid keypoints.
+        typical_log_std: Median of ``keypoint_log_std`` where valid, NaN without valid keypoints.
     """
 
     def __init__(self, image: MappingImage) -> None:
@@ -49,12 +49,12 @@ class DepthMap:
 
     @property
     def valid(self) -> Bool:
-        """(h, w) bool, pixels where the prior is valid."""
+        """(h, w) bool, True where the depth prior is valid."""
         return self.prior.valid
 
     @property
     def depth(self) -> Float32:
-        """(h, w) float32 refined depth, or the scaled prior, in world units."""
+        """(h, w) float32 refined depth, or scaled depth prior, in world units."""
         depth: Float32 = self._best * np.float32(self._factor)
         return depth
 
@@ -65,20 +65,20 @@ class DepthMap:
         return variance
 
     def prior_at_keypoints(self, rows: Int64 | slice = slice(None)) -> Float64:
-        """Return the unscaled prior (m,) at keypoints; defined where :attr:`keypoint_valid`."""
+        """Return the unscaled prior (m,) at keypoints where :attr:`keypoint_valid` is True."""
         return self._prior_at[rows]
 
     def at_keypoints(self, rows: Int64 | slice = slice(None)) -> Float64:
-        """Return depth (m,) at keypoints in world units; defined where :attr:`keypoint_valid`."""
+        """Return world depth (m,) at keypoints where :attr:`keypoint_valid` is True."""
         return self._best_at[rows] * self._factor
 
     def set_scale(self, scale: float) -> None:
-        """Set the scale of the prior; a refined map is scaled by the same factor."""
+        """Set the scale of the depth prior, and scale a refined depth map by the same factor."""
         self.scale, self.active = scale, True
         self._factor = scale / self.refined.scale if self.refined else scale
 
     def set_refined(self, refined: RefinedDepth) -> None:
-        """Replace the scaled prior by refined depth.
+        """Replace the scaled depth prior by refined depth.
 
         If the depth was refined on a subsampled grid, its log ratio to the prior is interpolated.
         """
@@ -94,12 +94,12 @@ class DepthMap:
         self.set_scale(refined.scale)
 
     def set_camera(self, camera: PinholeCamera) -> None:
-        """Set the intrinsics, given for the grid of the image."""
+        """Set the intrinsics of the depth map from a camera in pixels of the image."""
         rows, columns = self.prior.shape
         self.camera = camera.resized(columns, rows)
 
     def reset(self) -> None:
-        """Discard the scale and the refined depth."""
+        """Discard the scale and the refined depth of the map."""
         self.scale, self.active, self.refined = 1.0, False, None
         self._use_prior()
 

@@ -1,4 +1,4 @@
-"""Correspondence graph: verified matches between the keypoints of all images."""
+"""Correspondence graph of the verified matches between the keypoints of all images."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ import numpy as np
 from mpsfm_core.data import Float64, Int64, MappingProblem, VerifiedPair
 
 MIN_SCORE = 0.05
-"""Lower bound of match scores, since every match passed geometric verification. [ours]"""
+"""Minimum score of a match, because every match passed geometric verification. [ours]"""
 
 
 class CorrespondenceGraph:
-    """Matches as an edge list over globally numbered keypoints.
+    """Verified matches as an edge list over globally numbered keypoints.
 
     Keypoint ``k`` of image ``i`` has the global number ``offsets[i] + k``. The edge list contains
     each match in both directions, sorted by source, so that the edges of an image are one slice.
 
     Attributes:
-        offsets: (n + 1,) int64 first global keypoint of each image.
+        offsets: (n + 1,) int64 number of the first global keypoint of each image.
         num_images: Number of images.
-        image_of: (k,) int64 image of each global keypoint.
+        image_of: (k,) int64 image index of each global keypoint.
         source: (e,) int64 global keypoint at the start of each edge.
         target: (e,) int64 global keypoint at the end of each edge.
-        score: (e,) float64 score of the match in [0.05, 1].
-        pair_scores: (p,) float64 summed match scores of each pair.
-        pairs_of: For each image, the pairs that contain it.
+        score: (e,) float64 score of the match of each edge, in [0.05, 1].
+        pair_scores: (p,) float64 summed match scores of each image pair.
+        pairs_of: For each image, the indices of the pairs that contain it.
         keypoint_weight: (k,) float64 weight of the squared reprojection error of a keypoint: the
             score of its best match relative to the mean score, divided by the reduction of its
             variance by keypoint adjustment.
@@ -69,9 +69,9 @@ class CorrespondenceGraph:
                 self.keypoint_weight[self.keypoints_of(index)] /= image.keypoint_std_factor**2
 
     def edges_of(self, image: int) -> slice:
-        """Return the edges that start in an image."""
+        """Return the slice of the edges that start in an image."""
         return slice(int(self._first_edge[image]), int(self._first_edge[image + 1]))
 
     def keypoints_of(self, image: int) -> slice:
-        """Return the global keypoints of an image."""
+        """Return the global keypoint numbers of an image."""
         return slice(int(self.offsets[image]), int(self.offsets[image + 1]))

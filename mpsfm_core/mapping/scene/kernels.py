@@ -1,4 +1,4 @@
-"""Compiled kernels over tracks."""
+"""Compiled kernels for tracks: sorting of observations and triangulation angles."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from mpsfm_core.support import jit
 
 @jit.kernel()
 def sort_keypoints_by_point(point_of: Int64, num_points: int) -> Int64:
-    """Return the keypoints that observe a point, by point, then keypoint (counting sort).
+    """Return the keypoints that observe a point, sorted by point, then by keypoint.
 
     Args:
-        point_of: (k,) int64 point of each keypoint, below ``num_points``, or negative.
+        point_of: (k,) int64 point of each keypoint, less than ``num_points``, or negative without
+            point.
         num_points: Number of points.
     """
     first = np.zeros(num_points + 1, np.int64)
@@ -39,9 +40,9 @@ def compute_max_triangulation_angles(
     """Compute the largest angle between two rays of the track of each point.
 
     Args:
-        points: (p, 3) float64 world points.
-        observation_points: (o,) int64 row of the point of each observation, sorted.
-        centers: (o, 3) float64 camera center of each observation.
+        points: (p, 3) float64 points in the world frame.
+        observation_points: (o,) int64 row in ``xyz`` of the point of each observation, sorted.
+        centers: (o, 3) float64 camera center of each observation in the world frame.
 
     Returns:
         (p,) float64 in degrees, in [0, 90]; 0 for points with fewer than two observations.

@@ -1,7 +1,7 @@
 """3D points and their tracks, stored as one point row per keypoint.
 
-A keypoint observes at most one point. A track is the set of keypoints with the same row. Track
-lists and lengths are derived.
+A keypoint observes at most one point. A track is the set of keypoints with the same point row. The
+lists and lengths of tracks are computed on demand.
 """
 
 from __future__ import annotations
@@ -15,11 +15,12 @@ NO_POINT = -1
 
 
 class Tracks:
-    """Points and the keypoints that observe them.
+    """3D points and the keypoints that observe them.
 
     Attributes:
-        xyz: (p, 3) float64 world points; rows of deleted points stay until :meth:`compact`.
-        point_of: (k,) int64 row in ``xyz`` of each global keypoint, or -1.
+        xyz: (p, 3) float64 points in the world frame. Rows of deleted points remain until
+            :meth:`compact`.
+        point_of: (k,) int64 row in ``xyz`` of the point that each global keypoint observes, or -1.
     """
 
     def __init__(self, num_keypoints: int) -> None:
@@ -27,21 +28,21 @@ class Tracks:
         self.point_of: Int64 = np.full(num_keypoints, NO_POINT, dtype=np.int64)
 
     def __len__(self) -> int:
-        """Return the number of observed points."""
+        """Return the number of points with observations."""
         return int((self.lengths() > 0).sum())
 
     def lengths(self) -> Int64:
-        """Return the track length (p,) int64 of each point; 0 for deleted points."""
+        """Return the track length (p,) int64 of each point, 0 for deleted points."""
         observed = self.point_of[self.point_of >= 0]
         return np.bincount(observed, minlength=len(self.xyz)).astype(np.int64)
 
     def observations(self) -> Int64:
-        """Return the global keypoints that observe a point, by point, then keypoint."""
+        """Return the global keypoints that observe a point, sorted by point, then by keypoint."""
         keypoints: Int64 = sort_keypoints_by_point(self.point_of, len(self.xyz))
         return keypoints
 
     def observations_of(self, points: Int64) -> tuple[Int64, Int64]:
-        """Return the observations of distinct points (m,).
+        """Return the observations of distinct points ``points`` (m,).
 
         Returns:
             ``(keypoints, rows)``: global keypoints, and the row in 0..m-1 of the point that each
@@ -49,7 +50,7 @@ class Tracks:
         """
         row_of = np.full(len(self.xyz) + 1, NO_POINT, dtype=np.int64)
         row_of[points] = np.arange(len(points))
-        row_of_keypoint = row_of[self.point_of]  # keypoints without a point index the last entry
+        row_of_keypoint = row_of[self.point_of]  # no point: last entry
         keypoints = sort_keypoints_by_point(row_of_keypoint, len(points))
         return keypoints, row_of_keypoint[keypoints]
 
@@ -57,12 +58,12 @@ class Tracks:
         """Add points with their observations.
 
         Args:
-            xyz: (m, 3) world points.
-            keypoints: (o,) global keypoints that observe them.
-            track: (o,) row in 0..m-1 of the point that each keypoint observes.
+            xyz: (m, 3) points in the world frame.
+            keypoints: (o,) global keypoints that observe the added points.
+            track: (o,) row in 0..m-1 of the added point that each keypoint observes.
 
         Returns:
-            New rows (m,) in :attr:`xyz`.
+            Rows (m,) of the added points in :attr:`xyz`.
         """
         first = len(self.xyz)
         self.xyz = np.concatenate([self.xyz, xyz])
@@ -77,10 +78,10 @@ class Tracks:
         self.point_of[is_removed] = NO_POINT
 
     def remove_observations(self, keypoints: Int64, min_length: int = 2) -> int:
-        """Remove observations, and points with fewer than ``min_length`` remaining ones.
+        """Remove observations, and points with fewer than ``min_length`` remaining observations.
 
         Returns:
-            Number of removed observations.
+            The number of removed observations.
         """
         num_before = int((self.point_of >= 0).sum())
         self.point_of[keypoints] = NO_POINT
@@ -89,7 +90,7 @@ class Tracks:
         return num_before - int((self.point_of >= 0).sum())
 
     def compact(self) -> None:
-        """Remove the rows of deleted points; the order of the remaining points stays."""
+        """Remove the rows of deleted points, with the order of all other points unchanged."""
         alive = self.lengths() > 0
         renumber = np.cumsum(alive) - 1
         observed = self.point_of >= 0
