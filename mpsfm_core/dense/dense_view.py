@@ -1,4 +1,4 @@
-"""Posed views for stereo: gray values and known depth on one grid."""
+"""Posed views for stereo: gray values and input depth on one grid."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class DenseView(PosedGrid):
     usable: Bool
     """(h, w) mask of pixels that neither the user nor the undistortion masks."""
     log_depth: Float32
-    """(h, w) natural log of the known depth in world units; neighboring pixels fill holes."""
+    """(h, w) natural log of the input depth in world units; neighboring pixels fill holes."""
     log_std: Float32
     """(h, w) std of ``log_depth``; ``UNKNOWN_LOG_STD`` in holes."""
 

@@ -1,13 +1,13 @@
 """Densification: replace refined depth maps by multi-view stereo depth where images overlap.
 
-Densification has five stages:
+Input depth is the depth map of an image before densification. Densification has five stages:
 
 1. Select source views (:mod:`~mpsfm_core.dense.view_selection`).
 2. Match each view by plane-sweep stereo (:mod:`~mpsfm_core.dense.stereo`).
 3. Compare the depth maps of neighbors (:mod:`~mpsfm_core.dense.geometric_consistency`).
 4. Estimate the uncertainty of poses and scales (:mod:`~mpsfm_core.dense.epipolar_error`,
    :mod:`~mpsfm_core.dense.scale_uncertainty`).
-5. Fuse stereo depth with known depth (:mod:`~mpsfm_core.dense.depth_posterior`).
+5. Fuse stereo depth with input depth (:mod:`~mpsfm_core.dense.depth_posterior`).
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ _NUM_SOURCES = 5
 _MATCH_STD_PX = 0.5
 """Nominal std of a match in pixels, for the tolerance of the consistency check [ours]."""
 _MAX_COST = 0.9
-"""Maximum matching cost of a measured pixel; textureless images match anything [ours]."""
+"""Maximum matching cost of a pixel with stereo depth; textureless images match anything [ours]."""
 _MAX_SPLAT_STDS = 1.5
-"""Maximum difference of splatted and known depth, in stds of the known depth [ours].
+"""Maximum difference of splatted and input depth, in stds of the input depth [ours].
 
 A larger difference may mean that the splatted depth belongs to a surface past an edge."""
 _MAX_SPLAT_VIEWS = 16
@@ -300,7 +300,7 @@ def _store_consistency(
 def _measure_constraints(
     image: _MatchedImage, differences: Mapping[int, Float32], view: DenseView, options: DenseOptions
 ) -> ScaleConstraints:
-    """Measure the scale constraints between an image's pairs and the known depth of its view."""
+    """Measure the scale constraints between an image's pairs and the input depth of its view."""
     known = view.log_std < UNKNOWN_LOG_STD
     std = float(np.median(view.log_std[known])) if known.any() else UNKNOWN_LOG_STD
     change = image.log_depth - view.log_depth
@@ -317,7 +317,7 @@ def _merge_stereo_depth(
     """Merge the consistent stereo depth of an image with depth projected from neighbors.
 
     Pixels that another view confirms use the stereo depth of the image. Unconfirmed pixels use the
-    confirmed depth of neighbors if this depth is close to the known depth.
+    confirmed depth of neighbors if this depth is close to the input depth.
     """
     image, confirmed = matched[row], consistency[row].confirmed
     log_depth = image.log_depth + consistency[row].mean_change

@@ -1,6 +1,6 @@
-"""Depth completion: correct known depth at pixels without stereo measurement.
+"""Depth completion: correct input depth at pixels without stereo measurement.
 
-Two assumptions constrain a pixel without measurement. The ratio of known to true depth is smooth
+Two assumptions constrain a pixel without measurement. The ratio of input to true depth is smooth
 and close to 1. Surfaces are planar, and inverse depth of a plane is linear in the image. The
 variances of the smoothness and the planarity assumption are estimated at measured pixels. Both
 assumptions are linear in the ratio, so completion is one sparse linear least-squares problem.
@@ -22,10 +22,10 @@ _MAX_CORRECTION = 1.0
 
 
 class MeasuredCorrection(NamedTuple):
-    """Measured corrections of the known depth on a coarse grid."""
+    """Measured corrections of the input depth on a coarse grid."""
 
     change: Float32
-    """(h, w) measured minus known log depth."""
+    """(h, w) stereo minus input log depth."""
     precision: Float32
     """(h, w) inverse variance of ``change``, 0 at pixels without measurement."""
 
@@ -34,7 +34,7 @@ class PlanarityPrior(NamedTuple):
     """Gaussian prior on second differences of inverse depth, relative to inverse depth."""
 
     bends: csr_array
-    """(m, n) matrix from the n ratios of known to true depth to m relative second differences."""
+    """(m, n) matrix from the n ratios of input to true depth to m relative second differences."""
     weight: Float64
     """(m,) inverse variance of each relative second difference of inverse depth."""
 
@@ -42,17 +42,17 @@ class PlanarityPrior(NamedTuple):
 def estimate_planarity(
     log_depth: Float32, hole: Bool, correction: MeasuredCorrection, min_std: float
 ) -> PlanarityPrior:
-    """Estimate the weights of the planarity prior from the measured depth of an image.
+    """Estimate the weights of the planarity prior from the stereo depth of an image.
 
-    The std of a second difference is the std of measured second differences. If the known depth has
+    The std of a second difference is the std of measured second differences. If the input depth has
     an equally large second difference, an edge is likely and the weight is halved. Edges at the rim
     of a hole cannot be detected, so the weight at the rim is 0. Without measurements all weights
     are 0.
 
     Args:
-        log_depth: (h, w) known log depth; neighboring pixels fill holes.
-        hole: (h, w) mask of pixels without known depth.
-        correction: Measured corrections on the grid of the known depth.
+        log_depth: (h, w) input log depth; neighboring pixels fill holes.
+        hole: (h, w) mask of pixels without input depth.
+        correction: Measured corrections on the grid of the input depth.
         min_std: Minimum std of log depth.
     """
     second = _second_differences(*log_depth.shape)
@@ -74,16 +74,16 @@ def estimate_planarity(
 def solve_depth_correction(
     field: tuple[Float32, Float32, Float32], planarity: PlanarityPrior, measured: MeasuredCorrection
 ) -> Float32:
-    """Solve for the correction of the known log depth at every pixel.
+    """Solve for the correction of the input log depth at every pixel.
 
     Args:
-        field: Precisions (h, w) of the Gaussian Markov random field of the ratio of known to true
+        field: Precisions (h, w) of the Gaussian Markov random field of the ratio of input to true
             depth: coupling with the east neighbor, the south neighbor, and 1.
         planarity: Planarity prior of the image from :func:`estimate_planarity`.
         measured: Measured corrections.
 
     Returns:
-        (h, w) correction of the known log depth.
+        (h, w) correction of the input log depth.
     """
     height, width = measured.change.shape
     east, south, mass = (each.astype(np.float64) for each in field)

@@ -1,8 +1,8 @@
-"""Gaussian fusion of stereo depth with known depth, and the posterior std.
+"""Gaussian fusion of stereo depth with input depth, and the posterior std.
 
-:mod:`mpsfm_core.dense.depth_completion` corrects known depth at pixels without stereo measurement.
-The error of known log depth is a Gaussian Markov random field (Lindgren et al., 2011) on the
-pixels. The posterior std of known depth is the declared std far from stereo measurements and lower
+:mod:`mpsfm_core.dense.depth_completion` corrects input depth at pixels without stereo measurement.
+The error of input log depth is a Gaussian Markov random field (Lindgren et al., 2011) on the
+pixels. The posterior std of input depth is the declared std far from stereo measurements and lower
 near measurements. Planarity does not lower the std, because unmeasured surfaces often start behind
 an edge.
 """
@@ -28,9 +28,9 @@ _DOWNSAMPLING = 8
 _MIN_MEASURED_RATIO = 0.3
 """Minimum ratio of stereo pixels in a block; single pixels may match by chance [ours]."""
 _MIN_KNOWN_ERROR_RATIO = 0.5
-"""Minimum ratio of the known depth's std to its distance from measured depth [ours].
+"""Minimum ratio of the input depth's std to its distance from stereo depth [ours].
 
-The relative accuracy of the measured depth's std is about 1/8."""
+The relative accuracy of the stereo depth's std is about 1/8."""
 MIN_STD = 1e-4
 """Minimum std of log depth, more accurate than any sensor."""
 UNKNOWN_LOG_STD = 1.0
@@ -52,11 +52,11 @@ class LogDepthMap(NamedTuple):
 
 
 def fuse_known_depth(measured: LogDepthMap, known: LogDepthMap) -> LogDepthMap:
-    """Fuse measured depth with known depth at the same pixels.
+    """Fuse stereo depth with input depth at the same pixels.
 
-    The variance of known depth is estimated as the mean squared distance to measured depth minus
-    the variance of measured depth. The estimated variance may be far below the declared variance,
-    so that sensor depth keeps its accuracy. Holes of the known depth are ignored.
+    The variance of input depth is estimated as the mean squared distance to stereo depth minus
+    the variance of stereo depth. The estimated variance may be far below the declared variance,
+    so that sensor depth keeps its accuracy. Holes of the input depth are ignored.
     """
     compared = measured.known & (known.log_std < UNKNOWN_LOG_STD)
     if not compared.any():
@@ -81,12 +81,12 @@ def fuse_known_depth(measured: LogDepthMap, known: LogDepthMap) -> LogDepthMap:
 def compute_depth_posterior(
     known: LogDepthMap, measured: LogDepthMap, correlation_px: float
 ) -> LogDepthMap:
-    """Compute log depth and std at every pixel from known and measured depth.
+    """Compute log depth and std at every pixel from input and stereo depth.
 
     Args:
         known: Depth before stereo; neighboring pixels fill holes.
         measured: Stereo depth after :func:`fuse_known_depth`.
-        correlation_px: Correlation length of the error of known depth in pixels.
+        correlation_px: Correlation length of the error of input depth in pixels.
     """
     height, width = known.log_depth.shape
     grid = max(2, width // _DOWNSAMPLING), max(2, height // _DOWNSAMPLING)
@@ -117,7 +117,7 @@ def compute_depth_posterior(
 
 
 def _calibrated_std(known: LogDepthMap, measured: LogDepthMap, std: Float32) -> Float32:
-    """Scale a declared std so that it fits the distances between known and measured depth.
+    """Scale a declared std so that it fits the distances between input and stereo depth.
 
     Holes stay unknown.
     """

@@ -1,9 +1,9 @@
 """Scale uncertainty of stereo depth between image pairs.
 
 The depth of an image pair is known up to the length of its baseline. The log scales of pairs that
-share an image are linked by pixels that both pairs confirm, and by the known depth of the image.
-The declared std of known depth links the scale of each depth map to the world. The log scales of
-pairs, known depth maps and the world form a Gaussian network, in which a constraint limits the
+share an image are linked by pixels that both pairs confirm, and by the input depth of the image.
+The declared std of input depth links the scale of each depth map to the world. The log scales of
+pairs, input depth maps and the world form a Gaussian network, in which a constraint limits the
 difference of two log scales. The reported std is the marginal std of a scale relative to the mean
 of all pairs.
 """
@@ -25,7 +25,7 @@ from mpsfm_core.geometry.statistics import ONE_SIGMA
 _MIN_CONSTRAINT_STD = 1e-6
 """Minimum std of a log scale constraint; avoids infinite precision."""
 _SCALE_CORRELATION = 0.5
-"""Correlation of the scale errors of known depth maps in one component.
+"""Correlation of the scale errors of input depth maps in one component.
 
 The scale errors are correlated because one network predicts all depth maps of the scene [ours]."""
 _BLOCK_COLUMNS = 256
@@ -33,7 +33,7 @@ _BLOCK_COLUMNS = 256
 
 
 class ScaleConstraints(NamedTuple):
-    """Scale constraints that one image measures between its k pairs and its known depth."""
+    """Scale constraints that one image measures between its k pairs and its input depth."""
 
     sources: list[int]
     """(k,) index of the second image of each pair."""
@@ -42,9 +42,9 @@ class ScaleConstraints(NamedTuple):
     shared: Float64
     """(k, k) symmetric precision of the log scale difference of two pairs, from shared pixels."""
     known: Float64
-    """(k,) precision of the log scale difference between the known depth and each pair."""
+    """(k,) precision of the log scale difference between the input depth and each pair."""
     known_std: float
-    """Declared std of the known depth map's log scale."""
+    """Declared std of the input depth map's log scale."""
 
 
 def measure_scale_constraints(
@@ -53,18 +53,18 @@ def measure_scale_constraints(
     known_std: float,
     correlation_px: float,
 ) -> ScaleConstraints:
-    """Measure the scale constraints between an image's pairs and its known depth.
+    """Measure the scale constraints between an image's pairs and its input depth.
 
     All pairs that confirm a pixel have equal variance; the depth error that the pairs have in
     common cancels. The squared mean difference of shared pixels is a lower bound of the variance.
-    Errors of known depth are correlated within the region of a pair. The std of the known depth is
-    therefore its distance to the measured depth in the region.
+    Errors of input depth are correlated within the region of a pair. The std of the input depth is
+    therefore its distance to the stereo depth in the region.
 
     Args:
         differences: Source image -> (h, w) differences from
             :func:`~mpsfm_core.dense.geometric_consistency.compare_depths`.
-        change: (h, w) measured minus known log depth.
-        known_std: Declared std of the known log depth.
+        change: (h, w) stereo minus input log depth.
+        known_std: Declared std of the input log depth.
         correlation_px: Correlation length of depth errors in pixels; a square of this side counts
             as one observation.
     """
@@ -90,7 +90,7 @@ def estimate_scale_stds(images: Mapping[int, ScaleConstraints]) -> dict[int, flo
     """Estimate the std of the log scale of each image's stereo depth.
 
     The scale variance of an image is the mean over its pairs, weighted by the number of confirmed
-    pixels. An image without pairs has the scale variance of its known depth. If no image has a
+    pixels. An image without pairs has the scale variance of its input depth. If no image has a
     pair, all stds are 0.
 
     Args:
@@ -141,8 +141,8 @@ def _world_precision(precision: csr_array, maps: list[int], stds: list[float]) -
 
     Args:
         precision: (n, n) precision of the constraints between unknown log scales.
-        maps: Indices of the unknowns that are log scales of known depth maps.
-        stds: Declared std of each known depth map's log scale.
+        maps: Indices of the unknowns that are log scales of input depth maps.
+        stds: Declared std of each input depth map's log scale.
 
     Returns:
         (n,) precision relative to the world, 0 for image pairs.

@@ -1,6 +1,6 @@
-"""Multi-view stereo: plane-sweep along the known surface, coarse to fine.
+"""Multi-view stereo: plane-sweep along the input surface, coarse to fine.
 
-A stereo label is an offset of log depth from the known surface. A sweep warps all pixels of one
+A stereo label is an offset of log depth from the input surface. A sweep warps all pixels of one
 label into a source view, so that NCC windows follow the slant of the surface. Semi-global matching
 (Hirschmueller, PAMI 2008) aggregates the costs. The next finer pyramid level searches a few labels
 around the coarse result.
@@ -26,7 +26,7 @@ from mpsfm_core.dense.stereo_kernels import (
 from mpsfm_core.geometry import resize_map
 
 _RANGE_STDS = 2.0
-"""Half width of the depth search range in stds of the known depth [ours]."""
+"""Half width of the depth search range in stds of the input depth [ours]."""
 _MAX_LABELS = 96
 """Maximum number of depth hypotheses per pixel on the coarse level; bounds the memory [ours]."""
 _WINDOW_RADIUS = 3
@@ -38,7 +38,7 @@ _MERGED_VIEW_RATIO = 0.5
 
 The views with the highest costs count as occluded. A higher ratio is less robust to occlusion."""
 _PRIOR_WEIGHT = 0.02
-"""Weight of the squared deviation from the known depth in stds; costs are in [0, 1] [ours]."""
+"""Weight of the squared deviation from the input depth in stds; costs are in [0, 1] [ours]."""
 _SMALL_STEP_PENALTY = 0.04
 """Penalty P1 of semi-global matching for neighboring pixels one label apart [ours]."""
 _LARGE_STEP_PENALTY = 1.6
@@ -53,7 +53,7 @@ _UNSEEN_COST = 0.6
 _GRAY_EDGE = 10 / 255
 """Difference of gray values that halves the penalty P2 of a depth step [ours]."""
 _MAX_PRIOR = 9.0
-"""Maximum of the squared deviation from the known depth, in squared stds."""
+"""Maximum of the squared deviation from the input depth, in squared stds."""
 _OUT_OF_RANGE_COST = 4.0
 """Cost of a depth outside the search range, several times the worst matching cost [ours]."""
 _PARALLAX_SAMPLES = 8
