@@ -72,7 +72,7 @@ def installed_plugins(
     """Load every entry point of the group ``mpsfm.plugins``, ordered by distribution and name.
 
     Args:
-        timeout_s: Time limit for each plugin.
+        timeout_s: Time limit for loading each plugin.
         crashing: (name, module) of entry points to skip, see :func:`crashing_plugins`.
 
     Yields:

@@ -92,9 +92,8 @@ class ProviderContext:
 
     resolve_weights: Callable[[str, str | None], Path]
     """``resolve_weights(uri, sha256)`` returns the local path of a weights file and downloads the
-    file if necessary. The function raises
-    :class:`~mpsfm_core.data.errors.WeightsError`. URIs are described
-    in :mod:`mpsfm_core.providers.weights`."""
+    file if necessary. The function raises :class:`~mpsfm_core.data.errors.WeightsError`. URIs are
+    described in :mod:`mpsfm_core.providers.weights`."""
     device: str = "cpu"
     """Device of the networks, ``"cpu"`` or ``"cuda"``."""
     threads: int = 1
@@ -292,7 +291,7 @@ class Executor(Protocol):
             None for each finished item, in the order of completion.
 
         Raises:
-            Exception: Any exception that a step raised, unchanged.
+            Exception: Any exception that a step raises on a worker, unchanged.
         """
         ...
 

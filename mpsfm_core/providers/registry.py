@@ -231,7 +231,7 @@ class Registry:
         """Validate the options of a provider and fill in default values.
 
         Args:
-            kind: Kind of the provider.
+            kind: Kind of the provider, such as ``depth``.
             name: Name of the provider.
             values: Option values from the configuration.
             path: Path of ``values`` in the configuration, for messages.
@@ -257,7 +257,7 @@ class Registry:
         """List the weights files that a provider loads with the given options.
 
         Args:
-            kind: Kind of the provider.
+            kind: Kind of the provider, such as ``depth``.
             name: Name of the provider.
             values: Option values from the configuration.
 
@@ -289,7 +289,7 @@ class Registry:
         plugin's ``mpsfm_calibration`` hook or in its specification.
 
         Args:
-            kind: Kind of the provider.
+            kind: Kind of the provider, such as ``depth``.
             config: Configuration of the provider. ``config.calibration`` contains values only,
                 because loading the configuration has already read a calibration file.
 
@@ -323,7 +323,7 @@ class Registry:
         """Import and construct a provider and its wrappers.
 
         Args:
-            kind: Kind of the provider.
+            kind: Kind of the provider, such as ``depth``.
             name: Name of the provider.
             options: Validated options, or option values from the configuration.
             context: Resources of the run that the factory receives.

@@ -33,7 +33,7 @@ SHIFT_TOLERANCE_PX = 0.25
 """Largest shift of a map in pixels of the view, or of the map if its pixels are larger. Integer
 pixel centers shift a map by 0.5; correct resizing to half and a quarter stays below 0.1."""
 MIN_MATCHES = 8
-"""Smallest number of matches for a statistic."""
+"""Smallest number of matches for an accuracy statistic."""
 
 
 def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str:

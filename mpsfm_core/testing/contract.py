@@ -72,7 +72,7 @@ class CheckResult:
     message: str
     """Reason of a failure or skip, or the remark of a check that passed."""
     seconds: float
-    """Run time."""
+    """Run time of the check in seconds."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ class Contract:
 
         Args:
             registry: Registry that contains the provider.
-            kind: Kind of the provider.
+            kind: Kind of the provider, such as ``depth``.
             name: Name of the provider.
             folder: Folder for the weights files of test networks.
             setup: ContractSetup, or function that returns one; by default the function of the
@@ -209,7 +209,7 @@ def run_checks(
 
     Args:
         registry: Registry that contains the provider.
-        kind: Kind of the provider.
+        kind: Kind of the provider, such as ``depth``.
         name: Name of the provider.
         setup: ContractSetup, or function that returns one; by default the function of the
             specification.

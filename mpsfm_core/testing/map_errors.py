@@ -135,7 +135,7 @@ def _normalized_positions(shape: tuple[int, int]) -> Float64:
 
 
 def _solve_shift(error: Float64, slopes: list[Float64], positions: Float64) -> MapShift:
-    """Solve ``error = -slope . (shift + stretch * position) + constant``.
+    """Solve ``error = constant - dot(slope, shift + stretch * position)``.
 
     The least-squares fit has a second pass that excludes outliers.
 

@@ -25,7 +25,7 @@ def contract_tests(
         test_contract = contract_tests("depth", "my-depth")
 
     Args:
-        kind: Kind of the provider.
+        kind: Kind of the provider, such as ``depth``.
         name: Name of the provider.
         setup: ContractSetup, or function that returns one; by default the function of the
             specification.

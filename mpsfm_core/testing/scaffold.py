@@ -22,7 +22,7 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> list[Path]:
 
     Args:
         name: Name of the Python package, the distribution and the provider.
-        kind: Kind of the provider.
+        kind: Kind of the provider, such as ``depth``.
         folder: Parent folder of the plugin package.
 
     Returns:

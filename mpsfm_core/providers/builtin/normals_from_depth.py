@@ -30,16 +30,17 @@ _BEND_NOISE = np.sqrt(1.5)
 class NormalsFromDepth:
     """Normals provider that fits least-squares planes in a window around each depth pixel.
 
-    A plane ``g . X = 1`` has the inverse depth ``1 / z = g . (x, y, 1)`` along the ray ``(x, y,
-    1)``. The inverse depth is linear in ``g``, so a linear least-squares fit gives ``g``, and the
-    normal is ``-g / |g|``. The provider shrinks windows until they contain no depth edge.
+    A plane ``dot(g, X) = 1`` has the inverse depth ``1 / z = dot(g, r)`` along the ray
+    ``r = (x, y, 1)``. The inverse depth is linear in ``g``, so a linear least-squares fit gives
+    ``g``, and the normal is ``-g / |g|``. The provider shrinks windows until they contain no depth
+    edge.
 
     Errors of depth maps are smooth over many pixels, because a network bends a wall instead of
-    roughening the surface. Depth differences of neighboring pixels are therefore more
-        accurate than independent errors of the declared std would be. A depth error of relative std
-        ``s`` that varies over an angle of ``a`` radians tilts a surface by about ``s / a``; the
-        option ``slope_std`` is ``1 / a``. The fit residuals add the variance of the roughness,
-        assuming one independent error per pixel.
+    roughening the surface. Depth differences of neighboring pixels are therefore more accurate than
+    independent errors of the declared std would be. A depth error of relative std ``s`` that varies
+    over an angle of ``a`` radians tilts a surface by about ``s / a``. The option ``slope_std`` is
+    ``1 / a``. The fit residuals add the variance of the roughness, assuming one independent error
+    per pixel.
     """
 
     def __init__(self, options: NormalsFromDepthOptions, context: ProviderContext) -> None:
@@ -133,7 +134,7 @@ def _fit_without_edges(
 def _fit_planes(
     xy: Float64, inverse: Float64, noise: Float64, usable: Bool, edges: Bool, radius: int
 ) -> _Fit:
-    """Fit planes ``g`` with ``inverse = g . (x, y, 1)`` to the usable pixels of windows.
+    """Fit planes ``g`` with ``inverse = dot(g, (x, y, 1))`` to the usable pixels of windows.
 
     ``noise`` (h, w) is a lower bound for the variance of the inverse depth of a pixel.
     """

@@ -114,4 +114,4 @@ class NormalsFromDepthOptions(Options):
     1.015]."""
     slope_std: float = Field(4.0, ge=0)
     """Angular std of normals in radians per relative std of depth. Raising this factor lowers the
-    weight of the normals [tuned: FastDepth on the rendered kitchen]."""
+    weight of the normals [tuned: rendered kitchen with FastDepth]."""

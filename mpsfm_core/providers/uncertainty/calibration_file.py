@@ -97,7 +97,7 @@ def read_values(path: Path, kind: str) -> Mapping[str, Any]:
 
     Args:
         path: The file.
-        kind: Kind of the provider.
+        kind: Kind of the provider, such as ``depth``.
 
     Returns:
         Values by name.
@@ -128,7 +128,7 @@ def load_calibration(path: Path, kind: CalibratedKind = "depth") -> Calibration:
 
     Args:
         path: The file.
-        kind: Kind of the provider.
+        kind: Kind of the provider, such as ``depth``.
 
     Returns:
         The calibration.

@@ -34,8 +34,8 @@ FOCAL_FACTOR = 1.5
 """Focal length of the second camera relative to the first in ``check_depth_intrinsics``."""
 _FOCAL_RANGE = (1.2, 1.9)
 """Range of depth ratios that is accepted for a focal length ratio of 1.5. A network with a
-canonical camera model has exactly 1.5. A ratio of 1 means that the network ignores the focal
-length, 0.67 that the effect is inverted."""
+canonical camera model has a depth ratio of 1.5. A ratio of 1 means that the network ignores the
+focal length, 0.67 that the effect is inverted."""
 
 _ORIENTATIONS: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
     {
