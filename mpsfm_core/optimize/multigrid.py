@@ -31,9 +31,9 @@ _kernel, _helper = (
 )
 
 SOLVED = 1e-10
-"""Relative error below which only rounding errors remain."""
+"""Relative error of the solution below which only rounding errors remain."""
 _TINY = 1e-30
-"""Value up to which a diagonal counts as zero."""
+"""Maximum value of a diagonal entry that counts as zero."""
 _PLANES, _FIRST_WEIGHTS = 19, 11
 """Number of planes of a level, and index of its first interpolation weights."""
 _Squares = tuple[float, ...]
@@ -80,8 +80,8 @@ class _Level(NamedTuple):
 class Multigrid:
     """Solver for one grid size: ``update`` sets the operator, ``solve`` solves.
 
-    The solver is deterministic and single-threaded. Its kernels release the GIL, so that several
-    instances may run in threads; an instance must not be shared.
+    The solver is deterministic and single-threaded. The kernels of the solver release the GIL, so
+    several solvers may run in threads, but threads must not share a solver.
     """
 
     def __init__(self, height: int, width: int) -> None:
@@ -97,14 +97,15 @@ class Multigrid:
         self._vectors = np.zeros((3, *self._levels[0].x.shape))
 
     def update(self, east: Float32, south: Float32, mass: Float32) -> None:
-        """Set the operator; takes as long as 1.3 V-cycles.
+        """Set the operator, in the time of 1.3 V-cycles.
 
         Pixels without couplings and mass stay zero, and their right-hand side must be zero.
 
         Args:
-            east: (h, w) non-negative couplings to the right; the last column is ignored.
-            south: (h, w) non-negative couplings below; the last row is ignored.
-            mass: (h, w) non-negative masses.
+            east: (h, w) non-negative couplings to the next pixel to the right. The last column is
+                ignored.
+            south: (h, w) non-negative couplings to the next pixel below. The last row is ignored.
+            mass: (h, w) non-negative masses of the pixels.
         """
         finest = self._levels[0]
         finest.east[1:-1, 1:-2] = east[:, :-1]
@@ -244,7 +245,7 @@ def _chain(stiffness: float, coupling: float, rest: float) -> float:
 
 @_helper
 def _inverse(value: float) -> float:
-    """Return the inverse, 0 for values that count as zero."""
+    """Return the inverse of a value, or 0 for values that count as zero."""
     return 1.0 / value if value > _TINY else 0.0
 
 
@@ -321,7 +322,7 @@ def _four_rows(first: int, last: int) -> tuple[int, int, int, int]:
 
 @_helper
 def _relax_columns(level: _Level, nine_point: bool) -> None:
-    """Relax the columns that the coarser grid omits; all are computed, so that it vectorizes."""
+    """Relax the columns that the coarser grid omits. The loops cover all columns to vectorize."""
     south, pivot, x, change = level.south, level.column_pivot, level.x, level.work
     height, width = x.shape
     change[0] = 0
@@ -554,7 +555,7 @@ def _add_coupling(q: _Squares, coupling: float, a: _Corners, b: _Corners) -> _Sq
 
 @_helper
 def _apply(level: _Level, x: Float64, image: Float64) -> float:
-    """Compute ``image = A x`` on the finest level; returns ``x' A x``."""
+    """Compute ``image = A x`` on the finest level, and return ``x' A x``."""
     east, south, mass = level.east, level.south, level.mass
     curvature = 0.0
     for i in range(1, x.shape[0] - 1):
@@ -587,7 +588,7 @@ def _turn(factor: float, preconditioned: Float64, direction: Float64) -> None:
 
 @_helper
 def _dot(a: Float64, b: Float64) -> float:
-    """Return the dot product of the interiors."""
+    """Return the dot product of two vectors without their frames."""
     total = 0.0
     for i in range(1, a.shape[0] - 1):
         for j in range(1, a.shape[1] - 1):

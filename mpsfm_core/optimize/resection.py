@@ -1,8 +1,9 @@
 """Refinement of a camera pose from keypoints and 3D segments.
 
-Depth bounds the 3D point of a match to a segment on the ray of the other image; both ends are equal
-if the point is known. The objective is Tukey's biweight of the distances between keypoints and
-projected segments, minimized by IRLS with Gauss-Newton steps ``R <- exp(w) R, t <- t + dt``.
+The 3D point of a match is a segment on the ray of the other image, whose ends are given by bounds
+of its depth. Both ends are equal if the point is known. The objective is Tukey's biweight of the
+distances between keypoints and projected segments, minimized by IRLS with Gauss-Newton steps ``R <-
+exp(w) R, t <- t + dt``.
 """
 
 from __future__ import annotations
@@ -18,22 +19,23 @@ from mpsfm_core.support import jit
 DAMPING = 1e-6
 """Relative damping of the normal equations, against singular problems. [ours]"""
 MAX_TURN = 1.0
-"""Largest rotation of a step in radians; a larger one comes from matches without a pose. [ours]"""
+"""Maximum rotation of a step in radians. Larger rotations come from matches that determine no pose.
+[ours]"""
 
 
 class RaySegments(NamedTuple):
     """Keypoints and the 3D segments that contain their points."""
 
     near: Float64
-    """(m, 3) world point at the near end."""
+    """(m, 3) near end of each segment in the world frame."""
     far: Float64
-    """(m, 3) world point at the far end."""
+    """(m, 3) far end of each segment in the world frame."""
     xy: Float64
-    """(m, 2) keypoints in pixels."""
+    """(m, 2) keypoints in pixels of the image."""
     limit: Float64
-    """(m,) distance in pixels from which a match has no influence."""
+    """(m,) distance in pixels beyond which a match has no influence."""
     weight: Float64
-    """(m,) weight of the match."""
+    """(m,) weight of each match."""
 
 
 class _NearestPoint(NamedTuple):
@@ -68,7 +70,7 @@ def measure_segments(
 
     Args:
         pose: ``cam_from_world``.
-        intrinsics: (4,) fx, fy, cx, cy.
+        intrinsics: (4,) camera parameters fx, fy, cx, cy in pixels.
         segments: Keypoints and segments.
 
     Returns:
@@ -88,12 +90,12 @@ def refine_pose(
 
     Args:
         pose: Initial ``cam_from_world``.
-        intrinsics: (4,) fx, fy, cx, cy.
+        intrinsics: (4,) camera parameters fx, fy, cx, cy in pixels.
         segments: Keypoints and segments.
-        scales: Factors on the limits, the largest first (graduated non-convexity).
+        scales: Factors on the distance limits, the largest first (graduated non-convexity).
 
     Returns:
-        The refined pose, or the last one if the matches determine no pose.
+        The refined pose, or the last valid pose if the matches determine no pose.
     """
     rotation, translation = map(np.ascontiguousarray, pose)
     matrix, vector = np.empty((POSE, POSE)), np.empty(POSE)

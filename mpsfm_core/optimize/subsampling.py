@@ -26,7 +26,7 @@ def subsample(values: NDArray[Scalar], step: int) -> NDArray[Scalar]:
 
 
 def subsample_prior(prior: Prior, step: int) -> Prior:
-    """Subsample a depth or normal prior; a step of 1 returns the prior itself."""
+    """Subsample a depth or normal prior, or return the prior itself if the step is 1."""
     if step == 1:
         return prior
     maps: dict[str, Any] = {
@@ -54,9 +54,10 @@ def subsample_pixels(xy: Float64, step: int) -> Float64:
 
 
 def upsample(values: Float64, valid: Bool, shape: tuple[int, int]) -> Float32:
-    """Upsample a subsampled map bilinearly to the grid ``shape`` (h, w) that it came from.
+    """Upsample a subsampled map bilinearly to its original grid of ``shape`` (h, w).
 
-    Invalid pixels have no weight. The result is 0 without a valid pixel in reach.
+    Invalid pixels have no weight. The result is 0 for pixels without a valid pixel in their
+    neighborhood.
     """
     rows, columns = shape
     step = compute_subsampling_step(columns, values.shape[1])
@@ -67,7 +68,7 @@ def upsample(values: Float64, valid: Bool, shape: tuple[int, int]) -> Float32:
 
 
 def _stretched(values: Float32, size: int, step: int) -> Float32:
-    """Interpolate linearly along the first axis; the outermost values extend to the border."""
+    """Interpolate linearly along the first axis, and extend the outermost values to the border."""
     at = (np.arange(size) + 0.5) / step - _offset(step) - 0.5
     at = np.clip(at, 0, len(values) - 1)
     low = np.minimum(at.astype(np.int64), max(len(values) - 2, 0))
@@ -78,5 +79,5 @@ def _stretched(values: Float32, size: int, step: int) -> Float32:
 
 
 def _offset(step: int) -> float:
-    """Return the offset between pixel coordinates of both grids, in subsampled pixels."""
+    """Return the offset between the pixel coordinates of both grids, in subsampled pixels."""
     return (step // 2 + 0.5) / step - 0.5
