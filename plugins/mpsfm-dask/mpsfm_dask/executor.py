@@ -14,7 +14,7 @@ from mpsfm_core.data.options import Options, SettingsError, parse_settings
 
 MAX_TASKS = 50_000
 """Maximum number of Dask tasks per extraction step. If a step has more items, several items share a
-task, because the scheduler keeps all tasks in memory.
+task, because the scheduler keeps all tasks in memory. [ours]
 """
 
 

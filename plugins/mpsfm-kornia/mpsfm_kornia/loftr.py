@@ -18,7 +18,8 @@ from mpsfm_kornia.runtime import Grid, is_inside_mask, load_state, load_weights
 _MULTIPLE = 8
 """Side in pixels of the cells that LoFTR matches at its coarse level."""
 _STD_NETWORK_PX = 0.5
-"""Std of LoFTR's match positions in pixels of the network input."""
+"""Std of LoFTR's match positions in pixels of the network input.
+[reference: half of the noise of sparse keypoints]"""
 _LUMA = (0.299, 0.587, 0.114)
 """Luma coefficients of ITU-R BT.601, with which LoFTR was trained."""
 

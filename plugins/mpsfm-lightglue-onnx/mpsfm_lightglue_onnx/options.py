@@ -23,7 +23,7 @@ class FeatureOptions(Options):
     """Maximum number of keypoints, selected by score. [reference, for SuperPoint]"""
     resize: int | None = Field(1600, ge=32)
     """Longer side of the resized image in pixels for detection. Images are never enlarged, and null
-    keeps their size.
+    keeps their size. [reference]
     """
     sha256: str | None = None
     """Expected SHA-256 hash of the file ``model``."""

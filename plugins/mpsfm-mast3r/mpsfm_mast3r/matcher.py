@@ -28,7 +28,7 @@ from mpsfm_mast3r.network import OnnxPairNetwork, PairNetwork, ViewOutput
 from mpsfm_mast3r.options import DenseSearch, SparseSearch
 
 _STD_NETWORK_PX = 0.5
-"""Std of dense match positions in pixels of the network input."""
+"""Std of dense match positions in pixels of the network input. [reference]"""
 
 
 class DenseMatcher:

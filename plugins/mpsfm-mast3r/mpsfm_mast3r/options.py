@@ -20,7 +20,7 @@ class SizeOptions(Options):
     """Options of the image size that MASt3R sees."""
 
     size: int = Field(512, ge=16)
-    """Longer side of the network input in pixels. Smaller images are enlarged."""
+    """Longer side of the network input in pixels. Smaller images are enlarged. [reference]"""
 
 
 class DenseSearch(SizeOptions):
@@ -28,14 +28,14 @@ class DenseSearch(SizeOptions):
 
     subsample: int = Field(8, ge=1)
     """Step in network pixels between the pixels from which the reciprocal search starts. Larger
-    steps are faster and find fewer matches."""
+    steps are faster and find fewer matches. [reference]"""
 
 
 class SparseSearch(SizeOptions):
     """Options of MASt3R's matching at given keypoints."""
 
     min_similarity: float = Field(0.85, ge=-1, le=1)
-    """Minimum cosine similarity of the descriptors of a match."""
+    """Minimum cosine similarity of the descriptors of a match. [reference]"""
 
 
 class Mast3rOptions(FileOptions, SizeOptions):

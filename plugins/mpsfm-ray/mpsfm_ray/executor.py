@@ -13,7 +13,7 @@ from mpsfm_core.data.options import Options, SettingsError, parse_settings
 
 MAX_TASKS = 50_000
 """Maximum number of Ray tasks per extraction step. If a step has more items, several items share a
-task."""
+task. [ours]"""
 
 
 class RayOptions(Options):

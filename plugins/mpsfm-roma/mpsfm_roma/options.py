@@ -15,7 +15,8 @@ class RomaOptions(Options):
     sha256: str | None = None
     """Expected SHA-256 hash of the file ``model``."""
     height: int = Field(672, ge=14, multiple_of=14)
-    """Height of the network input in pixels. Images are stretched to the input size."""
+    """Height of the network input in pixels. Images are stretched to the input size.
+    [reference: coarse resolution]"""
     width: int = Field(672, ge=14, multiple_of=14)
     """Width of the network input in pixels."""
     inputs: tuple[str, str] = ("im_A", "im_B")
@@ -40,7 +41,7 @@ class SparseSearch(Options):
 
     snap_px: float = Field(2.0, gt=0)
     """Maximum distance in pixels between a keypoint and the warped position of the other
-    keypoint."""
+    keypoint. [reference]"""
     min_certainty: float = Field(0.05, ge=0, lt=1)
     """Minimum certainty of the warp at a keypoint."""
 

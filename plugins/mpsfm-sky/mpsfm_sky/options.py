@@ -25,7 +25,8 @@ class SkyOptions(Options):
     sha256: str | None = None
     """Expected SHA-256 hash of the file ``model``."""
     threshold: float = Field(0.5, gt=0, lt=1)
-    """Sky probability above which a pixel is masked. Higher values mask fewer pixels."""
+    """Sky probability above which a pixel is masked. Higher values mask fewer pixels.
+    [reference]"""
 
 
 class SimpleSkyOptions(Options):

@@ -21,7 +21,7 @@ from mpsfm_transformers.placement import Preparation, preparation_for
 
 _PROMPTED = "prompt_depth_anything"
 _FARTHEST_M = 250.0
-"""Maximum depth in meters that Depth Pro predicts."""
+"""Maximum depth in meters that Depth Pro predicts. [reference]"""
 _NO_SPREAD_M = 1e-6
 """Offset of one pixel, in meters, in constant sensor depth, which the library cannot normalize."""
 

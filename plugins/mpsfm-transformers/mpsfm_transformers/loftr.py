@@ -15,7 +15,8 @@ from mpsfm_transformers.options import EfficientLoftrOptions
 
 _MULTIPLE = 32
 _STD_NETWORK_PX = 0.5
-"""Std of match positions in pixels of the network input."""
+"""Std of match positions in pixels of the network input.
+[reference: half of the noise of sparse keypoints]"""
 
 
 class _Paired(EfficientLoFTRForKeypointMatching):  # transformers is untyped

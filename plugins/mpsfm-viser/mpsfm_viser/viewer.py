@@ -24,7 +24,7 @@ used."""
 HOST_VARIABLE = "MPSFM_VIEWER_HOST"
 """Environment variable with the host address. 0.0.0.0 allows access from other machines."""
 _LEAST_SECONDS = 1.0
-"""Minimum time in seconds between two updates of the scene during a reconstruction."""
+"""Minimum time in seconds between two updates of the scene during a reconstruction. [ours]"""
 _NEW, _OLD = (255, 122, 26), (31, 157, 107)
 
 
