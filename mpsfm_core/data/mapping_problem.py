@@ -44,6 +44,10 @@ class MappingImage:
     """False if the focal length is a guess for bundle adjustment to refine.
 
     Images with equal intrinsics then share the focal length."""
+    focal_log_std: float = 0.7
+    """Prior std of the logarithm of a guessed focal length."""
+    focal_guess_px: float | None = None
+    """Prior mean of ``fx`` in pixels of the undistorted view; None: ``camera.fx``."""
     known_pose: Pose | None = None
     """``cam_from_world`` of the user."""
     depth_group: int | None = None
@@ -57,12 +61,19 @@ class MappingImage:
             require_array(self, "keypoint_std_factor", np.float64, (len(self.keypoints),))
             if not (self.keypoint_std_factor > 0).all():
                 raise DataError("keypoint_std_factor", "must be positive")
+        if not self.focal_log_std > 0:
+            raise DataError("focal_log_std", "must be positive")
         if self.depth.variance is None:
             raise DataError("depth", "the mapper needs a variance (calibrate the prior)")
         if self.normals.variance is None:
             raise DataError("normals", "the mapper needs a variance (calibrate the prior)")
         if self.depth.shape != self.normals.shape:
             raise DataError("normals", "must be on the grid of the depth map")
+
+    @property
+    def focal_prior_px(self) -> float:
+        """Prior mean of ``fx`` in pixels of the undistorted view."""
+        return self.camera.fx if self.focal_guess_px is None else self.focal_guess_px
 
 
 @dataclass(frozen=True, eq=False)

@@ -163,6 +163,7 @@ def _extract(context: ExtractionContext, imported: ImportedMatches | None) -> Ex
                 keypoint_std_px=assembled.std_px[index],
                 keypoint_std_factor=assembled.std_factor[index],
                 focal_known=image.focal_known,
+                focal_log_std=image.focal_log_std,
                 **_group_fields(context, groups, index),
             )
             for index, image in enumerate(context.images)

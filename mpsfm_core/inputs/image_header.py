@@ -9,6 +9,11 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
+from mpsfm_core.geometry.focal_length import (
+    DIAGONAL_35MM,
+    compute_equivalent_mm,
+    is_plausible_equivalent,
+)
 from mpsfm_core.inputs.codecs import avif_exif, heif_exif, is_avif, is_heif
 
 _EXIF_SIGNATURE = b"Exif\x00\x00"
@@ -18,7 +23,6 @@ _JPEG_WITHOUT_LENGTH = frozenset((0x01, *range(0xD0, 0xD9)))
 _TYPE_FORMATS = {1: "B", 3: "H", 4: "I", 5: "II", 9: "i", 10: "ii"}
 _TYPE_SIZES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
-_DIAGONAL_35MM = math.hypot(36.0, 24.0)
 _MAX_ASPECT_DIFFERENCE = 0.02
 """Difference of log aspect ratios above which an image counts as cropped since EXIF was written."""
 
@@ -46,7 +50,7 @@ class ImageHeader:
         """Return the focal length in pixels of the image at a size, from EXIF.
 
         Uses the 35 mm equivalent, defined by the diagonal (CIPA DCG-001). Without it, uses focal
-        length times focal-plane resolution.
+        length times focal-plane resolution. A value that no lens has counts as absent.
 
         Returns:
             Focal length in pixels, None if EXIF has none or the image was cropped.
@@ -56,16 +60,19 @@ class ImageHeader:
             ratio = (max(recorded) / min(recorded)) / (max(width, height) / min(width, height))
             if abs(math.log(ratio)) > _MAX_ASPECT_DIFFERENCE:
                 return None
-        equivalent = self.tags.get(_FOCAL_35MM, 0.0)
-        if equivalent > 0:
-            return equivalent / _DIAGONAL_35MM * math.hypot(width, height)
+        # cameras write 0, 1 or 65535 for an unknown equivalent
+        equivalent_mm = self.tags.get(_FOCAL_35MM, 0.0)
+        if is_plausible_equivalent(equivalent_mm):
+            return equivalent_mm / DIAGONAL_35MM * math.hypot(width, height)
         focal_mm = self.tags.get(_FOCAL_MM, 0.0)
         resolution = self.tags.get(_PLANE_RESOLUTION, 0.0)
         unit_mm = _MM_PER_UNIT.get(int(self.tags.get(_PLANE_UNIT, 2)), 0.0)
         if min(focal_mm, resolution, unit_mm) <= 0:
             return None
         reduction = max(width, height) / max(recorded) if max(recorded) > 0 else 1.0
-        return focal_mm * resolution / unit_mm * reduction
+        focal_px = focal_mm * resolution / unit_mm * reduction
+        equivalent_mm = compute_equivalent_mm(focal_px, width, height)
+        return focal_px if is_plausible_equivalent(equivalent_mm) else None
 
 
 def read_declared_num_pixels(data: bytes) -> int | None:

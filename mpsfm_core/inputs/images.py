@@ -8,6 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal
 
 import cv2
@@ -50,6 +51,11 @@ _log = logging.getLogger(__name__)
 
 FocalSource = Literal["intrinsics", "exif", "provider", "default"]
 
+FOCAL_LOG_STD: Mapping[FocalSource, float] = MappingProxyType(
+    {"intrinsics": 0.01, "exif": 0.1, "provider": 0.2, "default": 0.7}
+)
+"""Prior std of the log focal length by source. EXIF has rounding, focus breathing and wrong
+equivalents of zoom lenses; the default covers wide-angle phones and telephoto lenses. [ours]"""
 CACHED_BYTES = 512 << 20
 """Size of the cache of decoded views in bytes: the matcher reads each image many times."""
 _CACHED_MAPS = 2
@@ -106,6 +112,11 @@ class SourceImage:
     def focal_known(self) -> bool:
         """True if intrinsics were given, so that the focal length is not refined."""
         return self.focal_source == "intrinsics"
+
+    @property
+    def focal_log_std(self) -> float:
+        """Prior std of the logarithm of the focal length, by its source."""
+        return FOCAL_LOG_STD[self.focal_source]
 
     @property
     def original_size(self) -> tuple[int, int]:

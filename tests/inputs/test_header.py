@@ -56,6 +56,17 @@ def test_cropped_photo_has_no_focal_length() -> None:
     assert header(f35=26, x=4000, y=3000).focal_px(1000, 751) is not None
 
 
+@pytest.mark.parametrize("value", [0, 1, 5, 900, 65535])
+def test_focal_px_with_implausible_equivalent_is_none(value: float) -> None:
+    assert header(f35=value).focal_px(4000, 3000) is None
+    tags = {"mm": 50, "resolution": 4368 / 35.8, "unit": 4}
+    assert header(f35=value, **tags).focal_px(4368, 2912) == pytest.approx(50 / 35.8 * 4368)
+
+
+def test_focal_px_with_implausible_plane_resolution_is_none() -> None:
+    assert header(mm=4.2, resolution=72, unit=2).focal_px(4000, 3000) is None
+
+
 @pytest.mark.parametrize("tags", [{}, {"mm": 50}, {"f35": 0}, {"mm": 50, "resolution": 0}])
 def test_not_enough(tags: dict[str, float]) -> None:
     assert header(**tags).focal_px(4000, 3000) is None
