@@ -5,6 +5,7 @@ maps::
 
     1/2 sum rho_r(|project(R X + t) - xy|^2 / std_px^2)
     + 1/2 sum rho_d((log z - log d - s)^2 / std^2) + 1/2 sum (s - expected)^2 / std_s^2
+    + 1/2 sum (log f - log f_prior)^2 / std_f^2
 
 by Levenberg-Marquardt (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000). The Schur
 complement eliminates the points, the reduced camera system is solved, and back-substitution gives
@@ -60,6 +61,9 @@ class BundleResult:
     log_scales: Float64
     intrinsics: Float64
     points: Float64
+    std_log_focals: Float64
+    """(k,) posterior standard deviation of each variable log focal length, from the inverse of the
+    reduced camera system at the solution. NaN if constant, infinite if undetermined."""
     initial_cost: float
     final_cost: float
     iterations: int
@@ -131,7 +135,8 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
         if damping > MAX_DAMPING:
             message = "no step lowers the cost"
             break
-    return BundleResult(*state, initial_cost, cost, iteration, converged, message)
+    stds = normal.compute_focal_stds(state)
+    return BundleResult(*state, stds, initial_cost, cost, iteration, converged, message)
 
 
 class SchurComplementSolver:
@@ -179,9 +184,10 @@ class SchurComplementSolver:
             for array, summand in zip(self.total, part, strict=True):
                 array += summand
         self._add_scale_prior(state)
+        self._add_focal_prior(state)
         self.total.rhs[:] += self.total.gradient
         self._fix_constants()
-        return cost + self.p.scale_prior.cost(state)
+        return cost + self.p.scale_prior.cost(state) + self.p.focal_prior.cost(state)
 
     def _add_scale_prior(self, state: kernels.BundleParameters) -> None:
         """Add the prior of the log scales to the reduced camera system."""
@@ -192,6 +198,45 @@ class SchurComplementSolver:
         self.total.diagonal[rows] += prior.weight
         residuals = state.log_scales[prior.image] - prior.log_scale
         self.total.gradient[rows] += prior.weight * residuals
+
+    def _add_focal_prior(self, state: kernels.BundleParameters) -> None:
+        """Add the prior of the log focal lengths to the reduced camera system."""
+        prior, num_poses = self.p.focal_prior, len(self.p.bundle.layout.pair)
+        rows = kernels.NUM_IMAGE_PARAMS * num_poses + prior.slot
+        self.total.corner[prior.slot, prior.slot] += prior.weight
+        self.total.diagonal[rows] += prior.weight
+        self.total.gradient[rows] += prior.weight * prior.residuals(state)
+
+    def compute_focal_stds(self, state: kernels.BundleParameters) -> Float64:
+        """Compute the posterior standard deviation of each log focal length.
+
+        Its square is an entry of the diagonal of the inverse reduced camera system.
+
+        Args:
+            state: Parameters at which the problem is linearized.
+
+        Returns:
+            (k,) NaN for constant focal lengths, infinite for undetermined ones.
+        """
+        slots = self.p.bundle.layout.focal_slot
+        stds = np.full(len(slots), np.nan)
+        cameras = np.flatnonzero(slots >= 0)
+        if not len(cameras):
+            return stds
+        self.linearize(state, MIN_DAMPING)
+        diagonal = self.total.diagonal
+        boost = np.where(diagonal > 0, MIN_DAMPING * diagonal, 1.0)
+        rows = kernels.NUM_IMAGE_PARAMS * len(self.p.bundle.layout.pair) + slots[cameras]
+        units = np.zeros((len(diagonal), len(rows)))
+        units[rows, np.arange(len(rows))] = 1.0
+        if self.dense:
+            columns = self._solve_dense(boost, units)
+        else:
+            columns = np.stack([self._solve_sparse(boost, unit) for unit in units.T], axis=1)
+        variances = columns[rows, np.arange(len(rows))]
+        determined = (diagonal[rows] > 0) & (variances > 0)
+        stds[cameras] = np.where(determined, np.sqrt(np.where(determined, variances, 1)), np.inf)
+        return stds
 
     def _fix_constants(self) -> None:
         """Remove the constant parameters of images with a slot from the system."""
@@ -220,7 +265,8 @@ class SchurComplementSolver:
         """
         diagonal = self.total.diagonal
         boost = np.where(diagonal > 0, damping * diagonal, 1.0)
-        delta = self._solve_dense(boost) if self.dense else self._solve_sparse(boost)
+        solve = self._solve_dense if self.dense else self._solve_sparse
+        delta = solve(boost, -self.total.rhs)
         if not np.isfinite(delta).all():
             return np.inf, -np.inf, np.inf
         focals = delta[self.total.border.shape[1] :]
@@ -245,20 +291,20 @@ class SchurComplementSolver:
             return costs
 
         visible, lost, predicted = (float(x) for x in np.sum(self.run(move), axis=0))
-        visible += self.p.scale_prior.cost(trial)
+        visible += self.p.scale_prior.cost(trial) + self.p.focal_prior.cost(trial)
         predicted += 0.5 * float(delta @ (boost * delta - self.total.gradient))
         return visible, cost - visible - lost, predicted
 
-    def _solve_dense(self, boost: Float64) -> Float64:
+    def _solve_dense(self, boost: Float64, rhs: Float64) -> Float64:
         if not len(boost):
             return boost
         matrix = np.zeros((len(boost), len(boost)))
         kernels.assemble_reduced_matrix(self.total, boost, self.p.bundle.layout.pair, matrix)
         # the transpose is in Fortran's order, so that nothing is copied
-        _, solution, info = lapack.dposv(matrix.T, -self.total.rhs, lower=0, overwrite_a=1)
+        _, solution, info = lapack.dposv(matrix.T, rhs, lower=0, overwrite_a=1)
         return solution if info == 0 else np.full_like(boost, np.nan)
 
-    def _solve_sparse(self, boost: Float64) -> Float64:
+    def _solve_sparse(self, boost: Float64, rhs: Float64) -> Float64:
         """Solve by conjugate gradients with a block-Jacobi preconditioner."""
         total = self.total
         poses = total.border.shape[1]
@@ -278,7 +324,7 @@ class SchurComplementSolver:
             first = np.einsum("nab,nb->na", inverse, x[:poses].reshape(-1, size))
             return np.concatenate([first.ravel(), x[poses:] / corner])
 
-        return _conjugate_gradients(multiply, precondition, -total.rhs)
+        return _conjugate_gradients(multiply, precondition, rhs)
 
 
 def _conjugate_gradients(

@@ -64,6 +64,10 @@ class BundleProblem:
     """(p,) bool; None makes all points variable."""
     variable_focal: Bool | None = None
     """(k,) bool, cameras whose focal length is variable, with constant aspect ratio; None: none."""
+    prior_log_focals: Float64 | None = None
+    """(k,) mean of the prior of ``log fx``; None: the given ``fx``."""
+    prior_std_log_focals: Float64 | float = np.inf
+    """(k,) or one number, standard deviation of that prior; infinite without a prior."""
     log_scales: Float64 | None = None
     """(n,) log of the factor on the depth map of each image; None: 0."""
     expected_log_scales: Float64 | None = None
@@ -95,6 +99,29 @@ class ScalePrior(NamedTuple):
         return 0.5 * float(residuals @ (self.weight * residuals))
 
 
+class FocalPrior(NamedTuple):
+    """Normal prior of the variable log focal lengths."""
+
+    camera: Int64
+    """(s,) camera of each focal length."""
+    slot: Int64
+    """(s,) focal slot of the camera."""
+    log_focal: Float64
+    """(s,) mean."""
+    weight: Float64
+    """(s,) inverse variance."""
+
+    def residuals(self, state: kernels.BundleParameters) -> Float64:
+        """Return (s,) log focal lengths minus their means."""
+        residuals: Float64 = np.log(state.intrinsics[self.camera, 0]) - self.log_focal
+        return residuals
+
+    def cost(self, state: kernels.BundleParameters) -> float:
+        """Return half the weighted sum of squares."""
+        residuals = self.residuals(state)
+        return 0.5 * float(residuals @ (self.weight * residuals))
+
+
 class PreparedBundle(NamedTuple):
     """Validated problem in the layout of the kernels."""
 
@@ -103,6 +130,7 @@ class PreparedBundle(NamedTuple):
     pairs: Int64
     """(b, 2) pose slots of each block of the reduced camera system."""
     scale_prior: ScalePrior
+    focal_prior: FocalPrior
     held: Bool
     """(s, 7) bool, constant parameters of the images with a pose slot."""
     ranges: list[PointRange]
@@ -158,6 +186,7 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
         state,
         pairs,
         _scale_prior(problem, variable_scale, layout.pose_slot),
+        _focal_prior(problem, variable_focal, layout.focal_slot),
         held[moving],
         _ranges(obs.start, len(pairs)),
         int(np.diff(obs.start).max(initial=0)),
@@ -239,6 +268,22 @@ def _scale_prior(
     image = np.flatnonzero(variable & np.isfinite(std))
     slot = pose_slot[image].astype(np.int64)
     return ScalePrior(image, slot, expected[image], 1.0 / std[image] ** 2)
+
+
+def _focal_prior(
+    problem: BundleProblem, variable: Bool, focal_slot: NDArray[np.int32]
+) -> FocalPrior:
+    count = len(variable)
+    std = np.broadcast_to(np.asarray(problem.prior_std_log_focals, dtype=np.float64), (count,))
+    if not (std > 0).all():
+        raise DataError("prior_std_log_focals", "must be positive")
+    means = problem.prior_log_focals
+    if means is None:
+        means = np.log(problem.intrinsics[:, 0])
+    means = _numbers(means, "prior_log_focals", (count,))
+    camera = np.flatnonzero(variable & np.isfinite(std))
+    slot = focal_slot[camera].astype(np.int64)
+    return FocalPrior(camera, slot, means[camera], 1.0 / std[camera] ** 2)
 
 
 def _numbers(values: ArrayLike, name: str, shape: tuple[int, ...]) -> Float64:

@@ -201,6 +201,25 @@ class ScaleCost(pyceres.CostFunction):  # type: ignore[misc]
         return True
 
 
+class LogFocalCost(pyceres.CostFunction):  # type: ignore[misc]
+    """(log f - mean) / std of the parameters of a SIMPLE_PINHOLE camera."""
+
+    def __init__(self, mean: float, std: float) -> None:
+        super().__init__()
+        self.set_num_residuals(1)
+        self.set_parameter_block_sizes([3])
+        self.mean = mean
+        self.std = std
+
+    def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
+        """Ceres' callback."""
+        focal = parameters[0][0]
+        residuals[0] = (np.log(focal) - self.mean) / self.std
+        if jacobians is not None and jacobians[0] is not None:
+            jacobians[0][:] = [1 / (focal * self.std), 0, 0]
+        return True
+
+
 def solve_with_ceres(
     problem: BundleProblem, *, refine_focal: bool = False
 ) -> tuple[float, float, pycolmap.Reconstruction, Float64]:
@@ -215,6 +234,11 @@ def solve_with_ceres(
     given = np.zeros(count) if problem.log_scales is None else problem.log_scales
     log_scales = [np.array([value]) for value in given]
     adjuster = ceres_adjuster(rec, 1e-13, refine_focal=refine_focal, fix_scale=plain)
+    priors = []
+    if problem.prior_log_focals is not None:
+        for k, mean in enumerate(problem.prior_log_focals):
+            priors.append(LogFocalCost(float(mean), float(problem.prior_std_log_focals)))
+            adjuster.problem.add_residual_block(priors[-1], None, [rec.cameras[k + 1].params])
     if not plain:
         ceres = adjuster.problem
         loss = pyceres.LossFunction({"name": "cauchy", "params": [SOFT_L1_OPTIONS.depth_scale]})
@@ -268,6 +292,42 @@ def whitened_residuals(
     if problem.obs_log_depth is not None:
         depth = (np.log(in_camera[:, 2]) - problem.obs_log_depth) / problem.obs_std_log_depth
     return np.column_stack([pixel, np.nan_to_num(depth)])
+
+
+def dense_information(problem: BundleProblem) -> Float64:
+    """J^T J by central differences over free poses (6 each), points and log focal lengths.
+
+    The weights of the robust losses are those at the problem's own state.
+    """
+    poses, cameras = np.flatnonzero(problem.variable_pose), len(problem.intrinsics)
+    sizes = 6 * len(poses), problem.points.size, cameras
+    fixed = whitened_residuals(problem, robust=False)
+    robust = whitened_residuals(problem)
+    weight = np.divide(robust, fixed, out=np.ones_like(fixed), where=fixed != 0)
+
+    def residuals(change: Float64) -> Float64:
+        pose, point, focal = np.split(change, np.cumsum(sizes)[:-1])
+        rotations, translations = problem.rotations.copy(), problem.translations.copy()
+        for row, step in zip(poses, pose.reshape(-1, 6), strict=True):
+            rotations[row] = rotation(step[:3]) @ rotations[row]
+            translations[row] += step[3:]
+        moved = replace(
+            problem,
+            rotations=rotations,
+            translations=translations,
+            points=problem.points + point.reshape(-1, 3),
+            intrinsics=problem.intrinsics * np.exp(np.outer(focal, [1, 1, 0, 0])),
+        )
+        return (weight * whitened_residuals(moved, robust=False)).ravel()
+
+    columns = []
+    for n in range(sum(sizes)):
+        change = np.zeros(sum(sizes))
+        change[n] = 1e-6
+        columns.append((residuals(change) - residuals(-change)) / 2e-6)
+    jacobian = np.stack(columns, axis=1)
+    information: Float64 = jacobian.T @ jacobian
+    return information
 
 
 def dense_point_information(problem: BundleProblem) -> Float64:

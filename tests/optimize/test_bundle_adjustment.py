@@ -16,6 +16,8 @@ from mpsfm_core.optimize.bundle_adjustment import (
 )
 from mpsfm_core.optimize.options import Loss
 from tests.optimize.bundle_reference import (
+    FOCAL,
+    dense_information,
     make_problem,
     perturb,
     rotation,
@@ -161,6 +163,59 @@ def test_focal_length_per_camera() -> None:
     result = adjust_bundle(replace(perturb(truth, 0, 0.5), intrinsics=wrong), TIGHT)
     np.testing.assert_allclose(result.intrinsics, truth.intrinsics, rtol=1e-6)
     np.testing.assert_allclose(result.points, truth.points, atol=1e-5)
+
+
+@pytest.mark.parametrize("depth", [True, False])
+def test_adjust_bundle_with_focal_prior_reaches_ceres_optimum(depth: bool) -> None:
+    start = perturb(make_problem(8, 80, 5), 0)
+    start = replace(
+        start,
+        variable_focal=np.array([True]),
+        prior_log_focals=np.log([1.05 * FOCAL]),
+        prior_std_log_focals=0.004,
+    )
+    assert_same_optimum(start if depth else without_depth(start), refine_focal=True)
+
+
+@pytest.mark.parametrize("dense_poses", [500, 0])
+@pytest.mark.parametrize("prior_std", [np.inf, 0.01])
+def test_adjust_bundle_focal_stds_match_the_dense_hessian(
+    dense_poses: int, prior_std: float
+) -> None:
+    """The inverse of J^T J by finite differences over poses, points and two focal lengths."""
+    problem = make_problem(4, 40, 4)
+    problem = replace(
+        problem,
+        intrinsics=np.repeat(problem.intrinsics, 2, axis=0),
+        camera_of_image=np.arange(4) % 2,
+        variable_focal=np.ones(2, dtype=np.bool_),
+        prior_std_log_focals=prior_std,
+    )
+    options = TIGHT.model_copy(update={"dense_poses": dense_poses})
+    result = adjust_bundle(problem, options)
+    solved = replace(
+        problem,
+        rotations=result.rotations,
+        translations=result.translations,
+        intrinsics=result.intrinsics,
+        points=result.points,
+    )
+    information = dense_information(solved)
+    information[-2:, -2:] += np.eye(2) / prior_std**2
+    expected = np.sqrt(np.diagonal(np.linalg.inv(information))[-2:])
+    np.testing.assert_allclose(result.std_log_focals, expected, rtol=0.01)
+
+
+def test_adjust_bundle_focal_std_is_nan_if_constant_and_infinite_if_unobserved() -> None:
+    problem = make_problem(4, 40, 4)
+    problem = replace(
+        problem,
+        intrinsics=np.repeat(problem.intrinsics, 3, axis=0),
+        camera_of_image=np.zeros(4, dtype=np.int64),
+        variable_focal=np.array([True, True, False]),
+    )
+    stds = adjust_bundle(problem).std_log_focals
+    assert 0 < stds[0] < 0.1 and np.isinf(stds[1]) and np.isnan(stds[2])
 
 
 def exact(problem: BundleProblem) -> BundleProblem:
@@ -429,6 +484,8 @@ def test_iteration_limit_is_reported() -> None:
         ("variable_pose", np.ones(5)),
         ("variable_point", np.ones(3, dtype=np.bool_)),
         ("variable_focal", np.ones(2, dtype=np.bool_)),
+        ("prior_std_log_focals", 0.0),
+        ("prior_log_focals", np.zeros(2)),
         ("log_scales", np.zeros(4)),
         ("expected_log_scales", np.full(5, np.nan)),
         ("std_log_scales", 0.0),
