@@ -104,14 +104,19 @@ class ChoiceReason(ReasonCode):
 
 
 class CameraReason(ReasonCode):
-    """Reasons why bundle adjustment does not refine the guessed focal length of a camera."""
+    """Reasons why bundle adjustment does not refine the focal length of a camera."""
 
+    KNOWN = ("known",)
+    """The focal length is given."""
+    NOT_ESTIMATED = ("not-estimated",)
+    """Refinement is switched off, or the image was registered tentatively."""
     TOO_FEW_IMAGES = ("too-few-images", "num_images", "min_images")
+    """Only ``num_images`` images are registered in the model."""
     NOT_OBSERVABLE = ("not-observable", "focal_length_std_ratio")
     """The images do not constrain the focal length, whose relative std is
     ``focal_length_std_ratio``."""
-    OUT_OF_RANGE = ("out-of-range", "focal_length_px")
-    """The refined focal length is outside of the plausible range."""
+    OUT_OF_RANGE = ("out-of-range", "equivalent_mm")
+    """No lens has the refined focal length, whose 35 mm equivalent is ``equivalent_mm``."""
 
 
 class GpsReason(ReasonCode):

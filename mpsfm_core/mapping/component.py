@@ -133,7 +133,7 @@ class Component:
             self._register_global_poses(poses)
         self.refiner.adapts_reprojection_loss = True
         self.maintenance.refine_globally()
-        if self.refiner.focal_is_stable():
+        if self.refiner.can_refine_focals():
             # the first refinement started from poses that a wrong focal length had bent
             self.maintenance.refine_globally()
         max_violations = self._options.consistency.max_violations
@@ -208,7 +208,8 @@ class Component:
         """Register both images, triangulate, refine and check depth; None or why that fails."""
         a, b = initial_pair.reference, initial_pair.image
         register_first_image(self.scene, a)
-        self.scene.register(b, initial_pair.pose.rotation, initial_pair.pose.translation)
+        pose = initial_pair.pose
+        self.scene.register(b, pose.rotation, pose.translation, pose.focal_px)
         triangulate_image(self.scene, b, self._options.triangulation)
         self.refiner.estimate_scale(b, [])
         self.refiner.adjust([a, b])

@@ -69,6 +69,9 @@ class RegistrationOptions(Options):
     min_inlier_ratio: float = expert(0.25, gt=0, le=1)
     """Inlier ratio from which RANSAC computes its number of trials; raising it is faster and may
     miss poses. [COLMAP abs_pose_min_inlier_ratio]"""
+    estimate_focal: bool = expert(True)
+    """Estimate a guessed focal length with the pose, unless a registered image shares the camera.
+    False registers with the guess. Needs ``refinement.refine_focal``. [ours]"""
     lifting: bool = expert(True)
     """Use points that depth lifts from a single view. [paper 3.2]"""
     min_point_angle_deg: float = expert(1.0, ge=0)
@@ -128,9 +131,7 @@ class RefinementOptions(Options):
     """Relative growth of images or points after which all images are refined; raising it is faster
     and less accurate. [reference]"""
     refine_focal: bool = Field(True)
-    """Refine estimated focal lengths in global refinement; calibrated ones stay."""
-    focal_max_change: float = expert(2.0, gt=1)
-    """Largest factor by which a focal length may change; a larger change is undone. [ours]"""
+    """Refine guessed focal lengths that the images determine; given ones stay."""
     final_robust: bool = expert(False)
     """End with a global refinement with a sharper depth loss.
     [paper, robust reconstruction] [tuned: benchmarks.ablation]"""

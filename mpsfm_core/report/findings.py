@@ -7,9 +7,15 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from mpsfm_core.data.decisions import ImageReason
-from mpsfm_core.report.reasons import explain, explain_image, explain_pair, explain_provider
-from mpsfm_core.report.verdict import judge
+from mpsfm_core.data.decisions import DoubtReason, ImageReason
+from mpsfm_core.report.reasons import (
+    explain,
+    explain_camera,
+    explain_image,
+    explain_pair,
+    explain_provider,
+)
+from mpsfm_core.report.verdict import is_focal_refined, judge
 
 Level = Literal["bad", "warning", "note"]
 _ORDER: tuple[Level, ...] = ("bad", "warning", "note")
@@ -97,7 +103,11 @@ def _doubts(summary: Mapping[str, Any]) -> Iterator[Finding]:
     for doubt in judge(summary).doubts:
         explained = explain(doubt.reason)
         title = f"{explained.title[:1].upper()}{explained.title[1:]}"
-        yield Finding("warning", title, explained.text, explained.remedy, doubt.images)
+        text = explained.text
+        if doubt.reason.code == DoubtReason.UNKNOWN_FOCAL_LENGTH:
+            reason = summary["images"]["details"][doubt.images[0]].get("focal_length_reason")
+            text = f"{text} {explain_camera(reason).text}" if reason else text
+        yield Finding("warning", title, text, explained.remedy, doubt.images)
 
 
 def _left_out(summary: Mapping[str, Any]) -> Iterator[Finding]:
@@ -205,22 +215,29 @@ def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
     guessed = [
         name
         for name, image in details.items()
-        if image["focal_length_from"] == "default" and refined[name][1]
+        if image["focal_length_from"] == "default" and is_focal_refined(image)
     ]
     if guessed:
         changes = [after / before for before, after in (refined[name] for name in guessed)]
+        std_ratios = [
+            details[name]["focal_length_std_px"] / refined[name][1]
+            for name in guessed
+            if "focal_length_std_px" in details[name]
+        ]
+        std = f" Its standard deviation is at most {max(std_ratios):.1%}." if std_ratios else ""
         yield Finding(
             "note",
             f"The focal length of {_count(len(guessed), 'photo')} was estimated from the photos",
             "EXIF and --intrinsics give none. Bundle adjustment changed the initial guess by "
-            f"{min(changes) - 1:+.0%} to {max(changes) - 1:+.0%}.",
+            f"{min(changes) - 1:+.0%} to {max(changes) - 1:+.0%}.{std}",
             "Give it with --intrinsics if you know it.",
             tuple(guessed),
         )
     far = [
         name
         for name, (before, after) in refined.items()
-        if name not in guessed and after and abs(after / before - 1) > _MAX_FOCAL_CHANGE
+        if details[name]["focal_length_from"] != "default"
+        if after and abs(after / before - 1) > _MAX_FOCAL_CHANGE
     ]
     if far:
         before, after = refined[far[0]]

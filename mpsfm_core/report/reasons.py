@@ -239,9 +239,17 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "wrong one bends the whole model.",
         "Give it with --intrinsics, or use photos with EXIF as they come from the camera.",
     ),
+    CameraReason.KNOWN: ("known focal length", "The focal length is given.", _NO_REMEDY),
+    CameraReason.NOT_ESTIMATED: (
+        "focal length not estimated",
+        "Bundle adjustment did not estimate the focal length.",
+        "Leave out --set mapping.refinement.refine_focal=false, or give the focal length with "
+        "--intrinsics.",
+    ),
     CameraReason.TOO_FEW_IMAGES: (
-        "too few images",
-        "{num_images} images of the camera are registered; {min_images} are needed.",
+        "too few photos",
+        "Only {num_images} photos are registered; {min_images} are needed to estimate a focal "
+        "length.",
         "Add photos, or give the focal length with --intrinsics.",
     ),
     CameraReason.NOT_OBSERVABLE: (
@@ -252,7 +260,8 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
     ),
     CameraReason.OUT_OF_RANGE: (
         "implausible focal length",
-        "Bundle adjustment ends at {focal_length_px:.0f} px, which no lens has.",
+        "Bundle adjustment ends at a 35 mm equivalent of {equivalent_mm:.1f} mm, which no lens "
+        "has.",
         "Give the focal length with --intrinsics.",
     ),
 }
@@ -273,6 +282,11 @@ def explain_image(stored: Mapping[str, Any]) -> Explanation:
 def explain_pair(stored: Mapping[str, Any]) -> Explanation:
     """Explain a reason of a dropped pair as ``summary.json`` stores it."""
     return explain(reason_from_json(PairReason, stored))
+
+
+def explain_camera(stored: Mapping[str, Any]) -> Explanation:
+    """Explain why a focal length is not refined, as ``summary.json`` stores it."""
+    return explain(reason_from_json(CameraReason, stored))
 
 
 def explain_provider(stored: Mapping[str, Any]) -> Explanation:

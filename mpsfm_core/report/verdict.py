@@ -84,11 +84,20 @@ def find_doubts(summary: Mapping[str, Any]) -> Iterator[Doubt]:
     guessed = tuple(
         name
         for name, image in summary["images"]["details"].items()
-        if image["focal_length_from"] == "default" and "refined_focal_length_px" not in image
+        if image["focal_length_from"] == "default" and not is_focal_refined(image)
         if name in summary["images"]["registered"]
     )
     if guessed:
         yield Doubt(DoubtReason.UNKNOWN_FOCAL_LENGTH.because(num_images=len(guessed)), guessed)
+
+
+def is_focal_refined(image: Mapping[str, Any]) -> bool:
+    """Return whether bundle adjustment determined the focal length of an image.
+
+    Args:
+        image: Entry of the image in ``images.details`` of ``summary.json``.
+    """
+    return "refined_focal_length_px" in image and "focal_length_reason" not in image
 
 
 def _unexplained_pairs(pairs: list[Mapping[str, Any]]) -> Iterator[Doubt]:

@@ -11,11 +11,16 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import ImageSet, SourceImage
-from mpsfm_core.mapping.scene.reconstruction import MappingResult, MetricScale, Reconstruction
+from mpsfm_core.mapping.scene.reconstruction import (
+    MappingResult,
+    MetricScale,
+    Reconstruction,
+    RegisteredImage,
+)
 from mpsfm_core.results.evidence import count_explained_matches, describe_evidence
 from mpsfm_core.support.format_versions import check_version
 
@@ -59,9 +64,7 @@ def describe_images(
         for image in reconstruction.confirmed_images
     }
     placed = {image.name for model in mapping.reconstructions[:1] for image in model.images}
-    cameras = {
-        image.name: image.camera for model in mapping.reconstructions for image in model.images
-    }
+    registered = {image.name: image for model in mapping.reconstructions for image in model.images}
     reasons = {}
     for name in images.names:
         if name not in component:
@@ -79,7 +82,7 @@ def describe_images(
         "failed": extraction.get("failed", {}),
         "details": {
             image.name: {
-                **_focal_length(image, cameras.get(image.name)),
+                **_focal_length(image, registered.get(image.name)),
                 **extraction["images"][image.name],
             }
             for image in images
@@ -87,15 +90,21 @@ def describe_images(
     }
 
 
-def _focal_length(image: SourceImage, refined: PinholeCamera | None) -> dict[str, Any]:
-    """Describe the initial and, if refined, the final focal length of the upright original."""
-    described = {
+def _focal_length(image: SourceImage, registered: RegisteredImage | None) -> dict[str, Any]:
+    """Describe the focal length of the upright original: initial, refined, std or why not."""
+    described: dict[str, Any] = {
         "focal_length_from": image.focal_source,
         "focal_length_px": image.camera.mean_focal_length(),
     }
-    if refined is not None and refined != image.pinhole:
-        camera = image.refined_camera(refined)
-        described["refined_focal_length_px"] = camera.mean_focal_length()
+    if registered is None:
+        return described
+    focal_px = image.refined_camera(registered.camera).mean_focal_length()
+    if registered.camera != image.pinhole:
+        described["refined_focal_length_px"] = focal_px
+    if registered.focal_log_std is not None:
+        described["focal_length_std_px"] = focal_px * registered.focal_log_std
+    if registered.focal_reason is not None:
+        described["focal_length_reason"] = registered.focal_reason.to_json()
     return described
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from mpsfm_core.data.decisions import (
+    CameraReason,
     DoubtReason,
     GpsReason,
     ImageReason,
@@ -155,6 +156,32 @@ def test_refined_focal_lengths_are_reported_once() -> None:
     assert (guess.images, change.images) == (("a",), ("b",))
     assert "-20%" in guess.text
     assert change.text.startswith("From 500 (exif) to 400 px.")
+
+
+def test_findings_of_a_refined_guess_give_its_std() -> None:
+    report = summary()
+    report["images"]["details"]["a"] |= {
+        "focal_length_from": "default",
+        "refined_focal_length_px": 400.0,
+        "focal_length_std_px": 8.0,
+    }
+    (finding,) = findings(report)
+    assert (finding.level, finding.images) == ("note", ("a",))
+    assert "standard deviation is at most 2.0%" in finding.text
+
+
+def test_findings_of_a_kept_guess_give_the_reason() -> None:
+    report = summary()
+    reason = CameraReason.NOT_OBSERVABLE.because(focal_length_std_ratio=0.4)
+    report["images"]["details"]["a"] |= {
+        "focal_length_from": "default",
+        "refined_focal_length_px": 520.0,  # of an earlier refinement
+        "focal_length_reason": reason.to_json(),
+    }
+    (finding,) = findings(report)
+    assert doubts(report) == [DoubtReason.UNKNOWN_FOCAL_LENGTH]
+    assert (finding.level, finding.images) == ("warning", ("a",))
+    assert "standard deviation of 40%" in finding.text
 
 
 def doubts(report: dict[str, Any]) -> list[DoubtReason]:

@@ -39,6 +39,7 @@ def apply_seed_poses(
         replace(
             image,
             camera=cameras.get(image.camera, image.camera),
+            focal_guess_px=image.focal_prior_px,
             known_pose=poses.get(index, image.known_pose),
         )
         for index, image in enumerate(problem.images)

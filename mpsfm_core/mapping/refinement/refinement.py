@@ -12,17 +12,20 @@ from dataclasses import replace
 import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.geometry.focal_length import compute_equivalent_mm
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.depth_noise import DepthNoise, measure_depth_noise
 from mpsfm_core.mapping.refinement.filtering import filter_points
+from mpsfm_core.mapping.refinement.focal_lengths import decide_focal_outcome
 from mpsfm_core.mapping.refinement.keypoint_noise import measure_loss_scale
 from mpsfm_core.mapping.registration.image_selection import find_local_bundle
+from mpsfm_core.mapping.scene.focal_outcome import MIN_FOCAL_IMAGES, FocalOutcome
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, lift_low_parallax
-from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
+from mpsfm_core.optimize.bundle_adjustment import BundleProblem, BundleResult, adjust_bundle
 from mpsfm_core.optimize.covariance import compute_point_covariances, propagate_depth_variance
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
-from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, Loss
+from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, BundleOptions, Loss
 from mpsfm_core.optimize.subsampling import (
     compute_subsampling_step,
     subsample_camera,
@@ -47,10 +50,6 @@ MAX_GLOBAL_CHANGE = 0.0005
 FINAL_DEPTH_SCALE = 0.125
 """Factor on the scale of the depth loss in the final robust refinement.
 [reference final_robustification]"""
-MIN_FOCAL_IMAGES = 3
-"""Number of registered images from which estimated focal lengths are refined. [ours]"""
-MIN_FOCAL_ANGLE_DEG = 2.0
-"""Median triangulation angle from which estimated focal lengths are refined. [ours]"""
 MAX_DEPTH_RATIO = 1.5
 """Largest ratio of a point's depth and the map for which the observation of depth counts.
 [reference scale_filter]"""
@@ -195,7 +194,7 @@ class Refiner:
         Args:
             variable: Images to adjust.
             local: Keep points with long tracks fixed.
-            focal: Also refine estimated focal lengths.
+            focal: Also refine guessed focal lengths that the observations determine.
             reprojection_scale: Factor on the scale of the reprojection loss.
             depth_scale: Factor on the scale of the depth loss.
             max_iterations: Maximum number of iterations; None takes the option.
@@ -224,37 +223,36 @@ class Refiner:
         _, first, camera_rows = np.unique(
             scene.camera_of[images], return_index=True, return_inverse=True
         )
-        result = adjust_bundle(
-            BundleProblem(
-                rotations=scene.rotations[images],
-                translations=scene.translations[images],
-                intrinsics=scene.intrinsics[images][first],
-                camera_of_image=camera_rows,
-                points=tracks.xyz[points],
-                obs_image=image_rows,
-                obs_point=point_rows,
-                obs_xy=scene.keypoints[observations],
-                obs_std_px=scene.keypoint_std_px[images][image_rows] / np.sqrt(weight),
-                obs_log_depth=log_depth if regularized else None,
-                obs_std_log_depth=log_std * self.noise.std_factor,
-                variable_pose=moving,
-                expected_log_scales=expected,
-                std_log_scales=std,
-                variable_scale=self._has_free_scale(variable)[images],
-                variable_point=~long_track if local else None,
-                scale_anchor=int(np.argmax(moving)) if free_scale else None,
-                variable_focal=self._guessed(images)[first] if focal else None,
-            ),
-            options.model_copy(
-                update={
-                    "reprojection_scale": self.loss_scale * reprojection_scale,
-                    "depth_scale": depth_scale,
-                    "max_iterations": max_iterations or options.max_iterations,
-                }
-            ),
+        problem = BundleProblem(
+            rotations=scene.rotations[images],
+            translations=scene.translations[images],
+            intrinsics=scene.intrinsics[images][first],
+            camera_of_image=camera_rows,
+            points=tracks.xyz[points],
+            obs_image=image_rows,
+            obs_point=point_rows,
+            obs_xy=scene.keypoints[observations],
+            obs_std_px=scene.keypoint_std_px[images][image_rows] / np.sqrt(weight),
+            obs_log_depth=log_depth if regularized else None,
+            obs_std_log_depth=log_std * self.noise.std_factor,
+            variable_pose=moving,
+            expected_log_scales=expected,
+            std_log_scales=std,
+            variable_scale=self._has_free_scale(variable)[images],
+            variable_point=~long_track if local else None,
+            scale_anchor=int(np.argmax(moving)) if free_scale else None,
         )
-        if focal and not self._take_focal(images, result.intrinsics[camera_rows]):
-            return
+        options = options.model_copy(
+            update={
+                "reprojection_scale": self.loss_scale * reprojection_scale,
+                "depth_scale": depth_scale,
+                "max_iterations": max_iterations or options.max_iterations,
+            }
+        )
+        if focal:
+            result = self._adjust_with_focals(problem, options, images[first])
+        else:
+            result = adjust_bundle(problem, options)
         scene.rotations[images] = result.rotations
         scene.translations[images] = result.translations
         tracks.xyz[points] = result.points
@@ -289,7 +287,7 @@ class Refiner:
         images = [int(i) for i in self.scene.registered_images()]
         complete_and_merge_tracks(self.scene, self.triangulation, create=True)
         lift_low_parallax(self.scene, self.triangulation)
-        if self.focal_is_stable():
+        if self.can_refine_focals():
             self.adjust(images, focal=True)
         for _ in range(MAX_GLOBAL_REFINEMENTS):
             self.estimate_shared_scales()
@@ -335,34 +333,57 @@ class Refiner:
         depth_map.set_refined(refined)
 
     def _guessed(self, images: Int64) -> Bool:
-        """Return (m,) bool, images whose focal length is an estimate."""
+        """Return (m,) bool, images whose focal length is a guess."""
         known = [self.scene.problem.images[i].focal_known for i in images]
         return ~np.array(known, dtype=np.bool_)
 
-    def focal_is_stable(self) -> bool:
-        """Return whether the registered images constrain estimated focal lengths."""
-        images, options = self.scene.registered_images(), self.options
-        if not options.refine_focal or len(images) < MIN_FOCAL_IMAGES:
+    def can_refine_focals(self) -> bool:
+        """Return whether enough images are registered and a focal length is a guess."""
+        images = self.scene.registered_images()
+        if not self.options.refine_focal or len(images) < MIN_FOCAL_IMAGES:
             return False
-        angles = self.scene.track_angles_deg()[self.scene.tracks.lengths() > 0]
-        is_wide = len(angles) > 0 and float(np.median(angles)) >= MIN_FOCAL_ANGLE_DEG
-        return is_wide and bool(self._guessed(images).any())
+        return bool(self._guessed(images).any())
 
-    def _take_focal(self, images: Int64, intrinsics: Float64) -> bool:
-        """Apply refined focal lengths to all images of their cameras.
+    def _adjust_with_focals(
+        self, problem: BundleProblem, options: BundleOptions, representatives: Int64
+    ) -> BundleResult:
+        """Adjust guessed focal lengths too, and apply those that the observations determine.
 
-        Returns:
-            False, and no change, if one changed by more than ``focal_max_change``.
+        Cameras whose estimate is refused keep their focal length; the adjustment is then repeated
+        without them. The outcome of each camera is recorded in the scene.
+
+        Args:
+            problem: The problem with constant focal lengths.
+            options: Options of the adjustment.
+            representatives: (k,) an image of each camera of the problem.
         """
-        scene, limit = self.scene, self.options.focal_max_change
-        rows = np.flatnonzero(self._guessed(images))
-        guesses = np.array([scene.problem.images[image].camera.fx for image in images[rows]])
-        ratios = intrinsics[rows, 0] / guesses
-        if not ((1 / limit < ratios) & (ratios < limit)).all():
-            return False
-        for row in rows:
-            scene.set_shared_focal(int(images[row]), *map(float, intrinsics[row, :2]))
-        return True
+        scene = self.scene
+        images = [scene.problem.images[image] for image in representatives]
+        prior_stds = np.array([image.focal_log_std for image in images])
+        variable = self._guessed(representatives)
+        problem = replace(
+            problem,
+            prior_log_focals=np.log([image.focal_prior_px for image in images]),
+            prior_std_log_focals=prior_stds,
+        )
+        while True:
+            result = adjust_bundle(replace(problem, variable_focal=variable), options)
+            refused = np.zeros_like(variable)
+            for row in map(int, np.flatnonzero(variable)):
+                focal_px = float(result.intrinsics[row, 0])
+                # the prior bounds the posterior, also if the reduced system was singular
+                std = min(float(result.std_log_focals[row]), float(prior_stds[row]))
+                equivalent_mm = compute_equivalent_mm(focal_px, *images[row].camera.size)
+                outcome = decide_focal_outcome(equivalent_mm, std, prior_stds[row])
+                refused[row] = outcome != FocalOutcome.REFINED
+                scene.set_focal_outcome(int(representatives[row]), outcome, std, focal_px)
+            if not refused.any():
+                break
+            variable &= ~refused
+        for row in map(int, np.flatnonzero(variable)):
+            fx, fy = map(float, result.intrinsics[row, :2])
+            scene.set_shared_focal(int(representatives[row]), fx, fy)
+        return result
 
     def _measure_keypoint_noise(self) -> None:
         """Measure the scale of the Cauchy loss from the epipolar errors of matches."""

@@ -47,6 +47,12 @@ class PoseCorrespondences(NamedTuple):
         """(m,) 1 for points of known depth, else :data:`RAY_MATCH_WEIGHT`."""
         return _depth_weights(self.depth_known)
 
+    @property
+    def triangulated(self) -> Bool:
+        """(m,) bool, correspondences with a triangulated point, whose depth range is empty."""
+        is_point: Bool = (self.near_points == self.far_points).all(axis=1)
+        return is_point
+
     def select(self, rows: Int64 | Bool) -> PoseCorrespondences:
         """Return the correspondences of some rows, given as indices or as a mask."""
         fields: list[Any] = [values[rows] for values in self]

@@ -143,6 +143,8 @@ class IncrementalRegistration:
         last_pose = history.get_last_pose(image)
         if last_pose:
             hypothesis = last_pose.hypothesis
+            if not self._scene.has_free_focal(image):
+                hypothesis = hypothesis._replace(focal_px=None)
             poses.append(score_pose(self._scene, correspondences, hypothesis, options))
         search = not history.is_exhausted(image, references)
         if search:
@@ -213,7 +215,7 @@ class IncrementalRegistration:
         """
         scene, options = self._scene, self._options
         with self._event_log.timed("local refinement"):
-            scene.register(image, pose.rotation, pose.translation)
+            scene.register(image, pose.rotation, pose.translation, pose.focal_px)
             triangulate_image(scene, image, options.triangulation)
             num_neighbors = options.refinement.local_images - 1
             _, *neighbors = find_local_bundle(scene, image, num_neighbors, self._scores)

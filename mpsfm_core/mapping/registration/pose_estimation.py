@@ -29,6 +29,9 @@ from mpsfm_core.support.threads import thread_limit
 
 MIN_POSE_DISTANCE_DEG = 3.0
 """Smallest angle between distinct poses; closer ones converge to the same pose. [ours]"""
+MIN_FOCAL_SUPPORT_RATIO = 1.05
+"""Smallest ratio of the support with an estimated focal length and with the guess. One parameter
+more always increases the support a little. [ours]"""
 
 
 class AbsolutePoseEstimator:
@@ -63,6 +66,8 @@ class AbsolutePoseEstimator:
     ) -> list[ScoredPose]:
         """Estimate a few distinct poses of an image without bundle adjustment."""
         options, seed = self._options.registration, self._options.seed
+        if not self._options.refinement.refine_focal:
+            options = options.model_copy(update={"estimate_focal": False})
         return estimate_candidate_poses(
             self.scene, image, correspondences, options, seed=seed, attempt=attempt
         )
@@ -78,14 +83,14 @@ class AbsolutePoseEstimator:
         self, image: int, pose: ScoredPose, correspondences: PoseCorrespondences, snapshot: Snapshot
     ) -> ScoredPose:
         scene, options = self.scene, self._options
-        scene.register(image, pose.rotation, pose.translation)
+        scene.register(image, pose.rotation, pose.translation, pose.focal_px)
         triangulate_image(scene, image, options.triangulation)
         self._refiner.adjust(
             [image], local=True, max_iterations=options.registration.max_bundle_iterations
         )
         rotation, translation = scene.rotations[image].copy(), scene.translations[image].copy()
         scene.restore(snapshot)
-        adjusted = PoseHypothesis(rotation, translation, pose.source)
+        adjusted = PoseHypothesis(rotation, translation, pose.source, pose.focal_px)
         refined = score_pose(scene, correspondences, adjusted, options.registration)
         return max(pose, refined, key=lambda candidate: candidate.support)
 
@@ -120,6 +125,7 @@ def estimate_candidate_poses(
         def add_poses(estimators: Iterator[HypothesisEstimator]) -> None:
             hypotheses = pool.map(lambda estimate: estimate(), estimators)
             scored = [score_pose(scene, correspondences, h, options) for h in hypotheses if h]
+            scored = _discard_needless_focals(scored)
             distinct = select_distinct_poses(scored, options.num_locally_optimized)
             maximize = partial(maximize_support, scene, correspondences, options=options)
             poses.extend([*scored, *pool.map(maximize, distinct)])
@@ -130,6 +136,13 @@ def estimate_candidate_poses(
         if options.lifting and not is_confident and attempt < options.max_resampled_attempts:
             add_poses(replace(generator, seed=seed + attempt).generate_from_halves())
     return select_distinct_poses(poses, options.num_bundle_adjusted)
+
+
+def _discard_needless_focals(poses: Sequence[ScoredPose]) -> list[ScoredPose]:
+    """Discard poses whose estimated focal length hardly increases the support of the guess."""
+    support = max((pose.support for pose in poses if pose.focal_px is None), default=0.0)
+    min_support = MIN_FOCAL_SUPPORT_RATIO * support
+    return [pose for pose in poses if pose.focal_px is None or pose.support > min_support]
 
 
 def select_distinct_poses(

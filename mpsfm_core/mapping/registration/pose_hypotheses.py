@@ -4,7 +4,7 @@ A single PnP estimate is not enough: over a wide baseline, points lifted from un
 reprojection errors of many pixels. All correspondences score each hypothesis. Hypotheses come from
 four sources:
 
-* PnP of the image on the points of the scene,
+* PnP of the image on the points of the scene, also with unknown focal length,
 * reverse PnP: a registered image on the points that the new image lifts from its own depth,
 * the essential matrix of a verified pair, with the baseline length from depth,
 * the pose that a multi-view network predicts relative to a registered image.
@@ -15,12 +15,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Bool, Float64, PinholeCamera, Pose
+from mpsfm_core.data import Bool, Float64, MappingImage, PinholeCamera, Pose
 from mpsfm_core.geometry import compose, invert
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.mapping.options import RegistrationOptions
@@ -36,6 +36,14 @@ PNP_TRIALS = (100, 10_000)
 """Smallest and largest number of RANSAC trials of PnP. [COLMAP, reference]"""
 ESSENTIAL_TRIALS = (50, 500)
 """The same for the essential matrix: few, because other subsets of the matches follow. [ours]"""
+FOCAL_RANGE = (0.4, 10.0)
+"""Smallest and largest focal length to try, over the longer side of the image. [ours]"""
+MAX_FOCAL_DEVIATION = 3.0
+"""Largest deviation of a focal length to try, in standard deviations of its prior. [ours]"""
+MAX_FOCAL_CORRESPONDENCES = 200
+"""About how many correspondences choose between focal lengths; raising it is slower. [ours]"""
+FOCAL_STEP = 1.2
+"""Largest ratio of consecutive focal lengths to try. PnP tolerates half of such a step. [ours]"""
 
 
 class PoseHypothesis(NamedTuple):
@@ -47,6 +55,8 @@ class PoseHypothesis(NamedTuple):
     """(3,) ``cam_from_world``."""
     source: str
     """Name of the estimator."""
+    focal_px: float | None = None
+    """``fx`` that was estimated with the pose; None for that of the scene."""
 
 
 HypothesisEstimator = Callable[[], PoseHypothesis | None]
@@ -77,6 +87,42 @@ def estimate_absolute_pose(
     """
     if len(xy) < MIN_CORRESPONDENCES:
         return None
+    result = _run_pnp_ransac(colmap_from_pinhole(camera), xy, points, options, seed, refine=refine)
+    if result is None:
+        return None
+    rotation, translation = _pose_from_rigid3d(result["cam_from_world"])
+    return rotation, translation, np.asarray(result["inlier_mask"], dtype=np.bool_)
+
+
+def sample_focal_lengths(image: MappingImage) -> Float64:
+    """Sample focal lengths to try for an image, on a logarithmic grid around its prior.
+
+    Args:
+        image: The image; ``focal_prior_px`` and ``focal_log_std`` are its prior.
+
+    Returns:
+        (m,) ``fx`` in pixels, ascending, within ``MAX_FOCAL_DEVIATION`` and ``FOCAL_RANGE``.
+    """
+    prior_px, reach = image.focal_prior_px, MAX_FOCAL_DEVIATION * image.focal_log_std
+    min_px, max_px = np.array(FOCAL_RANGE) * max(image.camera.size)
+    min_px = max(min_px, prior_px * np.exp(-reach))
+    max_px = min(max_px, prior_px * np.exp(reach))
+    if not min_px < max_px:
+        return np.array([prior_px])
+    num_steps = int(np.ceil(np.log(max_px / min_px) / np.log(FOCAL_STEP)))
+    return np.geomspace(min_px, max_px, 1 + num_steps)
+
+
+def _run_pnp_ransac(
+    camera: pycolmap.Camera,
+    xy: Float64,
+    points: Float64,
+    options: RegistrationOptions,
+    seed: int,
+    *,
+    refine: bool,
+) -> dict[str, Any] | None:
+    """Run COLMAP's PnP in LO-RANSAC; None if it fails."""
     min_trials, max_trials = PNP_TRIALS
     ransac = pycolmap.RANSACOptions(
         max_error=options.max_error_px,
@@ -89,19 +135,17 @@ def estimate_absolute_pose(
     estimate = (
         pycolmap.estimate_and_refine_absolute_pose if refine else pycolmap.estimate_absolute_pose
     )
-    result = estimate(
-        xy,
-        points,
-        colmap_from_pinhole(camera),
-        pycolmap.AbsolutePoseEstimationOptions(ransac=ransac),
+    result: dict[str, Any] | None = estimate(
+        xy, points, camera, pycolmap.AbsolutePoseEstimationOptions(ransac=ransac)
     )
-    if result is None:
-        return None
-    pose = result["cam_from_world"]
+    return result
+
+
+def _pose_from_rigid3d(pose: pycolmap.Rigid3d) -> Pose:
+    """Convert a pose of COLMAP to rotation matrix and translation."""
     return (
         np.asarray(pose.rotation.matrix(), dtype=np.float64),
         np.asarray(pose.translation, dtype=np.float64),
-        np.asarray(result["inlier_mask"], dtype=np.bool_),
     )
 
 
@@ -123,6 +167,8 @@ class PoseHypothesisGenerator:
     def generate_from_all(self) -> Iterator[HypothesisEstimator]:
         """Generate estimators that use all matches, and all matches of each reference image."""
         yield self._estimate_pnp
+        if self.options.estimate_focal and self.scene.has_free_focal(self.image):
+            yield self._estimate_pnp_with_focal
         if not self.options.lifting:
             return
         references = set(self.correspondences.references.tolist())
@@ -165,6 +211,49 @@ class PoseHypothesisGenerator:
         xy = self.scene.keypoints[correspondences.keypoints]
         pose = self._solve_pnp(self.image, xy, correspondences.points)
         return PoseHypothesis(*pose, "PnP") if pose else None
+
+    def _estimate_pnp_with_focal(self) -> PoseHypothesis | None:
+        """Estimate pose and focal length by PnP on points that calibrated cameras triangulated.
+
+        PnP runs with each focal length of a logarithmic grid. The one with most inliers is refined
+        together with its pose.
+        """
+        scene, options, correspondences = self.scene, self.options, self.correspondences
+        is_determined = scene.has_determined_focal(correspondences.references)
+        correspondences = correspondences.select(correspondences.triangulated & is_determined)
+        count = len(correspondences.keypoints)
+        if count < options.min_inliers:
+            return None
+        step = max(1, count // MAX_FOCAL_CORRESPONDENCES)
+        correspondences = correspondences.select(np.arange(0, count, step))
+        xy, points = scene.keypoints[correspondences.keypoints], correspondences.points
+        pinhole = scene.camera(self.image)
+        focal_lengths = sample_focal_lengths(scene.problem.images[self.image])
+        best: tuple[pycolmap.Camera, dict[str, Any]] | None = None
+        for focal_px in focal_lengths:
+            camera = colmap_from_pinhole(
+                replace(pinhole, fx=focal_px, fy=focal_px * pinhole.fy / pinhole.fx)
+            )
+            result = _run_pnp_ransac(camera, xy, points, options, self.seed, refine=False)
+            if result and (best is None or result["num_inliers"] > best[1]["num_inliers"]):
+                best = camera, result
+        if best is None:
+            return None
+        camera, result = best
+        refined = pycolmap.refine_absolute_pose(
+            result["cam_from_world"],
+            xy,
+            points,
+            result["inlier_mask"],
+            camera,
+            pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=True),
+        )
+        min_px, max_px = focal_lengths[[0, -1]] * [1 / FOCAL_STEP, FOCAL_STEP]
+        focal_px = float(camera.params[0])  # the refinement changes the camera
+        if refined is None or not min_px <= focal_px <= max_px:
+            return None
+        pose = _pose_from_rigid3d(refined["cam_from_world"])
+        return PoseHypothesis(*pose, "PnP with unknown focal length", focal_px)
 
     def _estimate_reverse_pnp(self, reference: int) -> PoseHypothesis | None:
         """Estimate the pose of the reference by PnP on points lifted from the image's own prior.

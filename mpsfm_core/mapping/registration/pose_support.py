@@ -41,11 +41,13 @@ class ScoredPose:
     """Inliers; those of unknown depth count by their depth weight."""
     inlier_ratio: float
     """Weighted share of the correspondences that are inliers, in [0, 1]."""
+    focal_px: float | None = None
+    """``fx`` that was estimated with the pose; None for that of the scene."""
 
     @property
     def hypothesis(self) -> PoseHypothesis:
         """The pose without its support."""
-        return PoseHypothesis(self.rotation, self.translation, self.source)
+        return PoseHypothesis(self.rotation, self.translation, self.source, self.focal_px)
 
 
 def score_pose(
@@ -74,10 +76,13 @@ def score_pose(
     total = sum_per_reference(correspondences.weights)[best]
     inlier_weight = sum_per_reference(correspondences.weights * inlier)[best]
     return ScoredPose(
-        *hypothesis,
+        hypothesis.rotation,
+        hypothesis.translation,
+        hypothesis.source,
         float(support[best]),
         int(sum_per_reference(correspondences.depth_weights * inlier)[best]),
         float(inlier_weight / total) if total else 0.0,
+        hypothesis.focal_px,
     )
 
 
@@ -96,19 +101,20 @@ def maximize_support(
         return pose
     rotation, translation = refine_pose(
         (pose.rotation, pose.translation),
-        _get_intrinsics(scene, correspondences),
+        _get_intrinsics(scene, correspondences, pose.focal_px),
         _make_segments(scene, correspondences, options),
         scales=REFINEMENT_SCALES,
     )
-    refined = PoseHypothesis(rotation, translation, pose.source)
+    refined = PoseHypothesis(rotation, translation, pose.source, pose.focal_px)
     return score_pose(scene, correspondences, refined, options)
 
 
-def _get_intrinsics(scene: Scene, correspondences: PoseCorrespondences) -> Float64:
+def _get_intrinsics(
+    scene: Scene, correspondences: PoseCorrespondences, focal_px: float | None
+) -> Float64:
     """Return fx, fy, cx, cy of the image that the correspondences belong to."""
-    image = scene.graph.image_of[correspondences.keypoints[0]]
-    intrinsics: Float64 = scene.intrinsics[image]
-    return intrinsics
+    image = int(scene.graph.image_of[correspondences.keypoints[0]])
+    return scene.intrinsics_with_focal(image, focal_px)
 
 
 def _make_segments(
@@ -134,9 +140,8 @@ def _compute_residuals(
     if not len(correspondences.keypoints):
         return np.empty(0)
     segments = _make_segments(scene, correspondences, options)
-    distances_px, depths = measure_segments(
-        (pose.rotation, pose.translation), _get_intrinsics(scene, correspondences), segments
-    )
+    intrinsics = _get_intrinsics(scene, correspondences, pose.focal_px)
+    distances_px, depths = measure_segments((pose.rotation, pose.translation), intrinsics, segments)
     residuals = distances_px / segments.limit
     depth_residuals = _compute_depth_residuals(
         scene, correspondences, depths, residuals < 1, options

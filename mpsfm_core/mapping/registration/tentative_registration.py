@@ -100,12 +100,12 @@ class _TentativeRegistration:
         """Register an image, and scale its depth prior by points that are discarded afterwards."""
         scene, depth_map = self.scene, self.scene.maps[image]
         before = scene.snapshot()
-        scene.register(image, pose.rotation, pose.translation)
+        scene.register(image, pose.rotation, pose.translation, pose.focal_px)
         triangulate_image(scene, image, self._triangulation)
         self._refiner.estimate_scale(image, self._poses[image][0])
         scale = depth_map.scale if depth_map.active else self._median_scale
         scene.restore(before)
-        scene.register(image, pose.rotation, pose.translation)
+        scene.register(image, pose.rotation, pose.translation, pose.focal_px)
         depth_map.set_scale(scale)
 
     def _register_component(self, image: int, component: Reconstruction) -> None:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, PosedImage, SceneState
+from mpsfm_core.data.decisions import CameraReason, Reason
+from mpsfm_core.geometry.focal_length import compute_equivalent_mm
 from mpsfm_core.geometry.statistics import MAD_TO_STD
+from mpsfm_core.mapping.scene.focal_outcome import MIN_FOCAL_IMAGES, FocalOutcome
 from mpsfm_core.mapping.scene.reconstruction import MetricScale, Reconstruction, RegisteredImage
 from mpsfm_core.mapping.scene.scene import Scene
 
@@ -83,6 +86,7 @@ def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> R
     """
     image, depth_map = scene.problem.images[index], scene.maps[index]
     depth = depth_map.depth * np.float32(factor)
+    log_std = float(scene.focal_log_std[index])
     variance = (depth_map.log_std * depth) ** 2
     return RegisteredImage(
         index=index,
@@ -93,4 +97,28 @@ def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> R
         point_ids=scene.tracks.point_of[scene.graph.keypoints_of(index)].copy(),
         depth=DepthPrior.from_arrays(depth, variance, depth_map.valid, metric=in_metres),
         scale=depth_map.scale * factor,
+        focal_log_std=log_std if np.isfinite(log_std) else None,
+        focal_reason=_get_focal_reason(scene, index),
     )
+
+
+def _get_focal_reason(scene: Scene, index: int) -> Reason | None:
+    """Return why the focal length of an image is not refined; None if it is refined."""
+    if scene.problem.images[index].focal_known:
+        return CameraReason.KNOWN.because()
+    outcome = FocalOutcome(int(scene.focal_outcome[index]))
+    if outcome == FocalOutcome.REFINED:
+        return None
+    if outcome == FocalOutcome.NOT_OBSERVABLE:
+        std_ratio = round(float(scene.focal_log_std[index]), 4)
+        return CameraReason.NOT_OBSERVABLE.because(focal_length_std_ratio=std_ratio)
+    if outcome == FocalOutcome.OUT_OF_RANGE:
+        width, height = scene.problem.images[index].camera.size
+        equivalent_mm = compute_equivalent_mm(float(scene.focal_estimate_px[index]), width, height)
+        return CameraReason.OUT_OF_RANGE.because(equivalent_mm=round(equivalent_mm, 2))
+    num_images = int(scene.registered.sum())
+    if num_images < MIN_FOCAL_IMAGES:
+        return CameraReason.TOO_FEW_IMAGES.because(
+            num_images=num_images, min_images=MIN_FOCAL_IMAGES
+        )
+    return CameraReason.NOT_ESTIMATED.because()

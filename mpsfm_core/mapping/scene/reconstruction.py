@@ -34,6 +34,10 @@ class RegisteredImage:
     """World units per unit of the prior."""
     confirmed: bool = True
     """False if the image was registered tentatively, without verification."""
+    focal_log_std: float | None = None
+    """Posterior standard deviation of the log focal length; None if it was not estimated."""
+    focal_reason: Reason | None = None
+    """Why the focal length is not refined, a ``CameraReason``; None if it is refined."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.mapping.scene.depth_map import DepthMap
+from mpsfm_core.mapping.scene.focal_outcome import FocalOutcome
 from mpsfm_core.mapping.scene.graph import CorrespondenceGraph
 from mpsfm_core.mapping.scene.kernels import compute_max_triangulation_angles
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
@@ -27,6 +28,9 @@ class Snapshot(NamedTuple):
     xyz: Float64
     point_of: Int64
     maps: Sequence[tuple[float, bool, RefinedDepth | None]]
+    focal_outcome: Int64
+    focal_log_std: Float64
+    focal_estimate_px: Float64
 
 
 class Scene:
@@ -45,6 +49,10 @@ class Scene:
         intrinsics: (n, 4) float64 fx, fy, cx, cy of each image in pixels.
         camera_of: (n,) int64 camera of each image. Images with the same estimated focal length
             share a camera.
+        focal_outcome: (n,) int64 :class:`FocalOutcome` of the camera of each image.
+        focal_log_std: (n,) float64 posterior standard deviation of the log focal length, NaN if it
+            was not estimated.
+        focal_estimate_px: (n,) float64 estimate of ``fx``, also a refused one; NaN without one.
         depth_group_of: (n,) int64; images of a group have depth in the same unit and share the
             scale of their priors.
         keypoints: (k, 2) float64 keypoints of all images in pixels.
@@ -79,6 +87,9 @@ class Scene:
         self.rotations: Float64 = np.tile(np.eye(3), (count, 1, 1))
         self.translations: Float64 = np.zeros((count, 3))
         self.registered: Bool = np.zeros(count, dtype=np.bool_)
+        self.focal_outcome: Int64 = np.zeros(count, dtype=np.int64)
+        self.focal_log_std: Float64 = np.full(count, np.nan)
+        self.focal_estimate_px: Float64 = np.full(count, np.nan)
         self.tracks = Tracks(len(self.keypoints))
 
     @property
@@ -96,8 +107,24 @@ class Scene:
         chosen[images] = True
         return chosen
 
-    def register(self, image: int, rotation: Float64, translation: Float64) -> None:
-        """Register an image with a pose ``cam_from_world``."""
+    def register(
+        self,
+        image: int,
+        rotation: Float64,
+        translation: Float64,
+        focal_px: float | None = None,
+    ) -> None:
+        """Register an image with a pose ``cam_from_world``.
+
+        Args:
+            image: The image.
+            rotation: (3, 3) rotation.
+            translation: (3,) translation.
+            focal_px: ``fx`` that was estimated with the pose; None keeps the present one.
+        """
+        if focal_px is not None:
+            fx, fy, _, _ = self.intrinsics_with_focal(image, focal_px)
+            self.set_shared_focal(image, float(fx), float(fy))
         self.rotations[image], self.translations[image] = rotation, translation
         self.registered[image] = True
 
@@ -113,6 +140,30 @@ class Scene:
         size = self.problem.images[image].camera.size
         return PinholeCamera(*size, *map(float, self.intrinsics[image]))
 
+    def intrinsics_with_focal(self, image: int, focal_px: float | None) -> Float64:
+        """Return fx, fy, cx, cy of an image, with another ``fx`` and the same aspect ratio.
+
+        Args:
+            image: The image.
+            focal_px: ``fx`` in pixels; None keeps the present one.
+        """
+        intrinsics: Float64 = self.intrinsics[image].copy()
+        if focal_px is not None:
+            intrinsics[:2] *= focal_px / intrinsics[0]
+        return intrinsics
+
+    def has_free_focal(self, image: int) -> bool:
+        """Return whether a focal length is a guess that no registered image shares."""
+        shares_camera = self.camera_of == self.camera_of[image]
+        is_guess = not self.problem.images[image].focal_known
+        return is_guess and not bool((shares_camera & self.registered).any())
+
+    def has_determined_focal(self, images: Int64) -> Bool:
+        """Return (m,) bool, images (m,) whose focal length is known or refined."""
+        known = np.array([image.focal_known for image in self.problem.images], dtype=np.bool_)
+        determined: Bool = (known | (self.focal_outcome == FocalOutcome.REFINED))[images]
+        return determined
+
     def set_focal(self, image: int, fx: float, fy: float) -> None:
         """Set the focal length of one image, in pixels."""
         self.intrinsics[image, :2] = fx, fy
@@ -125,6 +176,22 @@ class Scene:
             shares_camera & (self.intrinsics[:, :2] != (fx, fy)).any(axis=1)
         ):
             self.set_focal(int(other), fx, fy)
+
+    def set_focal_outcome(
+        self, image: int, outcome: FocalOutcome, log_std: float, estimate_px: float
+    ) -> None:
+        """Record the outcome of self-calibration for all images that share a camera.
+
+        Args:
+            image: An image of the camera.
+            outcome: The decision.
+            log_std: Posterior standard deviation of the log focal length.
+            estimate_px: Estimate of ``fx``, also if it is refused.
+        """
+        shares_camera = self.camera_of == self.camera_of[image]
+        self.focal_outcome[shares_camera] = outcome
+        self.focal_log_std[shares_camera] = log_std
+        self.focal_estimate_px[shares_camera] = estimate_px
 
     def centers(self) -> Float64:
         """Return the camera centers (n, 3) in world coordinates."""
@@ -222,6 +289,9 @@ class Scene:
             self.maps[image.index].set_scale(image.scale)
             self.tracks.point_of[self.graph.keypoints_of(image.index)] = image.point_ids
             self.set_shared_focal(image.index, image.camera.fx, image.camera.fy)
+            if image.focal_log_std is not None and image.focal_reason is None:
+                outcome = FocalOutcome.REFINED
+                self.set_focal_outcome(image.index, outcome, image.focal_log_std, image.camera.fx)
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the state for :meth:`restore`."""
@@ -234,6 +304,9 @@ class Scene:
             self.tracks.xyz.copy(),
             self.tracks.point_of.copy(),
             maps,
+            self.focal_outcome.copy(),
+            self.focal_log_std.copy(),
+            self.focal_estimate_px.copy(),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -243,6 +316,9 @@ class Scene:
         self.registered = snapshot.registered.copy()
         for image in np.flatnonzero((self.intrinsics != snapshot.intrinsics).any(axis=1)):
             self.set_focal(int(image), *map(float, snapshot.intrinsics[image, :2]))
+        self.focal_outcome = snapshot.focal_outcome.copy()
+        self.focal_log_std = snapshot.focal_log_std.copy()
+        self.focal_estimate_px = snapshot.focal_estimate_px.copy()
         self.tracks.xyz = snapshot.xyz.copy()
         self.tracks.point_of = snapshot.point_of.copy()
         for depth_map, (scale, active, refined) in zip(self.maps, snapshot.maps, strict=True):
