@@ -19,7 +19,7 @@ What :func:`reconstruct` does, compared with COLMAP's ``IncrementalMapper``::
                 refine locally; refine globally if the model has grown
             component.reregister_images()               # misregistered images, elsewhere
             component.finalize()                        # global refinement, depth check of all
-        stop if enough matches are explained
+        stop if enough matches are explained and no guessed focal length was far off
     select the run that explains the most matches
     register the remaining images tentatively           # if the options ask for it
 """
@@ -37,6 +37,7 @@ from mpsfm_core.mapping.component import Component, do_nothing
 from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.events import MappingEvents, NullMappingEvents
 from mpsfm_core.mapping.initialization.initial_pair import InitialPairSelector
+from mpsfm_core.mapping.initialization.refined_focal_lengths import apply_refined_focal_lengths
 from mpsfm_core.mapping.model_selection import (
     MapperRun,
     compute_explained_ratios,
@@ -62,9 +63,10 @@ def reconstruct(
 ) -> MappingResult:
     """Reconstruct poses, points and refined depth of all images that can be verified.
 
-    If many matches remain unexplained, the mapper runs again with other seeds and the run that
-    explains most of them is kept. The same problem, options and machine give the same bits, also
-    if an interrupted run continues from a checkpoint.
+    If many matches remain unexplained, the mapper runs again with other seeds. If guessed focal
+    lengths were far off, it runs again from the refined ones. The run that explains most matches is
+    kept. The same problem, options and machine give the same bits, also if an interrupted run
+    continues from a checkpoint.
 
     Args:
         problem: Images with priors, and verified matches.
@@ -81,10 +83,13 @@ def reconstruct(
     runs, interrupted = checkpointer.load()
     is_complete = bool(runs) and interrupted is None
     reweighted_problem = None
+    initial_problem = problem
+    for run in runs:  # each completed run may have refined focal lengths
+        initial_problem = _apply_refined_focals(initial_problem, run, options) or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):
         if interrupted is None:
             run_options = options.model_copy(update={"seed": options.seed + number})
-            mapper = Mapper(problem, run_options, events, reweighted_problem)
+            mapper = Mapper(initial_problem, run_options, events, reweighted_problem)
         else:
             assert isinstance(interrupted, Mapper)
             mapper, interrupted = interrupted, None
@@ -94,7 +99,12 @@ def reconstruct(
 
         runs.append(mapper.run(save_checkpoint))
         reweighted_problem = mapper.reweighted_problem
-        if mapper.is_deterministic or is_settled(runs, options.enough_explained):
+        if mapper.is_deterministic:
+            break
+        refined_problem = _apply_refined_focals(initial_problem, runs[-1], options)
+        if refined_problem is not None:
+            initial_problem, reweighted_problem = refined_problem, None
+        elif is_settled(runs, options.enough_explained):
             break
     checkpointer.save_completed(runs)
     selected = select_run(runs, options.consistency)
@@ -102,6 +112,16 @@ def reconstruct(
     if models and options.register_tentatively:
         models[0] = register_tentatively(models[0], models[1:], problem, options)
     return MappingResult(tuple(models), sum_run_times(selected.report, runs))
+
+
+def _apply_refined_focals(
+    problem: MappingProblem, run: MapperRun, options: MapperOptions
+) -> MappingProblem | None:
+    """Return the problem with the focal lengths of a run; None if they changed little."""
+    if not run.models or not options.refinement.refine_focal:
+        return None
+    refined = apply_refined_focal_lengths(problem, run.models[0], options.seed)
+    return None if refined is None else canonicalize(refined)
 
 
 class Mapper:

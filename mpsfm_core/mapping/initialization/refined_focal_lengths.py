@@ -1,0 +1,85 @@
+"""Refined focal lengths: a run that corrects guesses by much initializes the next run."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import MappingProblem, VerifiedPair
+from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+
+MIN_FOCAL_CHANGE = 1.1
+"""Ratio of refined and initial focal length from which the initial one has bent the relative poses
+of pairs, and the model that was built from them. [ours]"""
+MAX_ERROR_PX = 4.0
+"""Largest Sampson error of an inlier of the essential matrix. [COLMAP two-view max_error]"""
+MIN_INLIER_RATIO = 0.25
+"""Inlier ratio from which RANSAC computes its number of trials. [COLMAP two-view min_inlier_ratio]
+"""
+
+
+def apply_refined_focal_lengths(
+    problem: MappingProblem, model: Reconstruction, seed: int
+) -> MappingProblem | None:
+    """Return the problem with the refined focal lengths of a model, and new relative poses.
+
+    The priors of the focal lengths keep their means. Each pair of an image whose focal length
+    changes gets the relative pose of an essential matrix of all its matches.
+
+    Args:
+        problem: The problem that was reconstructed.
+        model: Its largest component.
+        seed: Seed of RANSAC.
+
+    Returns:
+        None if no focal length changed by ``MIN_FOCAL_CHANGE`` or more.
+    """
+    cameras = {
+        problem.images[image.index].camera: image.camera
+        for image in model.images
+        if image.focal_log_std is not None
+        and image.focal_reason is None
+        and abs(np.log(image.camera.fx / problem.images[image.index].camera.fx))
+        >= np.log(MIN_FOCAL_CHANGE)
+    }
+    if not cameras:
+        return None
+    images = tuple(
+        image
+        if image.focal_known or image.camera not in cameras
+        else replace(image, camera=cameras[image.camera], focal_guess_px=image.focal_prior_px)
+        for image in problem.images
+    )
+    changed = [new is not old for new, old in zip(images, problem.images, strict=True)]
+    refined = replace(problem, images=images)
+    pairs = tuple(
+        _estimate_relative_pose(refined, pair, seed)
+        if changed[pair.image_a] or changed[pair.image_b]
+        else pair
+        for pair in problem.pairs
+    )
+    return replace(refined, pairs=pairs)
+
+
+def _estimate_relative_pose(problem: MappingProblem, pair: VerifiedPair, seed: int) -> VerifiedPair:
+    """Return a pair with the relative pose of an essential matrix; unchanged if RANSAC fails."""
+    image_a, image_b = problem.images[pair.image_a], problem.images[pair.image_b]
+    result = pycolmap.estimate_essential_matrix(
+        image_a.keypoints[pair.matches[:, 0]],
+        image_b.keypoints[pair.matches[:, 1]],
+        colmap_from_pinhole(image_a.camera),
+        colmap_from_pinhole(image_b.camera),
+        pycolmap.RANSACOptions(
+            max_error=MAX_ERROR_PX * max(image_a.keypoint_std_px, image_b.keypoint_std_px),
+            min_inlier_ratio=MIN_INLIER_RATIO,
+            random_seed=seed,
+        ),
+    )
+    if result is None:
+        return pair
+    pose = result["cam2_from_cam1"]
+    rotation = np.array(pose.rotation.matrix(), order="C")
+    return replace(pair, rotation=rotation, translation=np.array(pose.translation))

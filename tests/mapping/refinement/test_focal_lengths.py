@@ -1,0 +1,121 @@
+"""Self-calibration: guessed focal lengths are refined camera by camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.data.decisions import CameraReason
+from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.mapping.mapper import reconstruct
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.refinement.focal_lengths import decide_focal_outcome
+from mpsfm_core.mapping.scene.conversion import convert_scene
+from mpsfm_core.mapping.scene.focal_outcome import FocalOutcome
+from tests.mapping.focal_scenes import (
+    CAMERA,
+    POSES,
+    guess_focals,
+    make_room,
+    register_true_poses,
+    scale_focal,
+)
+
+
+@pytest.fixture(scope="module")
+def room() -> MappingProblem:
+    return make_room()
+
+
+@pytest.mark.parametrize(
+    "factors",
+    [(1.6,) * 5, (0.55,) * 5, (2.5,) * 5, (1.7, 0.6, 1.3, 0.8, 1.01)],
+    ids=["shared long", "shared short", "shared very long", "one camera per image"],
+)
+def test_reconstruct_with_wrong_focal_lengths_refines_all(
+    room: MappingProblem, factors: Sequence[float]
+) -> None:
+    model = reconstruct(guess_focals(room, factors)).reconstructions[0]
+    assert len(model.images) == 5
+    for image in model.images:
+        assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
+        assert image.focal_reason is None
+        assert image.focal_log_std is not None and 0 < image.focal_log_std < 0.01
+        for other in model.images:
+            relative = image.rotation @ other.rotation.T
+            true_relative = POSES[image.index][:, :3] @ POSES[other.index][:, :3].T
+            assert rotation_angle_deg(relative @ true_relative.T) < 0.5
+
+
+def test_reconstruct_with_known_focal_lengths_keeps_them(room: MappingProblem) -> None:
+    for image in reconstruct(room).reconstructions[0].images:
+        assert image.camera == CAMERA
+        assert image.focal_reason == CameraReason.KNOWN.because()
+        assert image.focal_log_std is None
+
+
+def test_reconstruct_without_refinement_keeps_guesses(room: MappingProblem) -> None:
+    options = MapperOptions.model_validate({"max_runs": 1, "refinement": {"refine_focal": False}})
+    problem = guess_focals(room, [1.02] * 5)
+    for image in reconstruct(problem, options).reconstructions[0].images:
+        assert image.camera == problem.images[0].camera
+        assert image.focal_reason == CameraReason.NOT_ESTIMATED.because()
+
+
+def test_convert_scene_of_two_images_gives_too_few_images(room: MappingProblem) -> None:
+    scene = register_true_poses(guess_focals(room, [1.02] * 5), range(2)).scene
+    reason = convert_scene(scene).images[0].focal_reason
+    assert reason == CameraReason.TOO_FEW_IMAGES.because(num_images=2, min_images=3)
+
+
+def test_adjust_with_implausible_camera_refines_the_others(room: MappingProblem) -> None:
+    """The view of one image is enlarged 40 times: no lens has its focal length."""
+    last = room.images[4]
+    center = np.array([CAMERA.cx, CAMERA.cy])
+    enlarged = replace(
+        last,
+        keypoints=center + 40 * (last.keypoints - center),
+        camera=scale_focal(CAMERA, 40),
+        keypoint_std_px=40 * last.keypoint_std_px,
+        focal_known=False,
+    )
+    guess = scale_focal(CAMERA, 1.02)
+    images = [replace(image, camera=guess, focal_known=False) for image in room.images[:4]]
+    component = register_true_poses(replace(room, images=(*images, enlarged)))
+    component.refiner.adjust(list(range(5)), focal=True)
+    scene = component.scene
+    assert scene.intrinsics[4, 0] == enlarged.camera.fx
+    assert scene.focal_outcome.tolist() == [FocalOutcome.REFINED] * 4 + [FocalOutcome.OUT_OF_RANGE]
+    assert scene.intrinsics[:4, 0] == pytest.approx(CAMERA.fx, rel=0.005)
+    reason = convert_scene(scene).images[4].focal_reason
+    assert reason is not None and reason.code == CameraReason.OUT_OF_RANGE
+    assert reason.values["equivalent_mm"] == pytest.approx(40 * 520 / 800 * 43.27, rel=0.1)
+
+
+def test_adjust_with_narrow_prior_keeps_the_guess(room: MappingProblem) -> None:
+    component = register_true_poses(guess_focals(room, [1.02] * 5, log_std=1e-4))
+    component.refiner.adjust(list(range(5)), focal=True)
+    assert (component.scene.intrinsics[:, 0] == 1.02 * CAMERA.fx).all()
+    for image in convert_scene(component.scene).images:
+        assert image.focal_reason is not None
+        assert image.focal_reason.code == CameraReason.NOT_OBSERVABLE
+
+
+@pytest.mark.parametrize(
+    ("equivalent_mm", "posterior_std", "prior_std", "expected"),
+    [
+        (7.9, 0.01, 0.7, FocalOutcome.OUT_OF_RANGE),
+        (801.0, 0.01, 0.7, FocalOutcome.OUT_OF_RANGE),
+        (28.0, 0.4, 0.7, FocalOutcome.NOT_OBSERVABLE),
+        (28.0, np.inf, 0.7, FocalOutcome.NOT_OBSERVABLE),
+        (28.0, 0.04, 0.1, FocalOutcome.REFINED),
+    ],
+)
+def test_decide_focal_outcome_by_range_and_information(
+    equivalent_mm: float, posterior_std: float, prior_std: float, expected: FocalOutcome
+) -> None:
+    assert decide_focal_outcome(equivalent_mm, posterior_std, prior_std) == expected
