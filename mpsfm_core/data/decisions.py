@@ -49,8 +49,8 @@ class ImageReason(ReasonCode):
     LOW_INLIER_RATIO = ("low-inlier-ratio", "inlier_ratio", "min_inlier_ratio")
     TOO_FEW_POINTS_AFTER_REFINEMENT = ("too-few-points-after-refinement",)
     LOST_POINTS = ("lost-points", "step")
-    """The image lost its 3D points in ``step``: local-refinement, global-refinement or
-    re-registration."""
+    """The image lost its 3D points in ``step``: local-refinement, global-refinement,
+    re-registration or component-split."""
     CONTRADICTS_IMAGE = ("contradicts-image", "violation_ratio", "other_image")
     """The depth of another image contradicts the pose at the ratio ``violation_ratio`` of
     pixels."""
@@ -63,6 +63,12 @@ class ImageReason(ReasonCode):
     CONTRADICTED_BY_IMAGES = ("contradicted-by-images", "num_images")
     MISREGISTERED = ("misregistered", "num_matches")
     """By ``num_matches``, more matches contradict the pose than support the pose."""
+    SPLIT_OFF = ("split-off", "num_matches")
+    """One pair connects the image to the model, and ``num_matches`` more matches contradict the
+    connection."""
+    DISCONNECTED = ("disconnected", "step")
+    """After ``step``, no chain of common points connects the image to the largest part of the
+    model."""
     CONNECTED_BY_DROPPED_IMAGE = ("connected-by-dropped-image", "step")
     COMPONENT_TOO_SMALL = ("component-too-small", "num_images", "min_images")
     COMPONENT_LIMIT = ("component-limit", "max_components")

@@ -248,8 +248,9 @@ class Component:
         """Deregister misregistered images and register them with other references.
 
         The change is kept if no image is lost, more matches are explained, and the images are no
-        longer misregistered. Each set of images is tried once. Images with a known pose stay,
-        unless that pose is only an initial guess.
+        longer misregistered. Each set of images is tried once. If that fails, a group that one
+        pair connects and several contradict is split off. Images with a known pose stay, unless
+        that pose is only an initial guess.
 
         Args:
             candidates: (n,) bool, images that may be registered.
@@ -272,7 +273,21 @@ class Component:
             self.maintenance.restore(before)
             for image in lost:
                 self._event_log.registered(image, self.size)
+            if detection.splits:
+                self._split_off(detection)
+                detections = self._detect_misregistrations()
             self._event_log.scene_changed(self.scene)
+
+    def _split_off(self, detection: Misregistration) -> None:
+        """Deregister images that one pair connects and several contradict.
+
+        They may form another component.
+        """
+        reason = ImageReason.SPLIT_OFF.because(num_matches=int(detection.margin))
+        self.maintenance.deregister(list(detection.images), reason)
+        reason = ImageReason.LOST_POINTS.because(step="component-split")
+        self.maintenance.deregister(find_lost_images(self.scene), reason)
+        self.maintenance.refine_globally()
 
     def _find_deregistered(self, before: ModelState) -> list[int]:
         """Return the images that were registered in an earlier state and are not now."""

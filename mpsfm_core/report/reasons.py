@@ -117,6 +117,17 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "{num_matches} more matches contradict its pose than support it.",
         _CHECK_MATCHES,
     ),
+    ImageReason.SPLIT_OFF: (
+        "connected by one contradicted pair",
+        "Only one pair of photos connected it to the model, and {num_matches} more matches "
+        "contradict that pair.",
+        _CHECK_MATCHES,
+    ),
+    ImageReason.DISCONNECTED: (
+        "no points in common with the model",
+        "After the {step}, it had no points in common with the largest part of the model.",
+        _ADD_OVERLAP,
+    ),
     ImageReason.CONNECTED_BY_DROPPED_IMAGE: (
         "connected only by a removed photo",
         "Only a photo that was removed in the {step} connected it to the model.",
@@ -308,6 +319,7 @@ _STEPS = (
     "local-refinement",
     "global-refinement",
     "re-registration",
+    "component-split",
     "global-initialization",
     "final-check",
 )

@@ -18,7 +18,12 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+from scipy.sparse.csgraph import (
+    breadth_first_order,
+    connected_components,
+    maximum_flow,
+    minimum_spanning_tree,
+)
 
 from mpsfm_core.data import Bool, Int64
 from mpsfm_core.mapping.scene.scene import Scene
@@ -40,6 +45,22 @@ class Misregistration(NamedTuple):
     """(k, 2) pairs of one of them and another image whose matches support the present poses."""
     margin: int
     """Number of contradicting matches minus number of supporting matches."""
+    splits: bool = False
+    """True if one pair connects the images to the model and several contradict it. The images then
+    leave the model if they cannot be registered in another pose."""
+
+
+class ContradictedCut(NamedTuple):
+    """Cut of the model whose matches mostly contradict the poses."""
+
+    inside: Bool
+    """(n,) bool, images of the smaller part."""
+    margin: int
+    """Number of contradicting matches minus number of explained matches across the cut."""
+    num_supporting_pairs: int
+    """Pairs across the cut with explained matches."""
+    num_contradicting_pairs: int
+    """Pairs across the cut whose matches contradict the poses."""
 
 
 def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistration]:
@@ -61,15 +82,21 @@ def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistrat
     capacities = csr_array(explained.astype(np.int32))
     detected: dict[tuple[int, ...], Misregistration] = {}
 
-    def add(inside: Bool, margin: int) -> None:
+    def add(inside: Bool, margin: int, splits: bool = False) -> None:
         images = tuple(map(int, np.flatnonzero(inside)))
-        if images not in detected or detected[images].margin < margin:
-            outside = scene.registered & ~inside
-            pairs = np.argwhere(is_explained & inside[:, None] & outside)
-            detected[images] = Misregistration(images, pairs, margin)
+        previous = detected.get(images)
+        if previous is not None:
+            margin, splits = max(margin, previous.margin), splits or previous.splits
+        outside = scene.registered & ~inside
+        pairs = np.argwhere(is_explained & inside[:, None] & outside)
+        detected[images] = Misregistration(images, pairs, margin, splits)
 
     for image, margin in _find_contradicted_images(scene.registered, contradicting, explained):
         add(scene.mask([image]), margin)
+    for cut in find_contradicted_cuts(scene.registered, contradicting, explained):
+        is_group = bool(np.count_nonzero(cut.inside) > 1)
+        has_one_link = cut.num_supporting_pairs == 1 and cut.num_contradicting_pairs > 1
+        add(cut.inside, cut.margin, splits=is_group and has_one_link)
     for a, b in np.argwhere(np.triu(separating > compute_widest_paths(explained))):
         flow = maximum_flow(capacities, int(a), int(b))
         margin = int(separating[a, b] - flow.flow_value)
@@ -142,6 +169,44 @@ def _find_contradicted_images(
     std = np.sqrt((contradicting**2 + explained**2).sum(axis=1))
     images = np.flatnonzero(margin > MIN_SIGNIFICANCE * std)
     return [(int(image), int(margin[image])) for image in images]
+
+
+def find_contradicted_cuts(
+    registered: Bool, contradicting: Int64, explained: Int64
+) -> list[ContradictedCut]:
+    """Find parts of the model that the matches across their cut mostly contradict.
+
+    Candidates are the cuts at the edges of the maximum spanning tree of explained matches. A part
+    that one pair connects to the model is among them. All pairs across a cut count.
+
+    Args:
+        registered: (n,) bool.
+        contradicting: (n, n) unexplained matches of contradicting pairs.
+        explained: (n, n) explained matches.
+    """
+    images = np.flatnonzero(registered)
+    explained = explained[np.ix_(images, images)]
+    contradicting = contradicting[np.ix_(images, images)]
+    costs = np.where(explained > 0, 1.0 / np.maximum(explained, 1), 0)
+    edges = np.argwhere(minimum_spanning_tree(csr_array(costs)).toarray() > 0)
+    cuts = []
+    for row, (node, _) in enumerate(edges):
+        others = np.delete(edges, row, axis=0)
+        forest = csr_array((np.ones(len(others)), others.T), shape=explained.shape)
+        part_of = connected_components(forest, directed=False)[1]
+        inside = part_of == part_of[node]
+        if 2 * inside.sum() > len(images):
+            inside = ~inside
+        across = np.ix_(inside, ~inside)
+        margin = int(contradicting[across].sum() - explained[across].sum())
+        std = np.sqrt((contradicting[across] ** 2 + explained[across] ** 2).sum())
+        if margin > MIN_SIGNIFICANCE * std:
+            smaller_part = np.zeros_like(registered)
+            smaller_part[images[inside]] = True
+            num_supporting = int(np.count_nonzero(explained[across]))
+            num_contradicting = int(np.count_nonzero(contradicting[across]))
+            cuts.append(ContradictedCut(smaller_part, margin, num_supporting, num_contradicting))
+    return cuts
 
 
 def _count_separating_matches(registered: Bool, contradicting: Int64) -> Int64:

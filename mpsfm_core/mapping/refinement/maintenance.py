@@ -97,7 +97,7 @@ class ModelMaintenance:
             self.refine_globally()
 
     def refine_globally(self, *, final: bool = False) -> None:
-        """Refine all images and points; deregister images that lose their points.
+        """Refine all images and points; deregister images without points or connection.
 
         Args:
             final: Sharpen the depth loss (paper, robust reconstruction).
@@ -111,6 +111,7 @@ class ModelMaintenance:
         self._last_size = self.size, len(self.scene.tracks)
         reason = ImageReason.LOST_POINTS.because(step="global-refinement")
         self.deregister(find_lost_images(self.scene), reason)
+        self.deregister_disconnected(ImageReason.DISCONNECTED.because(step="global-refinement"))
         self.event_log.scene_changed(self.scene)
 
     def check_all_images(self, max_violations: float, step: str) -> None:
@@ -132,6 +133,16 @@ class ModelMaintenance:
         if conflicting:
             reason = ImageReason.CONNECTED_BY_DROPPED_IMAGE.because(step=step)
             self.deregister(find_disconnected_images(self.scene), reason)
+
+    def deregister_disconnected(self, reason: Reason) -> None:
+        """Deregister images that no chain of points connects to the largest part of the model.
+
+        Images with known poses stay, because these poses connect them, unless they are a guess.
+        """
+        has_pose = np.array([image.known_pose is not None for image in self.problem.images])
+        stays = has_pose & (self.options.known_poses != "guess")
+        disconnected = find_disconnected_images(self.scene)
+        self.deregister([image for image in disconnected if not stays[image]], reason)
 
     def check_depth(self, image: int, max_violations: float) -> Reason | None:
         """Check the depth of a new image against the images that it overlaps (paper 3.4).

@@ -17,6 +17,7 @@ from mpsfm_core.mapping.consistency.misregistration import (
     compute_widest_paths,
     count_pair_matches,
     detect_misregistrations,
+    find_contradicted_cuts,
 )
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
@@ -55,7 +56,7 @@ def test_pair_with_more_matches_than_minimum_cut_is_detected(
     matches = explained + symmetric(5, {(0, 3): 150, (1, 4): 90})
     (detected,) = detect(matches, explained, np.ones(5, np.bool_), monkeypatch)
     assert detected.images == (3, 4)
-    assert detected.margin == 150 - 70
+    assert detected.margin == 150 + 90 - 70
     assert detected.supporting_pairs.tolist() == [[3, 2], [4, 2]]
 
 
@@ -76,6 +77,22 @@ def test_unregistered_image_separates_two_images_that_it_matches(
     registered = np.array([True, True, True, True, False])
     (detected,) = detect(matches, explained, registered, monkeypatch)
     assert (detected.images, detected.margin) == ((3,), 40)
+
+
+def test_contradicted_cut_at_the_only_supporting_pair_is_found() -> None:
+    """One pair connects 3 and 4 to the others; several pairs across contradict it."""
+    explained = symmetric(5, {(0, 1): 200, (1, 2): 200, (0, 2): 150, (3, 4): 300, (2, 3): 140})
+    contradicting = symmetric(5, {(0, 3): 110, (1, 4): 90, (0, 4): 80})
+    (cut,) = find_contradicted_cuts(np.ones(5, np.bool_), contradicting, explained)
+    assert np.flatnonzero(cut.inside).tolist() == [3, 4]
+    assert cut.margin == 280 - 140
+    assert (cut.num_supporting_pairs, cut.num_contradicting_pairs) == (1, 3)
+
+
+def test_cut_with_more_supporting_matches_is_ignored() -> None:
+    explained = symmetric(5, {(0, 1): 200, (1, 2): 200, (3, 4): 300, (2, 3): 140, (1, 3): 90})
+    contradicting = symmetric(5, {(0, 3): 110, (1, 4): 90})
+    assert find_contradicted_cuts(np.ones(5, np.bool_), contradicting, explained) == []
 
 
 def test_image_whose_pairs_together_contradict_it_is_detected(
