@@ -1,0 +1,222 @@
+"""Photos of unknown cameras with the default configuration: ours and COLMAP's defaults.
+
+    python -m benchmarks.real_photos [SET ...] [--photos FOLDER] [--seeds 1] [--without-colmap]
+        [--set KEY=VALUE ...] [--output FILE] [--json]
+
+Each set is a folder with ``images/`` and, if there is a reference, a COLMAP model ``gt/``. No
+intrinsics are given. COLMAP uses SIFT, all pairs, the incremental mapper and one SIMPLE_RADIAL
+camera per image. Pose AUC counts all pairs; an unregistered image has an error of 180 degrees.
+Rotation errors are those after alignment to the image with the smallest median error. Camera
+centers are compared with GPS after a similarity transform, horizontally. ``--json`` prints one JSON
+object as the last line.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from benchmarks._scenes import percent
+from mpsfm_core.api import reconstruct
+from mpsfm_core.data import Float64, Pose
+from mpsfm_core.data.errors import MpsfmError
+from mpsfm_core.evaluation.alignment import umeyama
+from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
+from mpsfm_core.geometry import camera_center, rotation_angle_deg
+from mpsfm_core.inputs.gps import convert_to_enu, read_gps
+from mpsfm_core.inputs.models import reconstruction_poses
+
+SETS = ("sacre_coeur", "mobilebrick", "lund_door", "seneca")
+CONVENTION = CONVENTIONS["paper"]
+MAX_ROTATION_DEG = 2.0
+"""Largest rotation error of a correct image. [ours]"""
+MIN_GPS_POSITIONS = 4
+"""Smallest number of GPS positions that are compared: three fit a similarity transform. [ours]"""
+NUM_GPS_ITERATIONS = 20
+"""Iterations of the trimmed fit to GPS. [ours]"""
+
+
+def main() -> None:
+    """Parse the command line and run."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("sets", nargs="*", default=list(SETS), metavar="SET")
+    parser.add_argument("--photos", type=Path, default=Path("../shared/photos"))
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--without-colmap", action="store_true")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides")
+    parser.add_argument("--output", type=Path, help="also write the table to this file")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    rows = []
+    for name in arguments.sets:
+        folder = arguments.photos / name
+        methods = [f"seed {seed}" for seed in range(arguments.seeds)]
+        for method in [*methods, *([] if arguments.without_colmap else ["COLMAP"])]:
+            start = time.perf_counter()
+            if method == "COLMAP":
+                models = reconstruct_with_colmap(folder / "images")
+            else:
+                seed = f"runtime.seed={method.split()[1]}"
+                models = reconstruct_with_defaults(folder / "images", [seed, *arguments.overrides])
+            row = {"set": name, "method": method, **measure(models, folder)}
+            row["seconds"] = time.perf_counter() - start
+            rows.append(row)
+            print(json.dumps(row), file=sys.stderr, flush=True)
+    text = format_table(rows)
+    print(text)
+    if arguments.output:
+        arguments.output.write_text(text + "\n", encoding="utf-8")
+    if arguments.json:
+        print(json.dumps({"rows": rows}))
+
+
+def reconstruct_with_defaults(
+    images: Path, overrides: Sequence[str]
+) -> list[pycolmap.Reconstruction]:
+    """Return the models of ``mpsfm reconstruct IMAGES``, largest first; empty if it fails."""
+    offline = ["runtime.offline=true", "dense.enabled=false"]
+    try:
+        result = reconstruct(images, overrides=[*offline, *overrides])
+    except MpsfmError as error:
+        print(f"{images}: {error}", file=sys.stderr)
+        return []
+    return [result.model, *result.further_models]
+
+
+def reconstruct_with_colmap(images: Path) -> list[pycolmap.Reconstruction]:
+    """Return the models of COLMAP's incremental mapper with SIFT and all pairs, largest first."""
+    with tempfile.TemporaryDirectory(prefix="mpsfm-colmap-") as folder:
+        database = Path(folder) / "database.db"
+        pycolmap.set_random_seed(0)
+        pycolmap.extract_features(
+            database,
+            images,
+            reader_options=pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL"),
+            extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False),
+        )
+        pycolmap.match_exhaustive(
+            database, matching_options=pycolmap.FeatureMatchingOptions(use_gpu=False)
+        )
+        options = pycolmap.IncrementalPipelineOptions()
+        options.random_seed = 0
+        models = pycolmap.incremental_mapping(database, images, folder, options)
+        return sorted(models.values(), key=lambda model: -model.num_reg_images())
+
+
+def measure(models: Sequence[pycolmap.Reconstruction], folder: Path) -> dict[str, Any]:
+    """Measure registered images, pose AUC, rotation, focal and distortion errors, GPS residual.
+
+    Args:
+        models: Models of the set, largest first; errors are those of the first one.
+        folder: Folder of the set.
+    """
+    names = sorted(path.name for path in (folder / "images").iterdir())
+    row: dict[str, Any] = {
+        "images": len(names),
+        "registered": [model.num_reg_images() for model in models],
+    }
+    if not models:
+        return row
+    poses = reconstruction_poses(models[0])
+    cameras = {image.name: image.camera for image in models[0].images.values() if image.has_pose}
+    row["distortion"] = float(np.median([get_distortion(camera) for camera in cameras.values()]))
+    row["gps_median_m"] = measure_gps_residual(poses, folder / "images")
+    if not (folder / "gt").is_dir():
+        return row
+    reference = pycolmap.Reconstruction(folder / "gt")
+    true_poses = reconstruction_poses(reference)
+    true_cameras = {image.name: image.camera for image in reference.images.values()}
+    area = pose_auc(pose_errors_deg(poses, true_poses, CONVENTION), CONVENTION)
+    rotation_errors = measure_rotation_errors_deg(poses, true_poses)
+    focal_errors = np.array(
+        [
+            cameras[name].mean_focal_length() / true_cameras[name].mean_focal_length() - 1
+            for name in cameras
+            if name in true_cameras
+        ]
+    )
+    true_distortion = np.median([get_distortion(camera) for camera in true_cameras.values()])
+    return row | {
+        "auc_percent": percent(area),
+        "num_correct": int((rotation_errors < MAX_ROTATION_DEG).sum()),
+        "max_rotation_deg": float(rotation_errors.max(initial=0.0)),
+        "focal_median_error": float(np.median(np.abs(focal_errors))),
+        "focal_max_error": float(np.abs(focal_errors).max()),
+        "true_distortion": float(true_distortion),
+    }
+
+
+def measure_rotation_errors_deg(
+    poses: Mapping[str, Pose], true_poses: Mapping[str, Pose]
+) -> Float64:
+    """Measure rotation errors (n,) after alignment to the image with the smallest median error."""
+    world_rotations = np.stack(
+        [poses[name][0].T @ true_poses[name][0] for name in true_poses if name in poses]
+    )
+    differences = world_rotations[:, None].transpose(0, 1, 3, 2) @ world_rotations[None]
+    errors = rotation_angle_deg(differences)
+    aligned: Float64 = errors[np.median(errors, axis=1).argmin()]
+    return aligned
+
+
+def measure_gps_residual(poses: Mapping[str, Pose], images: Path) -> float | None:
+    """Measure the median horizontal distance of camera centers to GPS, in meters.
+
+    The similarity transform is a least-squares fit to the half of the images with the smaller
+    residuals. None if fewer than ``MIN_GPS_POSITIONS`` images have a position.
+    """
+    positions = {name: read_gps((images / name).read_bytes()) for name in poses}
+    known = {name: position for name, position in positions.items() if position is not None}
+    if len(known) < MIN_GPS_POSITIONS:
+        return None
+    measured = np.nan_to_num(convert_to_enu(list(known.values()), next(iter(known.values()))))
+    centers = np.stack([camera_center(*poses[name]) for name in known])
+    is_used = np.ones(len(known), dtype=np.bool_)
+    residuals = np.zeros(len(known))
+    for _ in range(NUM_GPS_ITERATIONS):
+        aligned = umeyama(centers[is_used], measured[is_used]).apply(centers)
+        residuals = np.linalg.norm((aligned - measured)[:, :2], axis=1)
+        is_used = residuals <= np.median(residuals)
+    return float(np.median(residuals))
+
+
+def get_distortion(camera: pycolmap.Camera) -> float:
+    """Return the first radial coefficient, 0 for a pinhole camera."""
+    extra = list(camera.extra_params_idxs())
+    return float(camera.params[extra[0]]) if extra else 0.0
+
+
+def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Format a Markdown table with one line per run."""
+    lines = [
+        "| set | method | registered | AUC@1/5/20 | within 2 deg | max. rotation error, deg "
+        "| focal error, median / max. | k1 (reference) | GPS median, m | s |",
+        "|---" * 10 + "|",
+    ]
+    for row in rows:
+        registered = " + ".join(map(str, row["registered"])) or "0"
+        cells = [row["set"], row["method"], f"{registered} of {row['images']}"]
+        if "auc_percent" in row:
+            cells += [row["auc_percent"], row["num_correct"], f"{row['max_rotation_deg']:.2f}"]
+            cells += [f"{row['focal_median_error']:.1%} / {row['focal_max_error']:.1%}"]
+        else:
+            cells += ["-"] * 4
+        k1 = f"{row['distortion']:.3f}" if "distortion" in row else "-"
+        cells += [f"{k1} ({row['true_distortion']:.3f})" if "true_distortion" in row else k1]
+        gps = row.get("gps_median_m")
+        cells += ["-" if gps is None else f"{gps:.1f}", f"{row['seconds']:.0f}"]
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
