@@ -34,6 +34,7 @@ from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_de
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
 from mpsfm_core.inputs.gps import convert_to_enu, read_gps
 from mpsfm_core.inputs.models import reconstruction_poses
+from mpsfm_core.report.verdict import judge
 
 SETS = ("sacre_coeur", "mobilebrick", "lund_door", "seneca")
 CONVENTION = CONVENTIONS["paper"]
@@ -62,12 +63,13 @@ def main() -> None:
         methods = [f"seed {seed}" for seed in range(arguments.seeds)]
         for method in [*methods, *([] if arguments.without_colmap else ["COLMAP"])]:
             start = time.perf_counter()
+            verdict = ""
             if method == "COLMAP":
                 models = reconstruct_with_colmap(folder / "images")
             else:
-                seed = f"runtime.seed={method.split()[1]}"
-                models = reconstruct_with_defaults(folder / "images", [seed, *arguments.overrides])
-            row = {"set": name, "method": method, **measure(models, folder)}
+                overrides = [f"runtime.seed={method.split()[1]}", *arguments.overrides]
+                models, verdict = reconstruct_with_defaults(folder / "images", overrides)
+            row = {"set": name, "method": method, **measure(models, folder), "verdict": verdict}
             row["seconds"] = time.perf_counter() - start
             rows.append(row)
             print(json.dumps(row), file=sys.stderr, flush=True)
@@ -81,15 +83,21 @@ def main() -> None:
 
 def reconstruct_with_defaults(
     images: Path, overrides: Sequence[str]
-) -> list[pycolmap.Reconstruction]:
-    """Return the models of ``mpsfm reconstruct IMAGES``, largest first; empty if it fails."""
+) -> tuple[list[pycolmap.Reconstruction], str]:
+    """Return the models of ``mpsfm reconstruct IMAGES``, largest first, and the verdict.
+
+    The verdict includes the codes of its doubts. There are no models if the run fails.
+    """
     offline = ["runtime.offline=true", "dense.enabled=false"]
     try:
         result = reconstruct(images, overrides=[*offline, *overrides])
     except MpsfmError as error:
         print(f"{images}: {error}", file=sys.stderr)
-        return []
-    return [result.model, *result.further_models]
+        return [], "failed"
+    verdict = judge(result.summary)
+    doubts = ", ".join(doubt.reason.code.value for doubt in verdict.doubts)
+    text = f"{verdict.level}: {doubts}" if doubts else verdict.level
+    return [result.model, *result.further_models], text
 
 
 def reconstruct_with_colmap(images: Path) -> list[pycolmap.Reconstruction]:
@@ -199,8 +207,8 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Format a Markdown table with one line per run."""
     lines = [
         "| set | method | registered | AUC@1/5/20 | within 2 deg | max. rotation error, deg "
-        "| focal error, median / max. | k1 (reference) | GPS median, m | s |",
-        "|---" * 10 + "|",
+        "| focal error, median / max. | k1 (reference) | GPS median, m | s | verdict |",
+        "|---" * 11 + "|",
     ]
     for row in rows:
         registered = " + ".join(map(str, row["registered"])) or "0"
@@ -213,7 +221,11 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
         k1 = f"{row['distortion']:.3f}" if "distortion" in row else "-"
         cells += [f"{k1} ({row['true_distortion']:.3f})" if "true_distortion" in row else k1]
         gps = row.get("gps_median_m")
-        cells += ["-" if gps is None else f"{gps:.1f}", f"{row['seconds']:.0f}"]
+        cells += [
+            "-" if gps is None else f"{gps:.1f}",
+            f"{row['seconds']:.0f}",
+            row["verdict"] or "-",
+        ]
         lines.append("| " + " | ".join(map(str, cells)) + " |")
     return "\n".join(lines)
 

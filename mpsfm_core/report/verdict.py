@@ -1,8 +1,8 @@
 """Judge a run: good, doubtful, partial or failed, with the reasons for doubt.
 
 Registered images are no proof: a model with look-alike places or a wrong focal length registers
-them too. The doubts come from measured evidence (:mod:`mpsfm_core.results.evidence`). Thresholds
-are chosen by ``benchmarks.verdicts``, which compares verdicts with true pose errors.
+them too. The doubts come from measured evidence (:mod:`mpsfm_core.results.evidence`).
+``benchmarks.real_photos`` shows verdicts next to true pose errors.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from mpsfm_core.data.decisions import DoubtReason, GpsReason, Reason
 Level = Literal["good", "doubtful", "partial", "failed"]
 
 MIN_PAIR_INLIERS = 50
-"""Inliers that make a verified pair evidence against a model [tuned: benchmarks.verdicts]."""
+"""Inliers that make a verified pair evidence against a model [ours]."""
 MAX_UNEXPLAINED_RATIO = 0.1
 """A pair is unexplained if its images share less than this share of its inliers as points
-[tuned: benchmarks.verdicts]."""
+[ours]."""
 MIN_UNEXPLAINED_PAIRS = 2
-"""Unexplained pairs that make a model doubtful [tuned: benchmarks.verdicts]."""
+"""Unexplained pairs that make a model doubtful [ours]."""
 MIN_ANGLE_DEG = 0.5
-"""Median ray angle below which depth rests on the priors [tuned: benchmarks.verdicts]."""
+"""Median ray angle below which depth rests on the priors [ours]."""
 MIN_POINTS = 30
 """Points that the pose of an image needs [COLMAP abs_pose_min_num_inliers]."""
 MIN_EXPLAINED_RATIO = 0.2
-"""Share of the matches of an image that the model explains [tuned: benchmarks.verdicts]."""
+"""Share of the matches of an image that the model explains [ours]."""
 
 
 @dataclass(frozen=True)
