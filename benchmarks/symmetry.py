@@ -28,8 +28,8 @@ from mpsfm_core.mapping.component import Component
 from mpsfm_core.mapping.consistency.depth_consistency import DepthConsistencyCheck
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
+from mpsfm_core.mapping.model_maintenance import ModelMaintenance
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement.maintenance import ModelMaintenance
 from mpsfm_core.mapping.scene.tracks import NO_POINT
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors
 from mpsfm_core.testing.synthetic.two_rooms import (

@@ -21,9 +21,9 @@ from mpsfm_core.mapping.initialization.initial_pair import (
     InitialPairSelector,
     register_first_image,
 )
+from mpsfm_core.mapping.model_maintenance import ModelMaintenance, ModelState
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.filtering import filter_points, find_lost_images
-from mpsfm_core.mapping.refinement.maintenance import ModelMaintenance, ModelState
 from mpsfm_core.mapping.registration.incremental_registration import IncrementalRegistration
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, triangulate_image

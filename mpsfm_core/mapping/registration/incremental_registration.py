@@ -8,8 +8,8 @@ import numpy as np
 
 from mpsfm_core.data import Bool
 from mpsfm_core.data.decisions import ImageReason, Reason
+from mpsfm_core.mapping.model_maintenance import ModelMaintenance
 from mpsfm_core.mapping.refinement.filtering import filter_points, find_lost_images
-from mpsfm_core.mapping.refinement.maintenance import ModelMaintenance
 from mpsfm_core.mapping.registration.correspondences import (
     PoseCorrespondences,
     find_correspondences,

@@ -14,8 +14,8 @@ from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.component import Component
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
+from mpsfm_core.mapping.model_maintenance import ModelMaintenance
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement.maintenance import ModelMaintenance
 from mpsfm_core.mapping.registration.incremental_registration import IncrementalRegistration
 from mpsfm_core.mapping.registration.pose_estimation import select_distinct_poses
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
