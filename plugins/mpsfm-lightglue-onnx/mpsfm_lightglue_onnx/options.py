@@ -16,8 +16,10 @@ LIGHTGLUE_DISK = WeightsFile(f"{_RELEASE}/disk_lightglue.onnx", license="Apache-
 
 
 class FeatureOptions(Options):
-    """Options of SuperPoint and DISK. The score thresholds of SuperPoint and DISK are part of the
-    ONNX file."""
+    """Options of the detectors SuperPoint and DISK.
+
+    The score thresholds of both detectors are part of the ONNX file.
+    """
 
     max_keypoints: int = Field(6000, gt=0)
     """Maximum number of keypoints, selected by score. [reference, for SuperPoint]"""
