@@ -1,1 +1,1 @@
-"""Prior-aware incremental mapper, without file access, plugins or console output."""
+"""Incremental mapper with depth and normal priors, without file access or plugins."""

@@ -1,4 +1,4 @@
-"""Checkpoints of the mapper. A resumed run has bit-identical results."""
+"""Checkpoints of the mapper, from which a resumed run gives bit-identical results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpsfm_core.mapping.serialization import CheckpointArrays, deserialize, seri
 
 
 class CheckpointStore(Protocol):
-    """Interface of the checkpoint storage, which selects the location and checks the problem.
+    """Interface of the storage that writes mapper checkpoints to disk and finds them again.
 
     The mapper saves checkpoints between two image registrations. Saving a checkpoint does not
     change the reconstruction.
@@ -22,7 +22,7 @@ class CheckpointStore(Protocol):
         """Return the last checkpoint of the same mapping problem and options, or None."""
 
     def unreadable(self, reason: str) -> None:
-        """Handle a checkpoint that cannot be restored, before the mapper starts again."""
+        """Handle a checkpoint that cannot be restored, before the mapper restarts from scratch."""
 
     def due(self) -> bool:
         """Return True if the mapper shall save a checkpoint now."""
@@ -31,7 +31,7 @@ class CheckpointStore(Protocol):
         """Save a checkpoint.
 
         Args:
-            state: Arrays of the checkpoint, by name.
+            state: Arrays of the mapper checkpoint, by name.
             registered: Number of images that are registered in the current component.
         """
 
@@ -42,7 +42,7 @@ class MapperProgress(NamedTuple):
     runs: list[MapperRun]
     """Completed runs."""
     mapper: object | None
-    """The mapper of the interrupted run. None means that all mapper runs are complete."""
+    """The mapper of the interrupted run. The attribute is None if all mapper runs are complete."""
 
 
 class Checkpointer:
@@ -55,7 +55,7 @@ class Checkpointer:
         self._shared = (problem, events)
 
     def load(self) -> MapperProgress:
-        """Restore the last checkpoint, or return empty progress if none can be read."""
+        """Restore the last mapper checkpoint, or return empty progress if none can be read."""
         if self._store is None or (arrays := self._store.load()) is None:
             return MapperProgress([], None)
         try:

@@ -31,11 +31,12 @@ from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, triangul
 _log = logging.getLogger(__name__)
 
 MAX_INITIAL_VIOLATIONS = 0.03
-"""Share of contradicting pixels above which an initial pair is rejected; 0.6 of
-``max_violations``, as in the reference. [reference]"""
+"""Share of pixels with contradicting depth above which an initial pair is rejected, 0.6 times the
+option ``max_violations``. [reference]"""
 MAX_FINAL_VIOLATIONS = 0.08
-"""The same in the final check. Images that were verified before need clearer evidence, since
-others depend on them. [tuned: benchmarks.symmetry]"""
+"""Share of pixels with contradicting depth above which the final check deregisters an image. The
+share exceeds that of registration because other images depend on the image. [tuned:
+benchmarks.symmetry]"""
 
 _WITHOUT_POINTS = {
     True: "the scale of their depth is unknown; check that the poses and the images match",
@@ -44,17 +45,17 @@ _WITHOUT_POINTS = {
 
 
 def do_nothing() -> None:
-    """Default of optional callbacks."""
+    """Ignore a call, as the default of optional callbacks."""
 
 
 class Component:
     """A connected set of images, from its initialization to its final refinement.
 
     Attributes:
-        maintenance: Refinement, depth checks and deregistration.
-        registration: Registration of further images.
-        scene: Poses, points and depth maps.
-        refiner: Bundle adjustment and depth integration.
+        maintenance: Object that refines the component, checks depth and deregisters images.
+        registration: Object that registers further images into the component.
+        scene: Camera poses, 3D points and depth maps of the component.
+        refiner: Object that runs bundle adjustment and depth integration.
     """
 
     maintenance_type: type[ModelMaintenance] = ModelMaintenance
@@ -79,11 +80,12 @@ class Component:
         return self.maintenance.size
 
     def reweight_pairs(self, unregistered: Bool) -> MappingProblem:
-        """Return the problem with the pairs of unregistered images reweighted by depth.
+        """Return the problem with match scores of unregistered images reweighted by depth checks.
 
-        The scene must have no registered image.
+        This method requires a scene without registered images.
         """
-        # all runs use the same seed here, so that they compare pairs with the same poses
+        # all mapper runs use the same seed to check pairs, so that pair poses do not differ among
+        # runs
         options = self._options.model_copy(update={"seed": 0})
         pose_estimator = AbsolutePoseEstimator(self.scene, self.refiner, options)
         check = PairConsistencyCheck(pose_estimator, options)
@@ -93,7 +95,7 @@ class Component:
         """Register all unregistered images that came with a pose.
 
         Returns:
-            False if fewer than two images keep enough points.
+            False if fewer than two images with known poses observe enough points.
         """
         images = self.maintenance.problem.images
         poses = {int(i): images[i].known_pose for i in np.flatnonzero(unregistered)}
@@ -119,8 +121,8 @@ class Component:
     def initialize_globally(self, unregistered: Bool) -> bool:
         """Register all well connected images together (motion averaging).
 
-        The result is kept if, without images whose depth contradicts others, the points explain
-        ``enough_explained`` of the matches between the registered images.
+        Images whose depth contradicts others are deregistered. The global poses are kept if both
+        keypoints of enough matches then observe the same 3D point (option ``enough_explained``).
 
         Returns:
             False if the initialization is rejected; the scene is then empty.
@@ -134,7 +136,7 @@ class Component:
         self.refiner.adapts_reprojection_loss = True
         self.maintenance.refine_globally()
         if self.refiner.can_refine_focals():
-            # the first refinement started from poses that a wrong focal length had bent
+            # the first refinement started from poses that a wrong focal length had distorted
             self.maintenance.refine_globally()
         max_violations = self._options.consistency.max_violations
         self.maintenance.check_all_images(max_violations, "global-initialization")
@@ -146,7 +148,7 @@ class Component:
         return True
 
     def _register_global_poses(self, poses: GlobalPoses) -> None:
-        """Register images with global poses, triangulate and refine once."""
+        """Register images with globally averaged poses, triangulate tracks and refine once."""
         scene, options = self.scene, self._options
         images = [int(image) for image in poses.images]
         for image, rotation, translation, scale in zip(
@@ -161,7 +163,7 @@ class Component:
         filter_points(scene, options.triangulation)
 
     def _explained_ratio(self, images: Int64) -> float:
-        """Return the share of the match scores between images that points explain."""
+        """Return the share of summed match scores whose two keypoints observe the same 3D point."""
         graph = self.scene.graph
         is_chosen = self.scene.mask(images)[graph.image_of]
         is_between = is_chosen[graph.source] & is_chosen[graph.target]
@@ -169,10 +171,10 @@ class Component:
         return float(graph.score[is_explained].sum() / max(graph.score[is_between].sum(), 1e-12))
 
     def initialize_from_pair(self, unregistered: Bool) -> bool:
-        """Initialize from the best pair of unregistered images; relax thresholds until one works.
+        """Initialize from the best image pair, and relax thresholds until a pair is accepted.
 
         Returns:
-            False if no pair works at the most relaxed thresholds.
+            False if no image pair is accepted at the most relaxed thresholds.
         """
         with self._event_log.timed("initialization"):
             pairs = self._pair_selector.rank_pairs(self._pose_estimator, unregistered)
@@ -193,7 +195,7 @@ class Component:
                 return False
 
     def _try_pair(self, pair: VerifiedPair) -> Reason | None:
-        """Register a pair; None on success, else the reason, which is recorded if it is final."""
+        """Register an initial image pair, and return None, or the reason of its rejection."""
         initial_pair = self._pair_selector.estimate_pair(self._pose_estimator, pair)
         if isinstance(initial_pair, Reason):
             return initial_pair
@@ -205,7 +207,7 @@ class Component:
         return reason
 
     def _register_pair(self, initial_pair: InitialPair) -> Reason | None:
-        """Register both images, triangulate, refine and check depth; None or why that fails."""
+        """Register and refine an initial pair, and return None, or the reason of its rejection."""
         a, b = initial_pair.reference, initial_pair.image
         register_first_image(self.scene, a)
         pose = initial_pair.pose
@@ -235,10 +237,10 @@ class Component:
         """Register images until no candidate can be registered.
 
         Args:
-            candidates: (n,) bool, images that may be registered.
-            save_checkpoint: Called after each registration.
-            wide: If an image fails with its usual references, also use the images that match it
-                best, before the thresholds relax.
+            candidates: (n,) bool mask of the images that may be registered.
+            save_checkpoint: Function that is called after each image registration.
+            wide: If an image cannot be registered by its local bundle, also use its best matching
+                images, before the acceptance thresholds relax.
         """
         while self.registration.register_next_image(candidates, wide=wide):
             self.maintenance.refine_if_grown()
@@ -247,13 +249,14 @@ class Component:
     def reregister_images(self, candidates: Bool) -> None:
         """Deregister misregistered images and register them with other references.
 
-        The change is kept if no image is lost, more matches are explained, and the images are no
-        longer misregistered. Each set of images is tried once. If that fails, a group that one
-        pair connects and several contradict is split off. Images with a known pose stay, unless
-        that pose is only an initial guess.
+        The new poses are kept if no image is lost, more matches observe common 3D points, and the
+        images are no longer misregistered. Each set of misregistered images is tried once. If its
+        new poses are not kept, images that one pair connects to the model and several pairs
+        contradict are deregistered. Images with a known pose stay registered, unless the known
+        poses are only initial guesses.
 
         Args:
-            candidates: (n,) bool, images that may be registered.
+            candidates: (n,) bool mask of the images that may be registered.
         """
         tried: set[tuple[int, ...]] = set()
         detections = self._detect_misregistrations()
@@ -279,7 +282,7 @@ class Component:
             self._event_log.scene_changed(self.scene)
 
     def _split_off(self, detection: Misregistration) -> None:
-        """Deregister images that one pair connects and several contradict.
+        """Deregister images that one pair connects to the model and several pairs contradict.
 
         They may form another component.
         """
@@ -290,7 +293,7 @@ class Component:
         self.maintenance.refine_globally()
 
     def _find_deregistered(self, before: ModelState) -> list[int]:
-        """Return the images that were registered in an earlier state and are not now."""
+        """Return the images that were registered in an earlier model state and no longer are."""
         return [int(i) for i in np.flatnonzero(before.scene.registered & ~self.scene.registered)]
 
     def _deregister_misregistered(self, detection: Misregistration) -> None:
@@ -305,7 +308,7 @@ class Component:
         maintenance.history.excluded_references[image, reference] = True
 
     def _detect_misregistrations(self) -> list[Misregistration]:
-        """Detect misregistered images that may be moved."""
+        """Detect misregistered images, except those whose known pose must not change."""
         is_guess = self._options.known_poses == "guess"
         has_pose = np.array(
             [image.known_pose is not None for image in self.maintenance.problem.images]
@@ -314,11 +317,11 @@ class Component:
         return [d for d in detections if is_guess or not has_pose[list(d.images)].any()]
 
     def _count_explained_matches(self) -> int:
-        """Count the matches whose keypoints observe the same point."""
+        """Count the matches whose keypoints observe the same 3D point."""
         return int(np.count_nonzero(self.scene.explained_edges()))
 
     def finalize(self) -> None:
-        """Refine globally, check the depth of every image again, and refine as the options say."""
+        """Refine all images, repeat the depth check, and refine with a sharper depth loss."""
         if self.maintenance.is_checked:
             return
         self.maintenance.refine_globally()

@@ -19,7 +19,7 @@ class EventLog:
     """Events, rejection reasons and step times of one mapper run.
 
     Attributes:
-        image_reasons: Image name -> last reason why the image was not registered.
+        image_reasons: Last reason why an image was not registered, by image name.
     """
 
     def __init__(self, problem: MappingProblem, events: MappingEvents) -> None:
@@ -36,7 +36,7 @@ class EventLog:
         self._events.image_registered(images[image].name, count, len(images))
 
     def scene_changed(self, scene: Scene) -> None:
-        """Forward a change of the scene. Its state is only copied if a receiver requests it."""
+        """Forward a change of the scene, which is only copied if a receiver requests the copy."""
         self._events.scene_changed(lambda: capture_scene_state(scene))
 
     def rejected(self, image: int, reason: Reason) -> None:
@@ -52,7 +52,7 @@ class EventLog:
 
     @contextmanager
     def timed(self, step: str) -> Iterator[None]:
-        """Add the run time of the ``with`` block to a named step."""
+        """Add the run time of the ``with`` block to a named step of the mapper."""
         start = time.perf_counter()
         try:
             yield
@@ -61,14 +61,14 @@ class EventLog:
             self._counts[step] += 1
 
     def report(self, models: Iterable[Reconstruction]) -> MappingReport:
-        """Return the report of the run, with rejection reasons for images outside of ``models``."""
+        """Return the report of the run, with rejection reasons of images outside ``models``."""
         names = {image.name for model in models for image in model.images}
         reasons = {name: reason for name, reason in self.image_reasons.items() if name not in names}
         return MappingReport(reasons, self._pair_reasons, dict(self._seconds), dict(self._counts))
 
 
 def _initial_reasons(problem: MappingProblem) -> dict[str, Reason]:
-    """Return the reason for each image that the mapper would not even try to register."""
+    """Return the reasons for images that the mapper cannot try to register."""
     matched = {index for pair in problem.pairs for index in (pair.image_a, pair.image_b)}
     reasons = {}
     for index, image in enumerate(problem.images):

@@ -16,10 +16,10 @@ class MappingEvents(Protocol):
         """Handle the registration of an image as the ``registered``-th image of its component."""
 
     def image_rejected(self, name: str, reason: Reason) -> None:
-        """Handle a failed registration, or the deregistration of an image."""
+        """Handle the failed registration or the deregistration of an image."""
 
     def scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """Handle a change of poses or points. Calling ``scene`` copies the current state."""
+        """Handle a change of poses or points; the function ``scene`` copies the reconstruction."""
 
 
 class NullMappingEvents:

@@ -6,7 +6,7 @@ Usage::
     for model in result.reconstructions:  # components, the largest first
         print(len(model.images), len(model.points))
 
-What :func:`reconstruct` does, compared with COLMAP's ``IncrementalMapper``::
+The steps of :func:`reconstruct`, compared with COLMAP's ``IncrementalMapper``::
 
     for each seed:
         while images are unregistered:
@@ -52,7 +52,8 @@ from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstructio
 from mpsfm_core.mapping.serialization import canonicalize
 
 MIN_ABSORBING_RATIO = 0.25
-"""Size relative to the largest component from which a component may absorb images of it. [ours]"""
+"""Smallest ratio of the image counts of a component and of the largest component for which the
+former may take images of the latter. [ours]"""
 
 
 def reconstruct(
@@ -64,18 +65,18 @@ def reconstruct(
     """Reconstruct poses, points and refined depth of all images that can be verified.
 
     If many matches remain unexplained, the mapper runs again with other seeds. If guessed focal
-    lengths were far off, it runs again from the refined ones. The run that explains most matches is
-    kept. The same problem, options and machine give the same bits, also if an interrupted run
-    continues from a checkpoint.
+    lengths were far off, the mapper runs again with the refined focal lengths. The run that
+    explains most matches is kept. The same problem, options and machine give the same bits, also if
+    an interrupted run continues from a checkpoint.
 
     Args:
-        problem: Images with priors, and verified matches.
+        problem: Images with depth and normal priors, and geometrically verified matches.
         options: Options of the mapper.
         events: Receiver of progress events.
         checkpoints: Storage of checkpoints.
 
     Returns:
-        Connected components, the largest first, and the report.
+        Connected components, sorted by decreasing number of images, and the report.
     """
     options, events = options or MapperOptions(), events or NullMappingEvents()
     problem = canonicalize(problem)
@@ -84,7 +85,7 @@ def reconstruct(
     is_complete = bool(runs) and interrupted is None
     reweighted_problem = None
     initial_problem = problem
-    for run in runs:  # each completed run may have refined focal lengths
+    for run in runs:  # each completed mapper run may have refined focal lengths
         initial_problem = _apply_refined_focals(initial_problem, run, options) or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):
         if interrupted is None:
@@ -117,7 +118,7 @@ def reconstruct(
 def _apply_refined_focals(
     problem: MappingProblem, run: MapperRun, options: MapperOptions
 ) -> MappingProblem | None:
-    """Return the problem with the focal lengths of a run; None if they changed little."""
+    """Return the problem with refined focal lengths, or None if they changed little."""
     if not run.models or not options.refinement.refine_focal:
         return None
     refined = apply_refined_focal_lengths(problem, run.models[0], options.seed)
@@ -127,14 +128,15 @@ def _apply_refined_focals(
 class Mapper:
     """One run of the mapper with one seed.
 
-    Its attributes hold all that decides how the run continues, so that a checkpoint between two
-    registrations restores it.
+    A checkpoint of the attributes between two image registrations suffices to continue the run with
+    identical results.
 
     Attributes:
         component: The current component.
         models: The completed components.
-        unregistered: (n,) bool, images that are in no completed component.
-        reweighted_problem: The problem with pairs reweighted by depth, once that was needed.
+        unregistered: (n,) bool mask of the images that are in no completed component.
+        reweighted_problem: The mapping problem with match scores reweighted by depth checks of
+        image pairs, or None before such checks.
     """
 
     component: Component
@@ -160,14 +162,14 @@ class Mapper:
 
     @property
     def is_deterministic(self) -> bool:
-        """True if known poses stay fixed, so that another seed changes nothing."""
+        """True if known poses stay fixed, so that another random seed gives the same result."""
         return self._uses_known_poses and self.options.known_poses == "fixed"
 
     def run(self, save_checkpoint: Callable[[], None] = do_nothing) -> MapperRun:
         """Reconstruct all components.
 
         Args:
-            save_checkpoint: Called whenever the run could continue from a checkpoint.
+            save_checkpoint: Function that is called whenever the mapper state can be saved.
         """
         components = self.reconstruct_components(save_checkpoint)
         models = sorted(components, key=lambda model: -len(model.images))
@@ -217,9 +219,10 @@ class Mapper:
         return self.component_type(problem, self.options, self._pair_selector, self.event_log)
 
     def _initialize(self) -> bool:
-        """Initialize the component globally, or else from a pair.
+        """Initialize the component from global poses, or else from an image pair.
 
-        If the first global initialization fails, a second one uses pairs reweighted by depth.
+        If the first global initialization fails, a second one uses match scores reweighted by depth
+        checks of image pairs.
         """
         if self._initialize_globally():
             return True
@@ -244,14 +247,14 @@ class Mapper:
         return self._uses_known_poses
 
     def _absorb_components(self) -> bool:
-        """Register images of completed components too, if that makes this one the largest.
+        """Register images of completed components, if the current one becomes the largest.
 
-        A bad initialization leads to a small component, whose images a later, better component
-        needs. Completed components that lose an image are dissolved, and their images become
-        unregistered. Images with a known pose are not absorbed.
+        A bad initialization leads to a small component, whose images fit a later component better.
+        Completed components that lose an image are dissolved, and their images become unregistered.
+        Images with a known pose are not absorbed.
 
         Returns:
-            Whether components were absorbed; the component is then finalized.
+            True if the current component took images of completed components and was finalized.
         """
         component = self.component
         max_size = max((len(model.images) for model in self.models), default=0)

@@ -21,30 +21,31 @@ from mpsfm_core.mapping.registration.threshold_schedule import ThresholdSchedule
 from mpsfm_core.mapping.scene.scene import Scene, Snapshot
 
 MAX_ROTATION_DEG = 3.0
-"""Rotation of a camera in one global refinement above which depth decides whether the refinement
-is kept: it may have reached a wrong local minimum. [ours]"""
+"""Rotation of a camera in one global refinement above which depth consistency decides whether the
+refinement is kept. [ours]"""
 
 
 class ModelState(NamedTuple):
-    """Copy of a model, for a rollback."""
+    """Copy of the state of a model, for a rollback."""
 
     scene: Snapshot
     checked: Bool
-    """(n,) bool, images whose depth was compared with all others."""
+    """(n,) bool mask of the images whose depth was compared with all other images."""
     noise: DepthNoise
     loss_scale: float
-    """Measured scale of the reprojection loss, in standard deviations of a keypoint."""
+    """Measured scale of the reprojection loss, in standard deviations of the keypoint position."""
 
 
 class ModelMaintenance:
-    """The model of one component, with what its maintenance needs.
+    """Model of one component, with refinement, depth checks, deregistration and rollback.
 
     Attributes:
-        scene: Poses, points and depth maps.
+        scene: Camera poses, 3D points and depth maps of the model.
         scores: (n, n) float64, score of the matches of each two images.
-        refiner: Bundle adjustment and depth integration.
-        history: Record of registration attempts.
-        thresholds: Thresholds of registration, which relax.
+        refiner: Object that runs bundle adjustment and depth integration.
+        history: Record of failed and successful image registration attempts.
+        thresholds: Acceptance thresholds of image registration, which relax if no image can be
+        registered.
     """
 
     def __init__(
@@ -76,7 +77,7 @@ class ModelMaintenance:
         return ModelState(self.scene.snapshot(), self._checked.copy(), *measured)
 
     def restore(self, state: ModelState) -> None:
-        """Roll back to an earlier state and clear the history of attempts since then."""
+        """Roll back to an earlier model state and clear the history of later registrations."""
         self.scene.restore(state.scene)
         self._checked = state.checked.copy()
         self.refiner.noise, self.refiner.loss_scale = state.noise, state.loss_scale
@@ -90,14 +91,14 @@ class ModelMaintenance:
         self._last_size = (0, 0)
 
     def refine_if_grown(self) -> None:
-        """Refine globally if images or points grew by ``global_growth`` since the last time."""
+        """Refine all images if images or points grew by the option ``global_growth``."""
         num_images, num_points = self.size, len(self.scene.tracks)
         growth = 1 + self.options.refinement.global_growth
         if num_images > growth * self._last_size[0] or num_points > growth * self._last_size[1]:
             self.refine_globally()
 
     def refine_globally(self, *, final: bool = False) -> None:
-        """Refine all images and points; deregister images without points or connection.
+        """Refine all images and points, then deregister images with few or unconnected points.
 
         Args:
             final: Sharpen the depth loss (paper, robust reconstruction).
@@ -115,13 +116,13 @@ class ModelMaintenance:
         self.event_log.scene_changed(self.scene)
 
     def check_all_images(self, max_violations: float, step: str) -> None:
-        """Deregister images until no two images contradict each other's depth.
+        """Deregister images until no two registered images contradict each other's depth.
 
-        Images that were compared before are not compared with each other again.
+        Image pairs whose depth was compared before are not compared again.
 
         Args:
-            max_violations: Largest violation ratio that is accepted.
-            step: Step of the mapper, for the reason.
+            max_violations: Largest accepted share of pixels with contradicting depth.
+            step: Name of the mapper step in the recorded reason.
         """
         images = self.scene.registered & ~self._checked
         self._checked |= images
@@ -137,7 +138,7 @@ class ModelMaintenance:
     def deregister_disconnected(self, reason: Reason) -> None:
         """Deregister images that no chain of points connects to the largest part of the model.
 
-        Images with known poses stay, because these poses connect them, unless they are a guess.
+        Images with known poses stay registered, unless the known poses are only initial guesses.
         """
         has_pose = np.array([image.known_pose is not None for image in self.problem.images])
         stays = has_pose & (self.options.known_poses != "guess")
@@ -149,7 +150,8 @@ class ModelMaintenance:
 
         Args:
             image: The image.
-            max_violations: Largest violation ratio at the strict thresholds.
+            max_violations: Largest share of pixels with contradicting depth, before thresholds
+            relax.
 
         Returns:
             None if the depth is consistent, else the reason.
@@ -167,7 +169,7 @@ class ModelMaintenance:
         return ImageReason.CONTRADICTS_IMAGE.because(violation_ratio=ratio, other_image=other)
 
     def confirm(self, image: int) -> None:
-        """Report a verified registration; poses that failed in the former scene may work now."""
+        """Report a verified registration, and allow previously rejected poses again."""
         self.history.clear_pose_rejections()
         self.event_log.registered(image, self.size)
         self.event_log.scene_changed(self.scene)
@@ -184,10 +186,10 @@ class ModelMaintenance:
             self.event_log.rejected(image, reason)
 
     def _undo_jump(self, before: Snapshot) -> None:
-        """Undo a refinement that turned a camera far and increased the number of conflicts.
+        """Undo a refinement that rotated a camera far and increased the depth contradictions.
 
-        A robust loss has several minima. If few matches connect an image, the next minimum may be
-        a wrong one.
+        A robust loss has several minima, so refinement may move an image with few matches to a
+        wrong minimum.
         """
         images = self.scene.registered_images()
         turns = self.scene.rotations[images] @ before.rotations[images].transpose(0, 2, 1)
@@ -200,7 +202,7 @@ class ModelMaintenance:
             self.scene.restore(after)
 
     def _find_conflicts(self, images: Int64, limit: float) -> list[tuple[int, float]]:
-        """Find images to deregister so that no depth contradicts ``images``, with their ratios."""
+        """Find images to deregister so that no depth contradicts ``images``."""
         if not self.options.consistency.enabled:
             return []
         with self.event_log.timed("depth check"):

@@ -1,8 +1,8 @@
 """Selection of one result among mapper runs with different seeds.
 
-The run with the largest component in terms of explained match scores is selected. A match is
-explained if both of its keypoints observe the same 3D point. Among runs with equal explained
-ratios, the depth agreement decides.
+The selected run has the component that explains the largest share of the match scores. A match is
+explained if both of its keypoints observe the same 3D point. Among runs that explain equal shares
+of the match scores, the agreement of depth maps decides.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
 
 MAX_RATIO_DIFFERENCE = 0.01
-"""Difference of the explained match ratios below which two runs count as equal. [ours]"""
+"""Difference between the explained shares of the match scores below which two runs count as equal.
+[ours]"""
 
 
 class MapperRun(NamedTuple):
@@ -42,7 +43,7 @@ class MapperRun(NamedTuple):
 
 
 def is_settled(runs: Sequence[MapperRun], min_explained_ratio: float) -> bool:
-    """Return True if the last run explains enough matches, or equals an earlier run."""
+    """Return True if the last mapper run explains enough matches or equals an earlier run."""
     *earlier, last = runs
     is_explained = sum(last.explained_ratios) >= min_explained_ratio
     return is_explained or any(_are_equal(run, last) for run in earlier)
@@ -51,8 +52,8 @@ def is_settled(runs: Sequence[MapperRun], min_explained_ratio: float) -> bool:
 def select_run(runs: Sequence[MapperRun], options: ConsistencyOptions) -> MapperRun:
     """Select the run whose largest component explains the most matches.
 
-    Among runs with equal explained ratios, the result that most runs share is selected, and among
-    several such results the one with the best depth agreement.
+    Among runs that explain equal shares of the match scores, the result that occurs in most runs is
+    selected. Among several such results, the agreement of depth maps decides.
     """
     max_ratio = max(run.largest_explained_ratio for run in runs)
     candidates = [
@@ -77,7 +78,7 @@ def _are_equal(a: MapperRun, b: MapperRun) -> bool:
 
 
 def sum_run_times(report: MappingReport, runs: Sequence[MapperRun]) -> MappingReport:
-    """Return the report of one run, with the step times summed over all runs."""
+    """Return the report of one mapper run, with the step times summed over all runs."""
     seconds: Counter[str] = Counter()
     counts: Counter[str] = Counter()
     for run in runs:

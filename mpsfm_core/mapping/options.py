@@ -2,8 +2,8 @@
 
 ``[paper ...]`` cites a section of MP-SfM and ``[reference ...]`` its published code.
 ``[COLMAP ...]`` names an option of COLMAP's incremental mapper. ``[tuned: ...]`` names the
-benchmark that chose the value; ``[ours]`` marks a choice without a benchmark. Angles are true
-angles; the reference overestimates them.
+benchmark that chose the value; ``[ours]`` marks a choice without a benchmark. Triangulation angles
+are true angles, while the published code overestimates them.
 """
 
 from __future__ import annotations
@@ -17,121 +17,128 @@ from mpsfm_core.optimize.options import BundleOptions, IntegrationOptions
 
 
 class InitializationOptions(Options):
-    """Initialization of a component."""
+    """Options of the initialization of a component."""
 
     global_initialization: bool = expert(True)
-    """Register all well connected images together; if the result fails verification, initialize
-    from a pair. False always initializes from a pair. [tuned: benchmarks.ablation]"""
+    """Initialize from averaged poses of all well connected images, or from an image pair if these
+    poses fail verification. False always initializes from an image pair. [tuned:
+    benchmarks.ablation]"""
     max_pairs: int = expert(50, ge=1)
-    """Maximum number of pairs to try; raising it tries harder before images are given up. [ours]"""
+    """Maximum number of initial image pairs to try; raising it takes longer and may initialize more
+    components. [ours]"""
     num_compared: int = expert(5, ge=1)
-    """Number of pairs with most matches whose poses are compared; the best supported pair is tried
-    first. [tuned: benchmarks.accuracy]"""
+    """Number of image pairs with most matches whose relative poses are compared; the pair with the
+    best supported pose is tried first. [tuned: benchmarks.accuracy]"""
     high_parallax_deg: float = expert(1.5, gt=0)
-    """Smallest triangulation angle of a point that supports a pair if ``lifting`` is off.
-    [COLMAP init_min_tri_angle]"""
+    """Smallest triangulation angle of a point that supports an initial image pair if ``lifting`` is
+    off. [COLMAP init_min_tri_angle]"""
 
 
 class RegistrationOptions(Options):
-    """Absolute pose of the next image."""
+    """Options of the registration of the next image."""
 
     next_view: Literal["match-scores", "inlier-matches", "visible-points"] = expert("match-scores")
-    """Order of registration: by summed match scores or number of matches with the best registered
-    image, or by number of visible 3D points. [paper, next view selection]"""
+    """Ranking of the next image, by summed match scores or number of matches with the best matching
+    registered image, or by number of visible 3D points. [paper, next view selection]"""
     min_inliers: int = Field(30, ge=3)
-    """Smallest number of inliers of a pose; raising it registers fewer and surer images.
-    [COLMAP abs_pose_min_num_inliers]"""
+    """Smallest number of inliers of an image pose; raising it registers fewer, more reliable
+    images. [COLMAP abs_pose_min_num_inliers]"""
     min_pose_inlier_ratio: float = expert(0.7, ge=0, le=1)
     """Smallest share of the 2D-3D matches that are inliers; raising it rejects more wrong poses and
     more images with repeated structure. [tuned: benchmarks.ablation]"""
     max_error_px: float = expert(12.0, gt=0)
-    """Largest reprojection error of an inlier of PnP; raising it accepts less exact points.
+    """Largest reprojection error of an inlier of PnP; raising it accepts less accurate points.
     [COLMAP abs_pose_max_error]"""
     max_support_error_px: float = expert(4.0, gt=0)
-    """Largest distance of a supporting keypoint to the projected depth interval of its match.
-    [COLMAP two-view max_error]"""
+    """Largest distance between an inlier keypoint and the projection of the depth interval of its
+    matched keypoint. [COLMAP two-view max_error]"""
     max_depth_deviation: float = expert(2.0, ge=0)
-    """Half length of that interval in standard deviations of log depth; raising it lowers the
-    influence of depth. [ours]"""
+    """Half length of the depth interval of a matched keypoint, in standard deviations of log depth;
+    raising it lowers the influence of depth. [ours]"""
     confident_inlier_ratio: float = expert(0.85, ge=0, le=1)
-    """Inlier ratio above which no hypotheses from resampled matches are generated. [ours]"""
+    """Inlier ratio of the best pose above which no pose hypotheses from resampled matches are
+    generated. [ours]"""
     num_resamples: int = expert(8, ge=0)
-    """Number of random halves of the matches that generate hypotheses per attempt. [ours]"""
+    """Number of random halves of the matches that generate pose hypotheses in each registration
+    attempt. [ours]"""
     max_resampled_attempts: int = expert(3, ge=0)
-    """Number of attempts at an image that draw new halves. [ours]"""
+    """Number of registration attempts of an image that draw new random halves of the matches.
+    [ours]"""
     num_locally_optimized: int = expert(8, ge=0)
-    """Number of distinct hypotheses whose support is maximized; 0 keeps the poses of RANSAC.
+    """Number of distinct pose hypotheses whose support is maximized; 0 keeps the poses of RANSAC.
     [tuned: benchmarks.ablation]"""
     num_bundle_adjusted: int = expert(3, ge=1)
     """Number of distinct poses that bundle adjustment refines before one is chosen. [ours]"""
     max_bundle_iterations: int = expert(10, ge=1)
-    """Maximum number of iterations of that bundle adjustment. [ours]"""
+    """Maximum number of iterations of the bundle adjustment of a pose hypothesis. [ours]"""
     min_inlier_ratio: float = expert(0.25, gt=0, le=1)
-    """Inlier ratio from which RANSAC computes its number of trials; raising it is faster and may
-    miss poses. [COLMAP abs_pose_min_inlier_ratio]"""
+    """Assumed inlier ratio from which RANSAC computes its number of trials; raising it is faster
+    and may miss poses. [COLMAP abs_pose_min_inlier_ratio]"""
     estimate_focal: bool = expert(True)
     """Estimate a guessed focal length with the pose, unless a registered image shares the camera.
-    False registers with the guess. Needs ``refinement.refine_focal``. [ours]"""
+    False registers the image with the guessed focal length. Needs ``refinement.refine_focal``.
+    [ours]"""
     lifting: bool = expert(True)
-    """Use points that depth lifts from a single view. [paper 3.2]"""
+    """Use 3D points that are lifted from the depth map of a single image. [paper 3.2]"""
     min_point_angle_deg: float = expert(1.0, ge=0)
-    """Triangulation angle below which a lifted point replaces a triangulated one.
+    """Triangulation angle below which a point lifted from depth replaces a triangulated point.
     [reference robust_triangles]"""
     num_neighbors: int = expert(4, ge=0)
-    """Number of neighbors of the reference image whose points are used. [reference: bundle of 5]"""
+    """Number of neighbors of the best matching image whose points also determine the new pose.
+    [reference: bundle of 5]"""
     max_relaxations: int = expert(6, ge=0)
     """Number of times that ``min_inliers`` and ``min_pose_inlier_ratio`` are divided by 1.2 if no
     image registers; raising it registers more and less certain images. [reference]"""
 
 
 class TriangulationOptions(Options):
-    """Triangulation and filtering of tracks."""
+    """Options of the triangulation and filtering of tracks."""
 
     min_angle_deg: float = expert(1.5, ge=0)
-    """Triangulation angle below which depth lifts a point; raising it relies more on depth.
-    [COLMAP tri_min_angle] [reference hard_angle]"""
+    """Triangulation angle below which a point is lifted from depth; raising it relies more on
+    depth. [COLMAP tri_min_angle] [reference hard_angle]"""
     max_angle_error_deg: float = expert(2.0, gt=0)
     """Largest angular error of an observation of a new image, before refinement.
     [COLMAP tri_create_max_angle_error, tri_continue_max_angle_error]"""
     max_error_px: float = Field(4.0, gt=0)
     """Largest reprojection error of an observation, times the standard deviation of its keypoint;
-    raising it keeps more and less exact points. [COLMAP filter_max_reproj_error]"""
+    raising it keeps more, but less accurate points. [COLMAP filter_max_reproj_error]"""
 
 
 class RefinementOptions(Options):
-    """Bundle adjustment and depth integration (paper 3.3)."""
+    """Options of bundle adjustment and depth integration (paper 3.3)."""
 
     integrate: bool = Field(True)
-    """Refine depth maps; False keeps the scaled priors, which is faster."""
+    """Refine depth maps, whereas False keeps the scaled depth priors, which is faster."""
     map_width: int = expert(200, ge=16)
-    """Width to which maps are subsampled for refinement; the change is interpolated. Raising it is
-    slower. [tuned: benchmarks.ablation]"""
+    """Width in pixels to which depth maps are subsampled for refinement. Raising the width is
+    slower and refines finer details. [tuned: benchmarks.ablation]"""
     bundle_depth: Literal["prior", "refined"] = expert("prior")
-    """Depth that regularizes bundle adjustment: the scaled priors, or the refined maps in
-    alternation with depth integration as in the paper. [tuned: benchmarks.ablation]"""
+    """Depth maps that regularize bundle adjustment, either the scaled priors, or the refined maps
+    in alternation with depth integration as in the paper. [tuned: benchmarks.ablation]"""
     depth_regularization: bool = expert(True)
-    """Use ``C_reg`` in bundle adjustment. [paper 3.3]"""
+    """Use the depth regularization ``C_reg`` in bundle adjustment. [paper 3.3]"""
     measure_depth_noise: bool = expert(True)
-    """Scale the declared variance of depth priors by how well views agree
+    """Scale the declared variance of depth priors by the measured agreement between images
     (:mod:`mpsfm_core.mapping.refinement.depth_noise`). [tuned: benchmarks.ablation]"""
     measure_keypoint_noise: bool = expert(True)
-    """Widen the reprojection loss if the errors of keypoints are normally distributed
+    """Widen the robust reprojection loss if the keypoint errors are normally distributed
     (:mod:`mpsfm_core.mapping.refinement.keypoint_noise`). [tuned: benchmarks.ablation]"""
     free_scales: bool = expert(True)
-    """Estimate the scales of depth priors in bundle adjustment. False alternates, as the reference
-    does, and converges slowly because poses and points compensate scale errors.
+    """Estimate the scales of depth priors in bundle adjustment. False alternates scale estimation
+    and bundle adjustment, which converges slowly because poses and points compensate scale errors.
     [tuned: benchmarks.ablation]"""
     local_images: int = expert(5, ge=2)
-    """Number of images of a local bundle, with the new image. [reference]
+    """Number of images of a local bundle, including the new image. [reference]
     [COLMAP ba_local_num_images]"""
     first_reprojection_scale: float = expert(5.0, ge=1)
     """Factor on the scale of the reprojection loss in the first bundle adjustment of a new image,
-    whose pose may be off by pixels. [tuned: benchmarks.ablation]"""
+    whose reprojection errors may be several pixels. [tuned: benchmarks.ablation]"""
     global_growth: float = expert(0.3, gt=0)
-    """Relative growth of images or points after which all images are refined; raising it is faster
-    and less accurate. [reference]"""
+    """Relative growth of the number of images or points after which all images are refined; raising
+    it is faster and less accurate. [reference]"""
     refine_focal: bool = Field(True)
-    """Refine guessed focal lengths that the images determine; given ones stay."""
+    """Refine guessed focal lengths that the images determine; known focal lengths stay fixed."""
     final_robust: bool = expert(False)
     """End with a global refinement with a sharper depth loss.
     [paper, robust reconstruction] [tuned: benchmarks.ablation]"""
@@ -142,58 +149,62 @@ class RefinementOptions(Options):
 
 
 class ConsistencyOptions(Options):
-    """Dense depth consistency check (paper 3.4)."""
+    """Options of the dense depth consistency check between images (paper 3.4)."""
 
     enabled: bool = True
-    """Reject images whose depth contradicts the model; False registers more wrong images."""
+    """Reject images whose depth contradicts registered images, while False registers more wrong
+    images."""
     weigh_evidence: bool = expert(True)
-    """Measure the noise of a prior locally, from well-constrained points
-    (:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_local_depth_noise`); False measures
-    it for the whole scene. [tuned: benchmarks.symmetry]"""
+    """Measure the noise of a depth prior for each pixel from nearby well-constrained points
+    (:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_local_depth_noise`). False measures
+    one noise level for the whole scene. [tuned: benchmarks.symmetry]"""
     check_pairs: bool = expert(True)
-    """If the global initialization fails, check pairs against depth and reweight their matches
-    (:mod:`~mpsfm_core.mapping.consistency.pair_consistency`). [tuned: benchmarks.accuracy]"""
+    """If the global initialization fails, check the depth consistency of image pairs and reweight
+    their matches (:mod:`~mpsfm_core.mapping.consistency.pair_consistency`). [tuned:
+    benchmarks.accuracy]"""
     check_at_end: bool = expert(True)
-    """Check every image again at the end. [paper 3.4]"""
+    """Repeat the depth check of every image after the last registration. [paper 3.4]"""
     max_violations: float = expert(0.05, gt=0)
-    """Share of pixels that contradict another image above which an image is rejected; raising it
-    registers more images and more wrong ones. [paper beta] [tuned: benchmarks.symmetry]"""
+    """Share of pixels that contradict the depth of another image above which an image is rejected;
+    raising it registers more images, also wrong ones. [paper beta] [tuned: benchmarks.symmetry]"""
     max_violations_pair: float = expert(0.01, gt=0)
-    """The same for a pair before any image is registered. [tuned: benchmarks.accuracy]"""
+    """Share of pixels with contradicting depth above which the relative pose of an image pair is
+    inconsistent, before any image is registered. [tuned: benchmarks.accuracy]"""
     max_deviation: float = expert(2.7, gt=0)
-    """Smallest depth error that counts as a violation, in standard deviations of both priors.
+    """Smallest depth error that counts as a violation, in standard deviations of both depth priors.
     [paper gamma] [reference: 0.6 * 15 / 3.33]"""
     min_gap: float = expert(0.05, ge=0)
     """Smallest relative depth error that counts as a violation. [tuned: benchmarks.symmetry]"""
     num_views: int = expert(16, ge=1)
-    """Number of images with the largest overlap that an image is compared with. [ours]"""
+    """Number of most overlapping images whose depth is compared with that of a new image. [ours]"""
     map_width: int = expert(160, ge=16)
-    """Width to which depth maps are subsampled for the check. [ours]"""
+    """Width in pixels to which depth maps are subsampled for the depth consistency check. [ours]"""
 
 
 class MappingOptions(Options):
     """The ``mapping`` section of a configuration."""
 
     known_poses: Literal["start", "fixed", "guess"] = "start"
-    """Use of poses that come with images. ``start`` refines them and registers the other images.
-    ``fixed`` keeps poses, world and unit, and leaves out images without a pose. ``guess`` is
-    ``start``, but may change the unit, to meters if depth is metric, and move images."""
+    """Use of the known poses of images. ``start`` refines the known poses and registers the other
+    images. ``fixed`` keeps known poses and their unit of length, and leaves out images without a
+    known pose. ``guess`` also re-registers misregistered images, and scales the world to meters if
+    depth is metric."""
     min_model_size: int = Field(2, ge=2)
-    """Number of images below which a component is discarded. [COLMAP min_model_size]"""
+    """Number of registered images below which a component is discarded. [COLMAP min_model_size]"""
     weigh_by_score: bool = expert(True)
     """Weight matches by their scores in pose support and in bundle adjustment.
     [tuned: benchmarks.ablation]"""
     max_components: int = Field(10, ge=1)
     """Maximum number of disconnected components. [COLMAP max_num_models]"""
     max_runs: int = Field(3, ge=1)
-    """Maximum number of runs with different seeds; raising it takes longer and may register more
-    images of difficult scenes. [tuned: benchmarks.accuracy]"""
+    """Maximum number of mapper runs with different seeds; raising it takes longer and may register
+    more images of difficult scenes. [tuned: benchmarks.accuracy]"""
     enough_explained: float = expert(0.75, ge=0, le=1)
-    """Share of the match scores that a model must explain so that no further run is needed.
-    [tuned: benchmarks.accuracy]"""
+    """Share of the summed match scores whose keypoints must observe common 3D points, so that no
+    further mapper run is needed. [tuned: benchmarks.accuracy]"""
     register_tentatively: bool = False
-    """Also register the remaining images where their matches fit best. They observe no points; the
-    summary lists them as unconfirmed."""
+    """Also register the remaining images in the best supported poses. These images observe no
+    points, and the summary lists them as unconfirmed."""
     initialization: InitializationOptions = InitializationOptions()
     """Options of the initialization."""
     registration: RegistrationOptions = RegistrationOptions()
@@ -210,9 +221,9 @@ class MapperOptions(MappingOptions):
     """Options of :func:`mpsfm_core.mapping.mapper.reconstruct`."""
 
     seed: int = 0
-    """Seed of every random choice; a configuration has one for the whole run."""
+    """Random seed of the mapper, which is the seed of the whole pipeline run."""
 
     @property
     def checks_pairs(self) -> bool:
-        """True if pairs are checked against depth."""
+        """True if image pairs are checked for depth consistency."""
         return self.consistency.enabled and self.consistency.check_pairs

@@ -1,9 +1,9 @@
 """Serialization of the state of the mapper to plain arrays, bit for bit.
 
-The object graph is stored with shared objects and shared array memory, because results must not
-change by one bit. Unsupported objects, such as locks and open files, raise an error that names
-their place. Reading executes nothing: it only creates objects of the data classes of the numerical
-packages.
+Objects and array memory that are shared stay shared, because a resumed mapper run must give
+bit-identical results. Unsupported objects, such as locks and open files, raise an error that names
+the attribute. Reading a checkpoint executes no stored code and only creates objects of data classes
+of ``mpsfm_core``.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from pydantic import BaseModel
 from mpsfm_core.data.errors import DataError
 
 CheckpointArrays: TypeAlias = Mapping[str, NDArray[Any]]
-"""Arrays of a checkpoint by name; ``tree`` is the object graph as JSON."""
+"""Arrays of a checkpoint by name, where the array ``tree`` contains the object graph as JSON."""
 
 T = TypeVar("T")
 
 FORMAT = 1
-"""Format version; it increases when the meaning of stored states changes."""
+"""Format version of checkpoints, which increases when the meaning of stored states changes."""
 
 _TREE = "tree"
 _PACKAGES = ("mapping", "optimize", "data", "geometry")
@@ -45,10 +45,10 @@ def serialize(state: object, shared: object = None) -> CheckpointArrays:
 
     Args:
         state: The object.
-        shared: Objects that the reader has too, such as the problem; they are stored by reference.
+        shared: Objects such as the mapping problem that the reader also has, stored by reference.
 
     Raises:
-        TypeError: An object is not supported; the message names its place.
+        TypeError: An object is not supported; the message names its attribute.
     """
     writer = _Writer(shared)
     tree = writer.node(state, "state")
@@ -61,24 +61,26 @@ def deserialize(frozen: CheckpointArrays, shared: object = None) -> Any:
 
     Args:
         frozen: Arrays of the checkpoint.
-        shared: Objects equal to those that the writer had.
+        shared: Objects equal to the shared objects that were passed to :func:`serialize`.
 
     Raises:
-        DataError: The arrays are damaged or have another format.
+        DataError: The arrays of the checkpoint are damaged or have another format.
     """
     try:
         stored = json.loads(frozen[_TREE].tobytes())
         if stored["format"] != FORMAT:
-            raise ValueError(f"has format {stored['format']}, {FORMAT} is known")
+            raise ValueError(f"the checkpoint has format {stored['format']} instead of {FORMAT}")
         return _Reader(frozen, shared)(stored["state"])
     except DataError:
         raise
-    except Exception as error:  # arbitrary content may raise any error
-        raise DataError("state", f"is damaged: {type(error).__name__}: {error}") from error
+    except Exception as error:  # a damaged checkpoint may raise any error
+        raise DataError(
+            "state", f"the checkpoint is damaged: {type(error).__name__}: {error}"
+        ) from error
 
 
 class _Writer:
-    """Writer that numbers objects and stores repeated ones by reference."""
+    """Writer that numbers the objects of a graph and stores repeated objects by reference."""
 
     def __init__(self, shared: object) -> None:
         self.arrays: dict[str, NDArray[Any]] = {}
@@ -86,13 +88,14 @@ class _Writer:
         for number, found in enumerate(_parts(shared)):
             self._shared.setdefault(id(found), number)
         self._met: dict[int, int] = {}
-        self._alive: list[object] = [shared]  # ids stay unique while objects live
+        self._alive: list[object] = [shared]  # live objects have unique ids
 
     def node(self, value: Any, place: str) -> Any:
-        """Return the JSON node of a value."""
+        """Return the JSON node that represents a Python value."""
         if value is None or type(value) in _PLAIN:
             return value
-        if id(value) in self._shared:  # after plain values, which may be interned
+        # plain values come first, because Python may share equal plain values
+        if id(value) in self._shared:
             return {"shared": self._shared[id(value)]}
         if id(value) in self._met:
             return {"met": self._met[id(value)]}
@@ -169,7 +172,7 @@ class _Writer:
 
 
 class _Reader:
-    """Reader of the nodes that the writer stored."""
+    """Reader of the JSON nodes that a checkpoint contains."""
 
     def __init__(self, frozen: CheckpointArrays, shared: object) -> None:
         self._arrays = frozen
@@ -178,14 +181,15 @@ class _Reader:
         self._read_only: list[NDArray[Any]] = []
 
     def __call__(self, tree: Any) -> Any:
-        """Return the root object."""
+        """Return the root of the restored object graph."""
         made = self.value(tree)
-        for array in self._read_only:  # last, because views of the array may be writable
+        # set the flag last, because views of a read-only array may be writable
+        for array in self._read_only:
             array.flags.writeable = False
         return made
 
     def value(self, node: Any) -> Any:
-        """Return the object of a node."""
+        """Return the Python object that a JSON node represents."""
         if not isinstance(node, dict):
             return node
         if "shared" in node:
@@ -195,7 +199,7 @@ class _Reader:
         return self._made(node, node["id"])
 
     def _made(self, node: dict[str, Any], number: int) -> Any:
-        # containers may contain themselves, so that they are registered before they are filled
+        # containers are registered before they are filled, because they may contain themselves
         for kind in ("list", "set", "map", "object"):
             if kind in node:
                 filled: Any = getattr(self, f"_{kind}")(node, number)
@@ -258,7 +262,7 @@ class _Reader:
     def _array(self, node: dict[str, Any]) -> NDArray[Any]:
         if "view" in node:
             owner = self.value(node["view"])
-            # unlike as_strided, the constructor checks the bounds of the view
+            # unlike as_strided, the constructor of ndarray checks the bounds of the view
             made: NDArray[Any] = np.ndarray(
                 tuple(node["shape"]),
                 node["dtype"],
@@ -277,7 +281,7 @@ class _Reader:
 def fingerprint(value: object) -> str:
     """Compute the SHA-256 of a tree of data classes, options, sequences and arrays.
 
-    Memory layout and sharing of arrays have no effect.
+    The memory layout and the sharing of arrays do not change the hash.
     """
     found = hashlib.sha256()
     for part in _parts(value):
@@ -292,11 +296,11 @@ def fingerprint(value: object) -> str:
 
 
 def canonicalize(value: T) -> T:
-    """Return the same data with every array in C order and in its own memory.
+    """Return a tree of data with every array in C order and in its own memory.
 
-    Sums and products depend on the memory layout in the last bit. Data from the cache may differ
-    in layout from data that was just computed. A view of a whole array is replaced by that array
-    without a copy; do not modify the result.
+    Sums and products of arrays depend on the memory layout in the last bit. Data from the cache may
+    differ in layout from data that was just computed. A view of a whole array is replaced by that
+    array without a copy, so callers must not modify the result.
     """
     made: Any = value
     if isinstance(value, np.ndarray):
@@ -318,7 +322,7 @@ def canonicalize(value: T) -> T:
 
 
 def _is_whole(array: NDArray[Any]) -> bool:
-    """Return whether an array is a view of a whole array in C order."""
+    """Return whether an array contains all elements of its base array in C order."""
     owner = array.base
     return (
         type(owner) is np.ndarray
@@ -330,7 +334,7 @@ def _is_whole(array: NDArray[Any]) -> bool:
 
 
 def _parts(value: object) -> Iterator[object]:
-    """Yield all objects of a tree in a fixed order, repeated ones repeatedly."""
+    """Yield all objects of a tree in a fixed order, shared objects once per occurrence."""
     yield value
     if isinstance(value, (tuple, list)):
         for item in value:
@@ -345,7 +349,7 @@ def _parts(value: object) -> Iterator[object]:
 
 
 def _attributes(value: Any) -> Iterator[tuple[str, Any]]:
-    """Yield names and values of slots and attributes."""
+    """Yield the names and values of the slots and attributes of an object."""
     for cls in type(value).__mro__:
         for name in getattr(cls, "__slots__", ()):
             if hasattr(value, name) and not name.startswith("__"):
@@ -354,7 +358,7 @@ def _attributes(value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _is_ours(cls: type) -> bool:
-    """Return whether a class belongs to the numerical packages."""
+    """Return whether a class belongs to the packages whose objects may be serialized."""
     package, _, rest = cls.__module__.partition(".")
     return package == __name__.partition(".")[0] and rest.partition(".")[0] in _PACKAGES
 
@@ -367,22 +371,22 @@ def _class(path: str) -> type:
     module, _, name = path.partition(":")
     package, _, rest = module.partition(".")
     if package != __name__.partition(".")[0] or rest.partition(".")[0] not in _PACKAGES:
-        raise ValueError(f"{path!r} is no class of a numerical package")
+        raise ValueError(f"{path!r} is no class that a checkpoint may contain")
     found = getattr(importlib.import_module(module), name)
     if not (isinstance(found, type) and _is_ours(found)):
-        raise ValueError(f"{path!r} is no class of a numerical package")
+        raise ValueError(f"{path!r} is no class that a checkpoint may contain")
     return found
 
 
 def _order(array: NDArray[Any]) -> list[int]:
-    """Return the axes in their order in memory."""
+    """Return the axes of an array in their order in memory."""
     long = [axis for axis in range(array.ndim) if array.shape[axis] > 1 and array.size]
     rest = [axis for axis in range(array.ndim) if axis not in long]
     return sorted(long, key=lambda axis: -array.strides[axis]) + rest
 
 
 def _memory(array: NDArray[Any]) -> NDArray[Any] | None:
-    """Return the bytes of an array without gaps as a view; None if it has gaps."""
+    """Return the bytes of an array as a view, or None if the memory is not contiguous."""
     ordered = array.transpose(_order(array))
     return ordered.reshape(-1).view(np.uint8) if ordered.flags.c_contiguous else None
 

@@ -2,7 +2,7 @@
 
 The operations are those of COLMAP's ``IncrementalTriangulator`` (``Continue``, ``Create``,
 ``Complete``, ``Merge``), vectorized over the edges of the correspondence graph. If the
-triangulation angle is low, a point is lifted from depth instead (paper section 3.2).
+triangulation angle is low, a point is lifted from the depth map instead (paper section 3.2).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mpsfm_core.mapping.scene.scene import Scene
 
 
 def triangulate_image(scene: Scene, image: int, options: TriangulationOptions) -> None:
-    """Continue tracks into a newly registered image, and create tracks with its neighbors."""
+    """Continue tracks into a newly registered image, and create tracks with matched images."""
     edges = _get_registered_edges(scene, image)
     max_error_px = _max_angle_error_px(scene, image, options)
     extend_tracks(scene, image, edges, max_error_px)
@@ -35,11 +35,12 @@ def complete_and_merge_tracks(
     Args:
         scene: The scene.
         options: ``max_error_px`` limits the reprojection errors in pixels.
-        images: Images whose tracks are completed. The default is all registered images.
-        create: Also create tracks from matches without a point (COLMAP's ``Retriangulate``).
+        images: Images whose tracks are completed, by default all registered images.
+        create: Also create tracks from matches that observe no 3D point (COLMAP's
+            ``Retriangulate``).
 
     Returns:
-        The number of changed observations.
+        The number of observations that were added or changed.
     """
     before = scene.tracks.point_of.copy()
     images = list(map(int, scene.registered_images())) if images is None else images
@@ -56,7 +57,7 @@ def complete_and_merge_tracks(
 def extend_tracks(
     scene: Scene, image: int, edges: tuple[Int64, Int64], max_error_px: float
 ) -> None:
-    """Add keypoints of an image without a point to the tracks of the keypoints that they match.
+    """Add keypoints that observe no 3D point to the tracks of their matched keypoints.
 
     Args:
         scene: The scene.
@@ -82,15 +83,16 @@ def extend_tracks(
 def create_tracks(
     scene: Scene, edges: tuple[Int64, Int64], max_error_px: float, options: TriangulationOptions
 ) -> None:
-    """Create tracks for keypoints of one image from matches without a point.
+    """Create tracks for keypoints of one image from matches that observe no 3D point.
 
-    Each match of a keypoint gives one hypothesis, a triangulated or lifted point. The hypothesis
-    that most matches of the keypoint support becomes the point, and its inliers become the track.
+    Each match of a keypoint gives one point hypothesis, triangulated or lifted from depth. The
+    hypothesis that most matches of the keypoint support becomes the point, and its inliers become
+    the track.
 
     Args:
         scene: The scene.
         edges: Source and target keypoints (e,) of the matches of the image to registered images.
-        max_error_px: Largest reprojection error in pixels of an inlier.
+        max_error_px: Largest reprojection error of an inlier, in pixels.
         options: Options with the angle limits for triangulation and for lifting.
     """
     tracks = scene.tracks
@@ -126,15 +128,16 @@ def triangulate_or_lift(
     """Triangulate a point for each match, or lift it from depth if the angle is low.
 
     A point is lifted from the depth map of the target image if its depth is valid there, because
-    that map has been refined more often. If the depth in the target image is not valid, the point
-    is lifted from the source image.
+    the depth map of the target image has been refined more often. If the depth in the target image
+    is not valid, the point is lifted from the source image.
 
     Args:
         scene: The scene.
         source: (m,) keypoints.
         target: (m,) target keypoints that match the source keypoints.
         max_error_px: Largest reprojection error in pixels in both images.
-        options: ``min_angle_deg`` is the triangulation angle below which points are lifted.
+        options: The option ``min_angle_deg`` is the triangulation angle below which points are
+        lifted from depth.
 
     Returns:
         Points (m, 3) in the world frame, and a mask (m,) of points in front of both cameras with
@@ -154,13 +157,14 @@ def triangulate_or_lift(
     has_depth[lifts] = source_valid | target_valid
     angle_deg = triangulation_angle_deg(center_a, center_b, points)
     valid = _reprojects(scene, source, target, points, max_error_px) & (~lifts | has_depth)
-    # A lifted point must not replace the point of rays that miss each other at a wide angle.
+    # A point lifted from depth must not replace the point of two rays that miss each other at a
+    # wide angle.
     valid &= ~lifts | (angle_deg < 2 * options.min_angle_deg) | ~np.isfinite(angle_deg)
     return points, valid
 
 
 def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int]) -> None:
-    """Merge the points of matched keypoints if their mean fits all observations of both points.
+    """Merge the 3D points of matched keypoints if the mean point fits all their observations.
 
     Args:
         scene: The scene.
@@ -257,14 +261,14 @@ def _get_registered_edges(scene: Scene, image: int) -> tuple[Int64, Int64]:
 
 
 def _max_angle_error_px(scene: Scene, image: int, options: TriangulationOptions) -> float:
-    """Convert ``max_angle_error_deg`` to a distance in pixels at the principal point."""
+    """Convert ``max_angle_error_deg`` to a distance from the principal point in pixels."""
     return float(scene.intrinsics[image, 0] * np.tan(np.radians(options.max_angle_error_deg)))
 
 
 def _reprojects(
     scene: Scene, source: Int64, target: Int64, points: Float64, max_error_px: float
 ) -> Bool:
-    """Return (m,) True for points that project close to both keypoints of their match."""
+    """Return a mask (m,) of points that project close to both keypoints of their match."""
     valid: Bool = np.asarray(np.isfinite(points).all(axis=1))
     for keypoints in (source, target):
         with np.errstate(invalid="ignore"):
@@ -274,12 +278,12 @@ def _reprojects(
 
 
 def _first_occurrences(values: Int64) -> Int64:
-    """Return the positions, ascending, at which each value occurs for the first time."""
+    """Return the ascending array positions at which each value occurs for the first time."""
     return np.sort(np.unique(values, return_index=True)[1])
 
 
 def _pairs_within_groups(groups: Int64) -> tuple[Int64, Int64]:
-    """Return all ordered pairs of positions with equal values, also of a position and itself.
+    """Return all ordered pairs of array positions with equal values, and each with itself.
 
     Args:
         groups: (m,) sorted values.
@@ -290,7 +294,7 @@ def _pairs_within_groups(groups: Int64) -> tuple[Int64, Int64]:
 
 
 def _expand_ranges(first: Int64, counts: Int64) -> tuple[Int64, Int64]:
-    """Expand ranges ``first[r] .. first[r] + counts[r] - 1``, and return row and item of each."""
+    """Expand ranges ``first[r] .. first[r] + counts[r] - 1`` to arrays of rows ``r`` and items."""
     rows = np.repeat(np.arange(len(counts)), counts)
     within = np.arange(len(rows)) - np.repeat(np.cumsum(counts) - counts, counts)
     return rows, first[rows] + within

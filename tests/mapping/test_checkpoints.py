@@ -136,7 +136,7 @@ def test_a_damaged_state_is_a_new_start(problem: MappingProblem, undisturbed) ->
     broken.append({**states[0], "tree": np.frombuffer(b'{"format":0,"state":1}', np.uint8)})
     broken.append({**states[0], "tree": np.frombuffer(b'{"format":1,"state":1}', np.uint8)})
     for state in broken[:-1]:
-        with pytest.raises(DataError, match="state: is damaged"):
+        with pytest.raises(DataError, match="state: the checkpoint is damaged"):
             deserialize(state, (problem, NullMappingEvents()))
     memory = Memory([broken[-1]], 2)
     with pytest.raises(Killed):
@@ -150,7 +150,7 @@ def test_a_damaged_state_is_a_new_start(problem: MappingProblem, undisturbed) ->
 )
 def test_no_other_classes_come_out_of_a_state(path: str) -> None:
     text = f'{{"format":1,"state":{{"id":0,"object":"{path}","attributes":{{}}}}}}'
-    with pytest.raises(DataError, match="no class of a numerical package"):
+    with pytest.raises(DataError, match="no class that a checkpoint may contain"):
         deserialize({"tree": np.frombuffer(text.encode(), np.uint8)})
 
 

@@ -10,21 +10,21 @@ from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 GRID = 24
-"""Columns and rows of the sampled pixels that are compared with other images. [ours]"""
+"""Columns and rows of the pixel grid whose depth is compared with other images. [ours]"""
 
 
 def measure_depth_agreement(model: Reconstruction, options: ConsistencyOptions) -> float:
-    """Measure the share of the images' depth that agrees with the depth of other images.
+    """Measure the share of pixels whose depth agrees with the depth of other images.
 
-    A misregistered image may contradict no other image, because it looks past their surfaces. The
-    depth of a misregistered image then also agrees little with other images.
+    The depth of a misregistered image may contradict no other image, because both may see different
+    surfaces. Little of the depth then agrees with other images.
 
     Args:
         model: The reconstructed model, with refined depth maps.
         options: The options ``max_deviation`` and ``min_gap`` define when two depths agree.
 
     Returns:
-        The share of agreeing pixels, summed over all ordered pairs of images.
+        Share of pixels with agreeing depth, summed over all ordered pairs of images.
     """
     images = [image for image in model.images if image.confirmed]
     samples = [_sample_points(image) for image in images]
@@ -37,14 +37,14 @@ def measure_depth_agreement(model: Reconstruction, options: ConsistencyOptions) 
 
 
 def _sample_points(image: RegisteredImage) -> tuple[Float64, Float64]:
-    """Return the world points (n, 3) of a depth map, and the std of their log depth (n,)."""
+    """Return the world points (n, 3) of a depth map, and the standard deviation of log depth."""
     depth = image.depth
     rows, columns = depth.shape
     xy = pixel_centers(GRID, GRID).reshape(-1, 2) * [columns, rows] / GRID
     column, row = np.floor(xy).astype(np.int64).T
     known = depth.valid[row, column]
     z = depth.depth[row, column].astype(np.float64)
-    assert depth.variance is not None  # all refined depth maps have a variance
+    assert depth.variance is not None  # all refined depth maps contain a variance of depth
     log_std = np.sqrt(depth.variance[row, column]) / np.where(known, z, 1.0)
     points = unproject(image.camera.resized(columns, rows), xy[known], z[known])
     return (points - image.translation) @ image.rotation, log_std[known]

@@ -1,31 +1,33 @@
 """Dense depth consistency check between posed images (paper section 3.4).
 
 Each pixel of an image's refined depth map is projected into another image. If the pixel is clearly
-in front of the surface there, both depth maps contradict each other. The other image then sees
-empty space where the pixel has a surface. A pixel behind the surface is occluded. Two explanations
-of a contradiction compete:
+in front of the surface in that image, both depth maps contradict each other, because that image
+sees empty space where the pixel has a surface. A pixel behind the surface of the other image is
+occluded. A contradiction of depth maps has one of two causes.
 
-* The depth is wrong. The errors of log depth in both images are normal with standard deviations
-  ``s`` and ``s'``. The likelihood is ``L = E_e[exp(-(e' / s')^2 / 2)]`` over the errors ``e`` along
-  the pixel's ray, where ``e'`` moves the other surface to the shifted pixel. ``e'`` is 0 if the
-  shifted pixel is occluded or outside the other image. At wide angles, an error of depth is also a
-  lateral shift in the other image. The expectation replaces the maximum because some error nearly
-  always shifts the pixel past a depth edge.
-* The pose is wrong. Then the other surface is independent of the pixel.
+* The depth is wrong. The errors of log depth in both images have normal distributions with standard
+  deviations ``s`` and ``s'``. The likelihood of the contradiction is ``L = E_e[exp(-(e' / s')^2 /
+  2)]`` over the errors ``e`` along the pixel's ray, where ``e'`` is the log depth from the other
+  surface to the shifted pixel, and 0 if the shifted pixel is occluded or outside the other image.
+  At wide angles, an error of depth also shifts the pixel laterally in the other image. The
+  likelihood is the expectation over ``e`` instead of the maximum, because some error nearly always
+  shifts the pixel past a depth edge.
+* The pose is wrong. The surface in the other image is then independent of the pixel.
 
 A pixel is a violation if ``L`` is below the likelihood of a deviation of ``max_deviation`` standard
-deviations. The violation ratio is the share of such pixels, summed over both directions (beta in
-the paper).
+deviations. The violation ratio (beta in the paper) is the share of violating pixels, summed over
+both directions.
 
-The check needs the local standard deviation of depth, because a good prior can be wrong in one
-spot. Triangulated points that do not depend on the prior measure it
-(:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_local_depth_noise`). If they contradict
-the prior, the standard deviation grows and the pixel is no violation. If they confirm it, or if
-there are none, the global value applies. An image registered to a look-alike place has points only
-on the shared structure, where depth fits, so the differing structure still counts.
+The depth check needs the standard deviation of depth at each pixel, because a good prior can be
+wrong in one spot. Triangulated points that do not depend on the prior measure this standard
+deviation (:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_local_depth_noise`). If nearby
+points contradict the prior, the standard deviation grows and the pixel is no violation. Otherwise
+the standard deviation of the whole scene applies. An image registered to a look-alike place
+observes points only on look-alike structure, so structure that differs still causes violations.
 
-An image is compared with all images that it overlaps with, not only with those that share points.
-The images that share points with a misregistered image look alike, so they cannot reveal it.
+The depth of an image is compared with all overlapping images, not only with those that share
+points. Images that share points with a misregistered image look alike, so their depth may agree
+with the wrong pose.
 """
 
 from __future__ import annotations
@@ -50,13 +52,13 @@ from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample,
 from mpsfm_core.support import jit
 
 NUM_ERROR_STEPS = 4
-"""Number of samples of the depth error on either side of 0, evenly spaced up to ``max_deviation``.
-[ours]"""
+"""Number of samples of the depth error on either side of 0, evenly spaced up to the option
+``max_deviation``. [ours]"""
 PIXEL_STRIDE = 2
 """Distance in pixels between the compared pixels of the subsampled maps. [ours]"""
 MIN_SIGNIFICANCE = 3.0
-"""Number of standard deviations between the violation ratio of a quarter of the pixels and the
-limit at which all other pixels are skipped. [ours]"""
+"""Number of standard deviations from the limit, beyond which the violation ratio of a quarter of
+the pixels decides and all other pixels are skipped. [ours]"""
 OVERLAP_GRID = 16
 """Columns and rows of the pixel grid that measures the overlap of two images. [ours]"""
 MIN_OVERLAP_RATIO = 0.05
@@ -68,19 +70,19 @@ class DepthViolation(NamedTuple):
     """Largest depth violation between an image and all other images."""
 
     ratio: float
-    """Violation ratio of the image pair, summed over both directions, in [0, 2]."""
+    """Share of pixels with contradicting depth, summed over both images of the pair, in [0, 2]."""
     other_image: int
     """Index of the image that contradicts the checked image, or -1 if no image overlaps."""
 
 
 class DepthConsistencyCheck:
-    """Depth consistency check of a scene, which caches subsampled depth maps.
+    """Depth consistency check of the images of a scene, which caches subsampled depth maps.
 
     Args:
         scene: The scene.
         options: Thresholds of the depth consistency check.
-        fill_holes: Fill holes of one or two pixels in sensor depth maps. Without filling, a
-            slightly wrong pose sees other surfaces through the holes.
+        fill_holes: The check fills holes of one or two pixels in sensor depth maps. Otherwise, with
+            a slightly wrong pose, an image sees other surfaces through these holes.
     """
 
     def __init__(
@@ -94,12 +96,11 @@ class DepthConsistencyCheck:
     def check_image(
         self, image: int, std_factor: float = 1.0, limit: float = math.nan
     ) -> DepthViolation:
-        """Return the largest violation ratio of an image with the images that overlap it most.
+        """Return the largest violation ratio of an image and its most overlapping images.
 
         Args:
             image: A registered image.
-            std_factor: Measured standard deviation of depth relative to the declared standard
-                deviation.
+            std_factor: Ratio of the measured and the declared standard deviation of depth.
             limit: See :meth:`measure_violation_ratio`.
         """
         violations = [
@@ -116,12 +117,12 @@ class DepthConsistencyCheck:
         Images with the most contradictions are deregistered first (greedy vertex cover).
 
         Args:
-            images: Images that are compared with all images that they overlap.
+            images: Images whose depth is compared with all overlapping images.
             limit: Violation ratio above which two images contradict each other.
             std_factor: See :meth:`check_image`.
 
         Returns:
-            The images to deregister, each with its largest violation ratio.
+            Images to deregister, each with its largest violation ratio.
         """
         scene = self._scene
         ratios = np.full((scene.num_images, scene.num_images), np.nan)
@@ -156,11 +157,12 @@ class DepthConsistencyCheck:
             a: A registered image.
             b: Another registered image.
             std_factor: See :meth:`check_image`.
-            limit: Limit that the ratio is compared with. A ratio that is significantly below or
-                above it is measured on a quarter of the pixels. NaN measures all pixels.
-            by_target_area: Weight a violation by its area in the other image, at most 1. A near
-                surface may project to few pixels, which refined maps resolve worst. This demands
-                clearer evidence against images that are registered already.
+            limit: Limit to which the violation ratio is compared. A quarter of the pixels is
+                measured if it shows significantly that the ratio is below or above the limit. NaN
+                measures all pixels.
+            by_target_area: Weight a violating pixel by its area in the other image, at most 1. A
+                near surface may project to few pixels, which refined maps resolve worst. The
+                weights demand clearer evidence against images that are registered already.
         """
         scene, options = self._scene, self._options
         rotation = scene.rotations[b] @ scene.rotations[a].T
@@ -194,7 +196,7 @@ class DepthConsistencyCheck:
                 self._scene, image, find_well_constrained_keypoints(self._scene, image), std_factor
             )
             std = subsample(depth_map.log_std, step) * subsample(local, step)
-        # An error of one pixel changes the depth at edges and at grazing angles.
+        # A projection error of one pixel changes the depth at edges and at grazing angles.
         kernel = np.ones((3, 3))
         nearest = cv2.erode(np.where(valid, depth, np.float32(np.inf)), kernel)
         if self._fill_holes:
@@ -205,7 +207,7 @@ class DepthConsistencyCheck:
 
 
 def find_overlapping_images(scene: Scene, image: int, max_images: int) -> list[int]:
-    """Return the registered images into which most of a depth map projects, best first."""
+    """Return the registered images into which most pixels of a depth map project, best first."""
     others = scene.registered_images()
     others = others[(others != image) & np.array([scene.maps[i].active for i in others])]
     depth_map = scene.maps[image]
@@ -231,14 +233,14 @@ def find_overlapping_images(scene: Scene, image: int, max_images: int) -> list[i
 def count_visible_points(
     points: Float64, rotations: Float64, translations: Float64, intrinsics: Float64, sizes: Float64
 ) -> Int64:
-    """Count the points that project into each image.
+    """Count the 3D points that project into each image.
 
     Args:
-        points: (p, 3) world points.
-        rotations: (n, 3, 3) ``cam_from_world``.
+        points: (p, 3) points in the world frame.
+        rotations: (n, 3, 3) rotations ``cam_from_world``.
         translations: (n, 3) ``cam_from_world``.
-        intrinsics: (n, 4) fx, fy, cx, cy in pixels.
-        sizes: (n, 2) width and height in pixels.
+        intrinsics: (n, 4) intrinsics fx, fy, cx, cy of each image in pixels.
+        sizes: (n, 2) width and height of each image in pixels.
 
     Returns:
         (n,) int64.
@@ -271,11 +273,11 @@ class _DepthGrid(NamedTuple):
     nearest: Float32
     """(h, w) smallest depth in the 3 x 3 neighborhood, in world units."""
     intrinsics: Float64
-    """(4,) fx, fy, cx, cy in pixels of the grid."""
+    """(4,) intrinsics fx, fy, cx, cy in pixels of the subsampled grid."""
 
 
 class _DepthMapState(NamedTuple):
-    """Inputs of a subsampled depth map, by which the cache detects a change.
+    """Inputs of a subsampled depth map, which the cache compares to detect a change.
 
     The points that measure the local standard deviation are not compared, because the depth map is
     refined whenever these points change.
@@ -291,11 +293,12 @@ class ViolationCriteria(NamedTuple):
     """Criteria for a pixel to count as a violation."""
 
     max_deviation: float
-    """Largest deviation, in standard deviations, that errors of depth explain."""
+    """Largest deviation that errors of depth explain, in standard deviations of log depth."""
     min_gap: float
-    """Smallest distance in front of the other surface, relative to its depth."""
+    """Smallest distance between a violating pixel and the surface behind it, relative to the depth
+    of that surface."""
     by_target_area: bool
-    """Weight a violation by its area in the other image, at most 1."""
+    """Weight a violating pixel by its area in the other image, at most 1."""
 
 
 @jit.kernel()
@@ -307,16 +310,16 @@ def compute_violation_ratio(
     criteria: ViolationCriteria,
     limit: float,
 ) -> float:
-    """Compute the violation ratio of two images, summed over both directions.
+    """Compute the share of pixels with contradicting depth, summed over both images.
 
     Args:
-        grid_a: Depth of the first image.
-        grid_b: Depth of the second image.
+        grid_a: Subsampled depth map of the first image.
+        grid_b: Subsampled depth map of the second image.
         rotation: (3, 3) ``b_from_a``.
         translation: (3,) ``b_from_a``.
-        criteria: Criteria of a violation.
-        limit: A quarter of the pixels suffices if it decides on which side of the limit the ratio
-            is.
+        criteria: Criteria for a pixel to be a violation.
+        limit: Limit of the violation ratio. A quarter of the pixels is measured if it shows
+            significantly on which side of the limit the ratio is.
     """
     inverse_rotation, counts = rotation.T.copy(), np.zeros((2, 2))
     inverse_translation = -inverse_rotation @ translation
@@ -341,12 +344,12 @@ def _count_violations(
     criteria: ViolationCriteria,
     quarter: int,
 ) -> Float64:
-    """Count violations in one direction and the compared pixels: one of four pixel lattices."""
+    """Count the violating and the compared pixels of one image on one of four pixel lattices."""
     rows, columns = target.depth.shape
     r, t, num_violations, num_pixels = rotation, translation, 0.0, 0.0
     limit = criteria.max_deviation
     zoom = target.intrinsics[0] / source.intrinsics[0]
-    # 0 first, then alternating signs: most pixels need no error at all
+    # sample the depth error 0 first, because most pixels are consistent without a depth error
     steps = np.arange(2 * NUM_ERROR_STEPS + 1)
     errors = limit * ((steps + 1) // 2) / NUM_ERROR_STEPS * (1 - 2 * (steps % 2))
     weights = np.exp(-errors * errors / 2) * limit / NUM_ERROR_STEPS / math.sqrt(2 * math.pi)
