@@ -1,4 +1,4 @@
-"""Decoders of optional libraries: HEIF images of phones, raw files of cameras."""
+"""Decode HEIF and AVIF images and raw camera files with optional libraries."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ RAW = frozenset(
         *(".srw", ".nrw", ".rwl", ".3fr", ".iiq", ".mrw", ".erf", ".kdc", ".mef", ".x3f"),
     )
 )
-"""Extensions of raw files. The content does not identify them: most are TIFF files."""
+"""File extensions of raw camera images, whose content looks like TIFF."""
 
 
 def find_decoder(data: bytes, path: Path) -> Callable[[bytes, Path], UInt8] | None:
-    """Return the decoder of an image that OpenCV does not read, else None.
+    """Return a decoder for an image format that OpenCV cannot read, else None.
 
     Args:
-        data: content of the file.
-        path: its extension identifies raw files.
+        data: bytes of the image file.
+        path: path of the image file, whose extension identifies raw camera images.
 
     Returns:
-        A function of ``data`` and ``path`` that returns the upright image, (H, W, 3) uint8 RGB. It
-        raises :class:`InputError` for a damaged file and for a missing library.
+        A function of ``data`` and ``path`` that returns the upright image, (H, W, 3) uint8 RGB. The
+        decoder raises :class:`InputError` for a damaged image or a missing library.
     """
     if is_heif(data):
         return _decode_heif

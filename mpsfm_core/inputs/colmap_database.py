@@ -1,6 +1,6 @@
 """Reader of COLMAP's database of cameras, keypoints and matches.
 
-Reads the SQLite file directly because pycolmap aborts the process on a damaged database.
+The SQLite file is read directly because pycolmap aborts the process on a damaged database.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from mpsfm_core.data import Float64, Int64
 from mpsfm_core.data.errors import InputError
 
 _MAX_IMAGES = 2**31 - 1
-"""Factor between the two image ids of a pair id [COLMAP kMaxNumImages]."""
+"""Factor of the smaller image id in COLMAP's ``pair_id`` [COLMAP kMaxNumImages]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,19 +28,18 @@ class ColmapDatabase:
     """Cameras, images, keypoints and matches of a COLMAP database."""
 
     path: Path
-    """File of the database, for messages."""
+    """Path of the database file, for error messages."""
     cameras: dict[int, pycolmap.Camera]
-    """Camera id -> camera."""
+    """Mapping of camera ids to cameras."""
     images: dict[str, int]
-    """Image name -> image id."""
+    """Mapping of image names to image ids."""
     camera_of: dict[int, int]
-    """Image id -> camera id."""
+    """Mapping of image ids to camera ids."""
     keypoints: dict[int, Float64]
-    """Image id -> (n, 2) float64, pixels of the stored image (EXIF orientation not applied)."""
+    """Keypoints by image id, (n, 2) float64 in pixels before EXIF rotation."""
     matches: dict[tuple[int, int], Int64]
-    """(smaller, larger image id) -> (m, 2) int64 rows of keypoints.
-
-    The raw matches if the database has them for the pair, else the verified matches.
+    """Matches by pair (smaller, larger image id) as (m, 2) int64 keypoint indices. Raw matches of a
+    pair are preferred to its verified matches.
     """
 
 
@@ -48,7 +47,7 @@ def read_database(path: Path) -> ColmapDatabase:
     """Read a COLMAP database without changing it.
 
     Raises:
-        InputError: the file is missing or damaged; the message names the record.
+        InputError: the database is missing or damaged; the message names the damaged record.
     """
     if not path.is_file():
         raise InputError(f"COLMAP database {path} does not exist; check the path")

@@ -1,7 +1,7 @@
 """Validation of COLMAP's binary model files before pycolmap reads them.
 
 COLMAP's reader does not check record counts: a damaged file can take unlimited time and memory.
-The functions here compare every count with the size of the file.
+This module compares every record count with the size of its file.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def check_binary_model(folder: Path) -> None:
     """Check that the record counts in a binary model fit the sizes of its files.
 
     Raises:
-        ValueError: a file ends before its last record.
+        ValueError: a model file ends before its last record.
     """
     for name, record_end in _RECORDS.items():
         path = folder / f"{name}.bin"
@@ -75,4 +75,4 @@ _RECORDS = {
     "frames": _frame_end,
     "rigs": _rig_end,
 }
-"""File stem -> function that returns the end (at least) of the record that starts at a byte."""
+"""Functions by file stem that return a lower bound of a record's end from its start offset."""

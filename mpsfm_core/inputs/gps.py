@@ -1,4 +1,4 @@
-"""GPS positions in EXIF data, and their conversion to east, north, up."""
+"""Read GPS positions from EXIF data and convert them to east, north, up."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ _GPS_IFD = 0x8825
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE = 1, 2, 3, 4
 _ALTITUDE_REF, _ALTITUDE, _ERROR_M = 5, 6, 31
 DEFAULT_STD_M = 5.0
-"""Horizontal std in meters if EXIF has none: a phone under open sky [GPS.gov: 4.9 m]."""
+"""Default horizontal standard deviation of GPS in meters, for a phone [GPS.gov, 4.9 m]."""
 
 
 @dataclass(frozen=True)
 class GpsPosition:
-    """Position in WGS84."""
+    """GPS position in WGS84."""
 
     latitude: float
-    """Degrees, [-90, 90]."""
+    """Latitude in degrees, [-90, 90]."""
     longitude: float
-    """Degrees, [-180, 180]."""
+    """Longitude in degrees, [-180, 180]."""
     altitude: float | None = None
-    """Meters, None if unknown."""
+    """Altitude in meters, None if unknown."""
     std_m: float = DEFAULT_STD_M
-    """Horizontal standard deviation in meters."""
+    """Horizontal standard deviation of the position in meters."""
 
 
 def read_gps(data: bytes) -> GpsPosition | None:
     """Read the GPS position from the EXIF data of an encoded image.
 
     Returns:
-        The position. None if it is missing, (0, 0), out of range or not a number.
+        The GPS position, or None if EXIF has no position or an invalid one such as (0, 0).
     """
     block = exif_block(data)
     if block is None:
@@ -62,10 +62,10 @@ def read_gps(data: bytes) -> GpsPosition | None:
 
 
 def convert_to_enu(positions: Sequence[GpsPosition], origin: GpsPosition) -> Float64:
-    """Convert positions to meters east, north, up of an origin.
+    """Convert GPS positions to meters east, north and up of an origin.
 
     Returns:
-        (n, 3) float64; up is NaN for a position without altitude.
+        (n, 3) float64 east-north-up coordinates in meters; up is NaN without altitude.
     """
     reference = origin.altitude or 0.0
     geographic = [
@@ -82,7 +82,7 @@ def convert_to_enu(positions: Sequence[GpsPosition], origin: GpsPosition) -> Flo
 
 
 def _values(block: bytes) -> dict[int, object]:
-    """Read the entries of the GPS directory: texts as bytes, numbers as lists."""
+    """Read the entries of the EXIF GPS directory, texts as bytes and numbers as lists."""
     for tag, kind, count, place in tiff_entries(block):
         if tag == _GPS_IFD and kind in (4, 13) and count == 1:
             order = "<" if block[:2] == b"II" else ">"

@@ -1,4 +1,4 @@
-"""Reader of hloc's HDF5 files of features and matches; needs h5py."""
+"""Read hloc's HDF5 files of features and matches with h5py."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from mpsfm_core.data import Float32, Float64, Int64
 from mpsfm_core.data.errors import InputError
 
 _TO_COLMAP = 0.5
-"""Offset to COLMAP's pixels: the center of hloc's first pixel is (0, 0)."""
+"""Offset in pixels from hloc to COLMAP keypoints, because hloc's first pixel center is (0, 0)."""
 
 
 class HlocFiles:
-    """Features file and matches file of one set of images.
+    """The features file and the matches file that hloc wrote for a set of images.
 
-    All methods raise :class:`InputError` that names what is missing or damaged.
+    All methods raise an :class:`InputError` that names the missing or damaged file or dataset.
     """
 
     def __init__(self, features: Path, matches: Path) -> None:
@@ -32,11 +32,11 @@ class HlocFiles:
         return [n.removesuffix(suffix) for n in self.features.datasets() if n.endswith(suffix)]
 
     def keypoints(self, name: str) -> tuple[Float64, float]:
-        """Read the keypoints of an image and their noise.
+        """Read the keypoints of an image and their standard deviation.
 
         Returns:
-            (n, 2) float64, COLMAP pixels of the stored image (EXIF orientation not applied), and
-            their standard deviation in pixels.
+            (n, 2) float64 keypoints in COLMAP pixels before EXIF rotation, and their standard
+            deviation in pixels.
         """
         values, attributes = self.features.read(f"{name}/keypoints")
         where = f"{self.features.path}, keypoints of {name!r}"
@@ -48,7 +48,7 @@ class HlocFiles:
         return values.astype(np.float64) + _TO_COLMAP, float(std)
 
     def size(self, name: str) -> tuple[int, int] | None:
-        """Return (width, height) of the stored image, None if the file does not have it."""
+        """Return (width, height) of an image before EXIF rotation, None if the file has no size."""
         if not self.features.has(f"{name}/image_size"):
             return None
         values = self.features.read(f"{name}/image_size")[0].ravel()
@@ -57,7 +57,7 @@ class HlocFiles:
         return int(values[0]), int(values[1])
 
     def pairs(self, names: list[str]) -> Iterator[tuple[str, str, Int64, Float32]]:
-        """Yield the matches of each pair: names, keypoint rows (m, 2), scores (m,) in [0, 1]."""
+        """Yield both names, keypoint indices (m, 2) and scores (m,) in [0, 1] of each pair."""
         written = {name.replace("/", "-"): name for name in names}
         suffix = "/matches0"
         for dataset in self.matches.datasets():
@@ -86,7 +86,7 @@ class HlocFiles:
 
 
 class _Hdf5:
-    """HDF5 file that is opened for each read and closed again."""
+    """HDF5 file that is open only during a read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -100,7 +100,7 @@ class _Hdf5:
             raise InputError(f"{path} does not exist; check the path")
 
     def datasets(self) -> list[str]:
-        """Return the full names of all datasets."""
+        """Return the full names of all datasets in the HDF5 file."""
         names: list[str] = []
 
         def visit(name: str, item: object) -> None:
@@ -112,12 +112,12 @@ class _Hdf5:
         return names
 
     def has(self, name: str) -> bool:
-        """Return whether there is a dataset or group of this name."""
+        """Return whether the HDF5 file has a dataset or group of this name."""
         with self._open() as file:
             return bool(self._guarded(name, lambda: name in file))
 
     def read(self, name: str) -> tuple[Any, dict[str, Any]]:
-        """Read values and attributes of a dataset."""
+        """Read the values and attributes of an HDF5 dataset."""
         with self._open() as file:
             return (
                 np.asarray(self._guarded(name, lambda: file[name][()])),
@@ -135,7 +135,7 @@ class _Hdf5:
 
 
 def _split_pair_name(pair: str, written: dict[str, str]) -> tuple[str, str] | None:
-    """Return the images of a pair named ``A/B`` (or ``A_B``, old hloc), None if unknown."""
+    """Split hloc's pair name ``A/B`` (``A_B`` in old files) into image names, None if unknown."""
     for cut, letter in enumerate(pair):
         if letter in "/_" and pair[:cut] in written and pair[cut + 1 :] in written:
             return written[pair[:cut]], written[pair[cut + 1 :]]

@@ -1,4 +1,4 @@
-"""Decoding of image files to upright 8-bit RGB, and checks before it."""
+"""Check image files and decode them to upright 8-bit RGB."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ EXTENSIONS = (
         )
     )
 )
-"""Extensions of image files. The content decides the decoder, not the extension."""
+"""File extensions of images; the file content, not the extension, selects the decoder."""
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read the content of an image file; raise :class:`InputError` if this fails."""
+    """Read the bytes of an image file; raise :class:`InputError` if reading fails."""
     try:
         return path.read_bytes()
     except OSError as error:
@@ -44,7 +44,7 @@ def check_decodable(data: bytes, path: Path) -> None:
     """Decode an image at 1/8 size; raise :class:`InputError` if it is damaged or not an image."""
     if is_cut_jpeg(data):
         raise InputError(f"image {path} is cut off: its end is missing. Copy it again")
-    if find_decoder(data, path) is None:  # other formats are decoded in full to get their size
+    if find_decoder(data, path) is None:  # formats other than JPEG are decoded in full here
         decode_stored(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
 
@@ -59,9 +59,9 @@ def check_size(data: bytes, path: Path, max_pixels: int) -> None:
 
 
 def upright_size(data: bytes, header: ImageHeader, path: Path) -> tuple[int, int]:
-    """Return (width, height) with the EXIF orientation applied.
+    """Return (width, height) of an image after EXIF rotation.
 
-    Decodes the pixels only if the header has no size.
+    The pixels are decoded only if the image header has no size.
 
     Raises:
         InputError: the file is damaged or not an image.
@@ -76,10 +76,11 @@ def upright_size(data: bytes, header: ImageHeader, path: Path) -> tuple[int, int
 def decode_rgb(data: bytes, header: ImageHeader, path: Path) -> UInt8:
     """Decode an image and apply its EXIF orientation.
 
-    Scales 16-bit values by 1/257 and floats in [0, 1] by 255, repeats gray, drops alpha.
+    16-bit values are divided by 257, floats in [0, 1] multiplied by 255, gray is repeated as RGB,
+    and alpha is dropped.
 
     Returns:
-        (H, W, 3) uint8 RGB.
+        (H, W, 3) uint8 upright RGB image.
 
     Raises:
         InputError: the file is damaged or not an image.
@@ -102,7 +103,7 @@ def decode_rgb(data: bytes, header: ImageHeader, path: Path) -> UInt8:
 
 
 def orient(image: UInt8, orientation: int) -> UInt8:
-    """Turn a stored image upright; ``orientation`` is the EXIF value, 1 for upright."""
+    """Rotate or flip a stored image upright by its EXIF ``orientation`` (1 if already upright)."""
     if orientation >= 5:
         image = np.swapaxes(image, 0, 1)
     if orientation in (3, 4, 7, 8):
@@ -113,7 +114,7 @@ def orient(image: UInt8, orientation: int) -> UInt8:
 
 
 def apply_orientation_to_pixels(xy: Float64, size: tuple[int, int], orientation: int) -> Float64:
-    """Map pixels (n, 2) of a stored image of (width, height) to the image of :func:`orient`."""
+    """Map pixels (n, 2) of a stored image of (width, height) to its upright image."""
     x, y = xy[:, 0], xy[:, 1]
     width, height = size
     if orientation >= 5:
@@ -126,7 +127,7 @@ def apply_orientation_to_pixels(xy: Float64, size: tuple[int, int], orientation:
 
 
 def decode_stored(data: bytes, path: Path, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray[Any]:
-    """Decode the stored pixels with OpenCV: BGR or BGRA or gray, any depth, not oriented."""
+    """Decode an image with OpenCV to BGR, BGRA or gray of any bit depth, without EXIF rotation."""
     if not data:
         raise InputError(f"image {path} is empty")
     try:

@@ -1,4 +1,4 @@
-"""Parser of image headers: size, orientation, EXIF tags; pixels are not decoded."""
+"""Parse size, orientation and EXIF tags of image headers without decoding pixels."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _TYPE_FORMATS = {1: "B", 3: "H", 4: "I", 5: "II", 9: "i", 10: "ii"}
 _TYPE_SIZES = {3: 2, 4: 4, 5: 8, 8: 2, 9: 4, 10: 8, 11: 4, 12: 8}
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
 _MAX_ASPECT_DIFFERENCE = 0.02
-"""Difference of log aspect ratios above which an image counts as cropped since EXIF was written."""
+"""Difference of log aspect ratios of image and EXIF above which the image counts as cropped."""
 
 _TIFF_WIDTH, _TIFF_HEIGHT = 0x0100, 0x0101
 _ORIENTATION, _EXIF_IFD = 0x0112, 0x8769
@@ -38,19 +38,20 @@ class ImageHeader:
     """Header of an image file."""
 
     size: tuple[int, int] | None
-    """Stored (width, height) before rotation, None if only decoding the pixels gives it."""
+    """(width, height) in pixels before EXIF rotation, None if the header has no size."""
     orientation: int
     """EXIF orientation of the stored pixels, 1 to 8."""
     tags: dict[int, float]
-    """Numeric EXIF tags by number."""
+    """Values of the numeric EXIF tags by tag number."""
     projection: str | None = None
     """Projection of a panorama such as ``equirectangular``, None for other images."""
 
     def focal_px(self, width: int, height: int) -> float | None:
-        """Return the focal length in pixels of the image at a size, from EXIF.
+        """Return the focal length in pixels from EXIF, for an image of a given size.
 
-        Uses the 35 mm equivalent, defined by the diagonal (CIPA DCG-001). Without it, uses focal
-        length times focal-plane resolution. A value that no lens has counts as absent.
+        The 35 mm equivalent focal length is preferred, relative to the image diagonal (CIPA
+        DCG-001). Without a 35 mm equivalent, the focal length is multiplied by the focal-plane
+        resolution. Values that no lens has are ignored.
 
         Returns:
             Focal length in pixels, None if EXIF has none or the image was cropped.
@@ -60,7 +61,7 @@ class ImageHeader:
             ratio = (max(recorded) / min(recorded)) / (max(width, height) / min(width, height))
             if abs(math.log(ratio)) > _MAX_ASPECT_DIFFERENCE:
                 return None
-        # cameras write 0, 1 or 65535 for an unknown equivalent
+        # cameras write 0, 1 or 65535 for an unknown 35 mm equivalent
         equivalent_mm = self.tags.get(_FOCAL_35MM, 0.0)
         if is_plausible_equivalent(equivalent_mm):
             return equivalent_mm / DIAGONAL_35MM * math.hypot(width, height)
@@ -76,7 +77,7 @@ class ImageHeader:
 
 
 def read_declared_num_pixels(data: bytes) -> int | None:
-    """Return the number of pixels in the header of an encoded image, None if unknown."""
+    """Return the number of pixels of an encoded image from its header, None if unknown."""
     if data[:4] in (b"II*\x00", b"MM\x00*"):
         tags = _read_tags(data)
         size = tags.get(_TIFF_WIDTH), tags.get(_TIFF_HEIGHT)
@@ -89,8 +90,7 @@ def read_declared_num_pixels(data: bytes) -> int | None:
 def is_plain_rgb(data: bytes) -> bool:
     """Return whether an image is an 8-bit RGB JPEG or PNG, which all programs decode alike.
 
-    Gray, CMYK, palette, alpha and 16-bit images are not: many programs give them other shapes or
-    colors.
+    Programs differ in how they decode gray, CMYK, palette, alpha and 16-bit images.
     """
     if data[:2] == b"\xff\xd8":
         frames = (p for m, p in _jpeg_segments(data) if m in _JPEG_SOF and len(p) >= 6)
@@ -151,7 +151,7 @@ def _jp2_size(data: bytes) -> tuple[int, int] | None:
 
 
 def read_header(data: bytes) -> ImageHeader:
-    """Parse the header of an encoded image; omit damaged and unknown parts."""
+    """Parse the header of an encoded image and skip its damaged or unknown parts."""
     size: tuple[int, int] | None = None
     if data[:2] == b"\xff\xd8":
         for marker, payload in _jpeg_segments(data):
@@ -170,7 +170,7 @@ def read_header(data: bytes) -> ImageHeader:
 
 
 def exif_block(data: bytes) -> bytes | None:
-    """Return the TIFF structure with the EXIF data of an encoded image, None if there is none."""
+    """Return the TIFF structure that stores EXIF data in an image, None without EXIF."""
     if data[:2] == b"\xff\xd8":
         app1 = (p for m, p in _jpeg_segments(data) if m == 0xE1 and p.startswith(_EXIF_SIGNATURE))
         block = next(app1, None)
@@ -200,7 +200,7 @@ def _projection(data: bytes) -> str | None:
 
 
 def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield marker and payload of each segment before the pixels."""
+    """Yield marker and payload of each JPEG segment before the pixel data."""
     position = 2
     while position + 4 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
@@ -215,7 +215,7 @@ def _jpeg_segments(data: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _chunks(data: bytes, position: int, order: str) -> Iterator[tuple[bytes, bytes]]:
-    """Yield chunks of a PNG (big-endian, length first, CRC last) or RIFF (name first, padded)."""
+    """Yield the chunks of a PNG file or of a RIFF file such as WebP."""
     png = order == ">"
     while position + 8 <= len(data):
         first, second = data[position : position + 4], data[position + 4 : position + 8]
@@ -226,7 +226,7 @@ def _chunks(data: bytes, position: int, order: str) -> Iterator[tuple[bytes, byt
 
 
 def _read_tags(block: bytes) -> dict[int, float]:
-    """Read numeric tags of the first directory and the EXIF directory of a TIFF structure."""
+    """Read the numeric tags of a TIFF structure, from its first and its EXIF directory."""
     order = {b"II": "<", b"MM": ">"}.get(block[:2])
     if order is None or len(block) < 8:
         return {}
@@ -237,11 +237,11 @@ def _read_tags(block: bytes) -> dict[int, float]:
 
 
 def tiff_entries(block: bytes, offset: int | None = None) -> Iterator[tuple[int, int, int, int]]:
-    """Yield tag, type, number of values and offset of the first value of each directory entry.
+    """Yield tag, type, value count and value offset of each entry of a TIFF directory.
 
     Args:
-        block: TIFF structure. Iteration stops where it is cut off.
-        offset: position of the directory, by default the first one.
+        block: TIFF structure. Iteration stops at the end of the data if the directory is cut off.
+        offset: byte offset of the TIFF directory, by default of the first directory.
     """
     order = {b"II": "<", b"MM": ">"}.get(block[:2])
     if order is None or len(block) < 8:

@@ -1,4 +1,4 @@
-"""Search for images in a folder: names, lists of names, and files that cannot be read."""
+"""Find the images of a folder, read image lists, and report files that cannot be read."""
 
 from __future__ import annotations
 
@@ -17,29 +17,28 @@ from mpsfm_core.inputs.video import EXTENSIONS as VIDEO_EXTENSIONS
 _log = logging.getLogger(__name__)
 
 MAX_LISTED = 5
-"""Maximum number of names in a message."""
+"""Maximum number of file names in a message."""
 _UNREADABLE = frozenset(
     (".gif", ".jxl", ".psd", ".xcf", ".tga", ".exr", ".hdr", ".insp", ".gpr", ".heics", ".svg")
 )
-"""Extensions of pictures that are not read."""
+"""Extensions of image formats that no decoder of this package reads."""
 _SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\x00", b"MM\x00*")
-"""First bytes of images, to recognize files without extension."""
+"""First bytes of image formats, to recognize image files without extension."""
 _MASK_MARK = re.compile(r"[_.-]masks?$", re.IGNORECASE)
-"""End of the stem of a mask file such as ``X_mask.png`` (OpenDroneMap, Metashape)."""
+"""Endings of file stems of masks such as ``X_mask.png`` (OpenDroneMap, Metashape)."""
 
 
 def find_images(folder: Path, without: Path | None = None) -> list[str]:
-    """Find all images below a folder, through links to folders too.
+    """Find all images in a folder and its subfolders, following symbolic links.
 
-    Skips hidden files, the subfolder ``without``, and subfolders with results (those that contain
-    :data:`SUMMARY`). Logs a warning for pictures that are not read and for files that are masks
-    of images in the same folder.
+    Hidden files, the subfolder ``without``, and result folders (with a :data:`SUMMARY`) are
+    skipped. A warning lists unsupported image formats, and masks of images in the same folder.
 
     Returns:
-        Names relative to the folder, in natural order.
+        Image names relative to the folder, in natural order.
 
     Raises:
-        InputError: the folder does not exist or is not a folder.
+        InputError: the path does not exist or is not a folder.
     """
     if not folder.is_dir():
         if folder.exists():
@@ -86,19 +85,19 @@ def find_images(folder: Path, without: Path | None = None) -> list[str]:
 
 
 def find_videos(folder: Path) -> list[str]:
-    """Find all videos below a folder, as names relative to it in natural order."""
+    """Find all videos below a folder; return relative paths in natural order."""
     names = _walk_input_files(folder, None)
     videos = [name for name in names if PurePosixPath(name).suffix.lower() in VIDEO_EXTENSIONS]
     return sorted(videos, key=_natural_sort_key)
 
 
 def require_two_images(folder: Path, names: list[str], source: Path) -> None:
-    """Raise :class:`InputError` for fewer than two images, with the next step.
+    """Raise an :class:`InputError` that suggests a next step if there are fewer than two images.
 
     Args:
         folder: images folder.
-        names: images that were found.
-        source: folder or list to name in the message.
+        names: names of the images that were found.
+        source: path of the image folder or image list, for the message.
     """
     if len(names) >= 2:
         return
@@ -135,10 +134,10 @@ def check_output_folder(output: Path, folder: Path) -> None:
 
 
 def read_image_list(path: Path) -> list[str]:
-    """Read a text file with one image name a line; ``#`` starts a comment line.
+    """Read an image list, a text file with one image name per line and ``#`` comments.
 
     Raises:
-        InputError: the file cannot be read.
+        InputError: the image list cannot be read.
     """
     try:
         lines = read_text_file(path).splitlines()
@@ -148,10 +147,10 @@ def read_image_list(path: Path) -> list[str]:
 
 
 def select_listed_images(image_list: Path, names: list[str], folder: Path) -> list[str]:
-    """Return the names in a list file, in its order.
+    """Read an image list and check its names; keep their order.
 
     Raises:
-        InputError: a name is listed twice or is not among ``names``.
+        InputError: an image name is listed twice or is not among ``names``.
     """
     listed = read_image_list(image_list)
     available, seen = set(names), set()
@@ -166,9 +165,9 @@ def select_listed_images(image_list: Path, names: list[str], folder: Path) -> li
 
 
 def walk_files(folder: Path) -> Iterator[str]:
-    """Yield all files below a folder, relative and with forward slashes, except hidden ones.
+    """Yield relative paths, with forward slashes, of all files below a folder except hidden files.
 
-    Follows links to folders. A folder that several links reach is read once.
+    Symbolic links to folders are followed. A folder that several links reach is read once.
     """
     visited: set[tuple[int, int]] = set()
     for parent, folders, files in os.walk(folder, followlinks=True):
@@ -177,7 +176,7 @@ def walk_files(folder: Path) -> Iterator[str]:
             folders.clear()
             continue
         visited.add((status.st_dev, status.st_ino))
-        # Real folders first: images keep the names that they have without links.
+        # Real folders are visited before symbolic links, so that links do not change image names.
         visible = [name for name in folders if not name.startswith(".")]
         folders[:] = [
             name for _, name in sorted((Path(parent, n).is_symlink(), n) for n in visible)
@@ -189,7 +188,7 @@ def walk_files(folder: Path) -> Iterator[str]:
 
 
 def is_utf8(name: str) -> bool:
-    """Return whether a file name is valid UTF-8; COLMAP and JSON files cannot have other names."""
+    """Return whether a file name is valid UTF-8, as COLMAP and JSON files require."""
     try:
         name.encode("utf-8")
     except UnicodeEncodeError:
@@ -203,13 +202,13 @@ def escape(name: str) -> str:
 
 
 def list_names(names: list[str]) -> str:
-    """Join at most :data:`MAX_LISTED` names for a message."""
+    """Join at most :data:`MAX_LISTED` file names for a message."""
     rest = len(names) - MAX_LISTED
     return ", ".join(names[:MAX_LISTED]) + (f" and {rest} more" if rest > 0 else "")
 
 
 def _walk_input_files(folder: Path, without: Path | None) -> Iterator[str]:
-    """Yield files below a folder except those below ``without`` and in result folders."""
+    """Yield the files below a folder, skipping the subfolder ``without`` and result folders."""
     skipped = _find_below(without, folder)
     results: dict[Path, bool] = {}
 
@@ -225,7 +224,7 @@ def _walk_input_files(folder: Path, without: Path | None) -> Iterator[str]:
 
 
 def _find_mask_names(names: list[str]) -> list[str]:
-    """Return names such as ``X_mask.png`` whose image ``X`` is in the same folder."""
+    """Return names of mask files such as ``X_mask.png`` whose image ``X`` is in the same folder."""
     stems = {str(PurePosixPath(name).with_suffix("")).casefold() for name in names}
     stems |= {name.casefold() for name in names}
     masks = []
@@ -246,7 +245,7 @@ def _has_signature(path: Path) -> bool:
 
 
 def _find_below(inner: Path | None, folder: Path) -> Path | None:
-    """Return ``inner`` as a path that starts with ``folder``, None if it is not below."""
+    """Return ``inner`` as a path that starts with ``folder``, None if not below ``folder``."""
     if inner is None or not inner.resolve().is_relative_to(folder.resolve()):
         return None
     return folder / inner.resolve().relative_to(folder.resolve())

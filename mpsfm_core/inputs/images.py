@@ -1,4 +1,4 @@
-"""Images of a run: search, checks, cameras, and undistorted views on demand."""
+"""Find and check the images of a run, assign cameras, and undistort images on demand."""
 
 from __future__ import annotations
 
@@ -54,39 +54,39 @@ FocalSource = Literal["intrinsics", "exif", "provider", "default"]
 FOCAL_LOG_STD: Mapping[FocalSource, float] = MappingProxyType(
     {"intrinsics": 0.01, "exif": 0.1, "provider": 0.2, "default": 0.7}
 )
-"""Prior std of the log focal length by source. EXIF has rounding, focus breathing and wrong
-equivalents of zoom lenses; the default covers wide-angle phones and telephoto lenses. [ours]"""
+"""Prior std of the log focal length by source (EXIF, default ratio or network). EXIF focal lengths
+are rounded, and the default ratio must cover wide-angle and telephoto lenses. [ours]"""
 CACHED_BYTES = 512 << 20
-"""Size of the cache of decoded views in bytes: the matcher reads each image many times."""
+"""Size in bytes of the cache of undistorted images, because the matcher reads each image often."""
 _CACHED_MAPS = 2
-"""Number of cached undistortion maps, 8 bytes a pixel each; neighboring images share a camera."""
+"""Number of cached undistortion maps; a map takes 8 bytes per pixel, and images share cameras."""
 _READERS = 4
-"""Maximum number of threads that read and hash files."""
+"""Maximum number of threads that read and hash image files."""
 
 
 @dataclass(frozen=True, eq=False)
 class SourceImage:
-    """One image file with its cameras."""
+    """Image file with its original camera and the camera of its undistorted view."""
 
     name: str
-    """Path below the images folder, with forward slashes."""
+    """Image name, the path relative to the images folder with forward slashes."""
     path: Path
-    """Path of the file."""
+    """Path of the image file."""
     camera: pycolmap.Camera
-    """Camera of the upright original image. ``camera_id`` is the number in the intrinsics file, or
-    counts distinct cameras."""
+    """Camera of the upright original image. Its ``camera_id`` is the number in the intrinsics file,
+    if given, else a running number."""
     pinhole: PinholeCamera
-    """Camera of the undistorted and possibly reduced view."""
+    """Pinhole camera of the undistorted and possibly downscaled image."""
     focal_source: FocalSource
     """Source of the focal length."""
     digest: str
-    """SHA-256 of the file."""
+    """SHA-256 hash of the image file."""
     orientation: int = 1
-    """EXIF orientation of the stored pixels."""
+    """EXIF orientation of the image file, 1 to 8."""
     gps: GpsPosition | None = None
-    """Position in EXIF, None if there is none."""
+    """GPS position in EXIF, None if EXIF has no position."""
     mask: MaskFile | None = None
-    """Mask of the original image, None if there is none."""
+    """Mask file of the original image, None if the image has no mask."""
 
     def original_pixels(self, xy: Float64) -> Float64:
         """Map pixels (n, 2) of the undistorted view to pixels of the upright original image."""
@@ -97,10 +97,10 @@ class SourceImage:
         return undistort_pixels(self.pinhole, self.camera, xy)
 
     def refined_camera(self, pinhole: PinholeCamera) -> pycolmap.Camera:
-        """Return the original camera with the focal length of a refined camera of the view.
+        """Scale the original camera to the refined focal length of its undistorted view.
 
-        Only guessed focal lengths are refined, and guessed cameras have no distortion. Scaling the
-        focal length is therefore exact.
+        Only estimated focal lengths are refined, and their cameras have no distortion. Scaling the
+        focal length of a camera without distortion is exact.
         """
         camera = pycolmap.Camera(self.camera.todict())
         params = np.array(camera.params)
@@ -110,12 +110,12 @@ class SourceImage:
 
     @property
     def focal_known(self) -> bool:
-        """True if intrinsics were given, so that the focal length is not refined."""
+        """True if the user gave the intrinsics, so that the focal length is not refined."""
         return self.focal_source == "intrinsics"
 
     @property
     def focal_log_std(self) -> float:
-        """Prior std of the logarithm of the focal length, by its source."""
+        """Prior standard deviation of the log focal length, given its source."""
         return FOCAL_LOG_STD[self.focal_source]
 
     @property
@@ -127,8 +127,8 @@ class SourceImage:
 class ImageSet:
     """Images of a run in a fixed order, with undistorted views on demand.
 
-    Caches about 512 MB of decoded views. Methods may be called from several threads. ``left_out``
-    maps the names of damaged images to their faults.
+    About 512 MB of undistorted images are cached. All methods are thread-safe. The attribute
+    ``left_out`` maps names of unusable images to the reasons.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class ImageSet:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.images, self._options)  # decoded views are not pickled
+        return type(self), (self.images, self._options)  # cached images are not pickled
 
     def __len__(self) -> int:
         return len(self.images)
@@ -163,19 +163,20 @@ class ImageSet:
         return [image.name for image in self.images]
 
     def view(self, index: int) -> View:
-        """Return the undistorted view of an image; decode it unless it is cached.
+        """Return the undistorted view of an image, cached or decoded from its file.
 
         Raises:
-            InputError: the file or its mask is unreadable or has changed since the start.
+            InputError: the image or mask file is unreadable or has changed since the start of the
+                run.
         """
         return self._views.get(index, lambda: self._load(self.images[index]))
 
     def with_focals(self, focals: Mapping[int, float]) -> ImageSet:
-        """Return the images with predicted instead of default focal lengths.
+        """Return a copy of the images with predicted instead of default focal lengths.
 
         Args:
-            focals: camera id -> focal length in pixels of the original image. The focal lengths
-                still count as guesses.
+            focals: focal lengths by camera id, in pixels of the original image. Predicted focal
+                lengths are still refined in bundle adjustment.
         """
 
         def changed(image: SourceImage) -> SourceImage:
@@ -190,17 +191,17 @@ class ImageSet:
         return ImageSet(images, self._options, self.left_out)
 
     def mask(self, index: int) -> Bool | None:
-        """Return the mask of a view; do not decode the image if it has none."""
+        """Return the mask of an undistorted view; images without a mask are not decoded."""
         image = self.images[index]
         if is_pinhole(image.camera) and image.mask is None:
             return None
         return self.view(index).mask
 
     def pixel_key(self, index: int) -> str:
-        """Return a cache key of a view: equal keys mean equal pixels and mask.
+        """Return a hash of an undistorted view; equal hashes mean equal pixels and masks.
 
-        Hashes the file and all parameters of undistortion and reduction. Intrinsics of an image
-        without distortion are not part of the key.
+        The hash covers the image file, mask, and all parameters of undistortion and downscaling.
+        The hash excludes the intrinsics of an image without distortion.
         """
         image = self.images[index]
         parts = [image.digest, str(image.pinhole.size)]
@@ -256,20 +257,24 @@ def load_images(
     """Find the images of a folder and its subfolders, check them, and assign cameras.
 
     Args:
-        folder: images, in the formats of :data:`mpsfm_core.inputs.image_decoding.EXTENSIONS`.
-        intrinsics: ``intrinsics.yaml``, a COLMAP model (folder or ``cameras.txt``) or
-            ``transforms.json``, for upright images (after EXIF rotation). Without it focal
-            lengths come from EXIF, else from ``options.default_focal_ratio`` with a warning.
-        image_list: text file with one name a line (``#`` starts a comment); its order is used.
+        folder: folder of images in the formats of
+            :data:`mpsfm_core.inputs.image_decoding.EXTENSIONS`.
+        intrinsics: path of ``intrinsics.yaml``, a COLMAP model (folder or ``cameras.txt``) or
+            ``transforms.json``, for upright images (after EXIF rotation). Without an intrinsics
+            file focal lengths come from EXIF, else from ``options.default_focal_ratio`` with a
+            warning.
+        image_list: text file with one image name per line (``#`` starts a comment), which also sets
+            the order of the images.
         options: see :class:`InputOptions`.
         model: COLMAP model or ``transforms.json`` of some of the images. Without ``intrinsics`` the
-            images use its cameras. Unlisted images use the model's only camera of their size.
-        without: subfolder to skip, such as the output folder.
-        names: only these images, instead of all or those of ``image_list``; one is enough.
+            images use the cameras of this model. Images that the model does not list use its camera
+            of their size, if there is exactly one.
+        without: subfolder to skip in the search, such as the output folder.
+        names: names of the images to read, instead of ``image_list``; a single image is allowed.
 
     Raises:
         InputError: fewer than two images, unreadable files, missing or repeated names in the list,
-            or intrinsics that do not fit. The message names the file.
+            or intrinsics for other image sizes. The message names the faulty file.
     """
     options = options or InputOptions()
     if names is None:
@@ -314,7 +319,7 @@ def load_images(
 
 
 def _exclude_masks(names: Sequence[str], folder: Path, masks: Path) -> list[str]:
-    """Return the names that are not below a masks folder inside of the images folder."""
+    """Return the image names without those in a masks folder inside the images folder."""
     inner, outer = masks.resolve(), folder.resolve()
     if inner == outer or not inner.is_relative_to(outer):
         return list(names)
@@ -328,7 +333,7 @@ def _read_cameras(path: Path | None, names: Sequence[str], folder: Path) -> Intr
 
 @dataclass(frozen=True)
 class _ProbedImage:
-    """Upright size, header and hash of an image file, or the reason why it is unreadable."""
+    """Upright size, header and hash of an image file, or the reason why the file is unreadable."""
 
     size: tuple[int, int]
     header: ImageHeader
@@ -338,12 +343,12 @@ class _ProbedImage:
 
     @property
     def oriented_size(self) -> tuple[tuple[int, int], int]:
-        """Upright size and EXIF orientation."""
+        """Upright size and EXIF orientation of an image."""
         return self.size, self.header.orientation
 
 
 class _CameraGuesses:
-    """Creates cameras from EXIF or the default focal length; equal cameras share an id."""
+    """Factory of cameras from EXIF or default focal lengths; equal cameras share an id."""
 
     def __init__(self, options: InputOptions, max_id: int) -> None:
         self._options = options
@@ -351,7 +356,7 @@ class _CameraGuesses:
         self._ids: dict[tuple[tuple[int, int], float], int] = {}
 
     def camera(self, file: _ProbedImage) -> tuple[pycolmap.Camera, FocalSource]:
-        """Return a SIMPLE_PINHOLE camera and the source of its focal length."""
+        """Return a SIMPLE_PINHOLE camera of an image and the source of its focal length."""
         source: FocalSource = "exif"
         focal = file.header.focal_px(*file.size)
         if focal is None:
@@ -374,7 +379,7 @@ def _source_image(
 
 
 def _simple_camera(size: tuple[int, int], focal: float, number: int) -> pycolmap.Camera:
-    """Return a SIMPLE_PINHOLE camera with the principal point in the center."""
+    """Return a SIMPLE_PINHOLE camera with the principal point at the image center."""
     width, height = size
     params = [focal, width / 2, height / 2]
     return pycolmap.Camera(
@@ -383,7 +388,7 @@ def _simple_camera(size: tuple[int, int], focal: float, number: int) -> pycolmap
 
 
 def _view_camera(camera: pycolmap.Camera, options: InputOptions) -> PinholeCamera:
-    """Return the camera of the undistorted and possibly reduced view."""
+    """Return the pinhole camera of the undistorted and possibly downscaled image."""
     original = camera.width, camera.height
     size = _reduced_size(original, options.max_image_size)
     reduced = camera if size == original else resize_camera(camera, size)
@@ -411,7 +416,7 @@ def _probe(path: Path, options: InputOptions) -> _ProbedImage:
 
 
 def _report_left_out(left_out: Mapping[str, str], total: int, options: InputOptions) -> None:
-    """Warn of images that cannot be used; raise if ``strict`` or if they are too many."""
+    """Warn of unusable images; raise :class:`InputError` if ``strict`` or if most are unusable."""
     if not left_out:
         return
     faults = list(left_out.values())

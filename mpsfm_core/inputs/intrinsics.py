@@ -1,6 +1,6 @@
-"""Reader of cameras: ``intrinsics.yaml``, COLMAP model or database, ``transforms.json``.
+"""Read cameras from ``intrinsics.yaml``, COLMAP files or ``transforms.json``.
 
-Format of ``intrinsics.yaml``, cameras by number::
+The file ``intrinsics.yaml`` maps camera numbers to camera parameters::
 
     1:
       model: OPENCV            # any camera model of COLMAP; default PINHOLE (SIMPLE_PINHOLE for 3)
@@ -31,11 +31,11 @@ _NUM_ORIENTATIONS = 8
 """Number of EXIF orientations, 1 to 8."""
 _KEYS = ("model", "params", "width", "height", "images")
 _MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = 0.1, 10.0
-"""Bounds of focal length over longer side [COLMAP min/max_focal_length_ratio]."""
+"""Bounds of focal length over longer image side [COLMAP min/max_focal_length_ratio]."""
 _CENTRAL = (0.8, 1.25)
-"""Bounds of the principal point over the image center of real cameras."""
+"""Plausible ratios of principal point to image center, per axis."""
 _SAME_SCALE = 0.1
-"""Relative difference of x and y ratios below which a principal point is for another image size."""
+"""Maximum relative difference of the x and y ratios of a camera for another image size."""
 
 
 @dataclass(frozen=True)
@@ -43,17 +43,18 @@ class CameraEntry:
     """One camera of an intrinsics file."""
 
     camera_id: int
-    """Number of the camera in the file."""
+    """Number of the camera in the intrinsics file."""
     model: str
-    """Name of COLMAP's camera model."""
+    """Name of the COLMAP camera model."""
     params: tuple[float, ...]
-    """Parameters in COLMAP's order, pixels."""
+    """Camera parameters in COLMAP's order, in pixels."""
     size: tuple[int, int] | None
-    """(width, height), None if the file does not have it."""
+    """Image (width, height) of the camera in pixels, None if the file has no size."""
     images: frozenset[str] | None
-    """Names of its images, None for all images that no other camera lists."""
+    """Names of the images of the camera, None for all images that no other camera lists."""
     is_stored: bool = False
-    """True if the camera is of stored pixels where the size does not decide [COLMAP]."""
+    """True if the camera is for pixels before EXIF rotation when its size fits both orientations
+    [COLMAP]."""
 
 
 @dataclass(frozen=True)
@@ -64,9 +65,9 @@ class Intrinsics:
     entries: tuple[CameraEntry, ...]
 
     def for_images(self, names: Iterable[str]) -> Intrinsics:
-        """Return the same cameras, listed under these names of the images.
+        """Return the cameras with their listed image names replaced by matching names of the run.
 
-        Matches names with :func:`~mpsfm_core.inputs.models.match_names`.
+        The function :func:`~mpsfm_core.inputs.models.match_names` matches the image names.
         """
         listed = {image for entry in self.entries for image in entry.images or ()}
         new_names: dict[str, set[str]] = {}
@@ -84,7 +85,7 @@ class Intrinsics:
 
     @property
     def max_id(self) -> int:
-        """Return the largest camera number, including those of turned cameras."""
+        """Return the largest camera number, including numbers of cameras after EXIF rotation."""
         return self._max_file_id + _NUM_ORIENTATIONS * len(self.entries)
 
     @property
@@ -94,10 +95,10 @@ class Intrinsics:
     def usual_camera(
         self, name: str, size: tuple[int, int], orientation: int = 1
     ) -> pycolmap.Camera | None:
-        """Return the camera that lists the image, else the only camera of its size.
+        """Return the camera that lists an image, else the only camera of the image size.
 
         Returns:
-            None if neither exists.
+            The camera, or None if no camera lists the image and its size does not determine one.
 
         Raises:
             InputError: as :meth:`camera`.
@@ -109,22 +110,24 @@ class Intrinsics:
         return self._checked(same[0], name, size, orientation) if len(same) == 1 else None
 
     def camera(self, name: str, size: tuple[int, int], orientation: int = 1) -> pycolmap.Camera:
-        """Return the camera of an upright image.
+        """Return the camera of an image after EXIF rotation.
 
         Args:
             name: name of the image.
-            size: upright (width, height).
-            orientation: EXIF orientation; a camera of the stored pixels is turned upright.
+            size: (width, height) of the image after EXIF rotation.
+            orientation: EXIF orientation of the image; a camera for the pixels before EXIF rotation
+                is rotated.
 
         Raises:
-            InputError: the file has no camera for the image, or one for images of another size.
+            InputError: the file has no camera for the image, or its camera is for images of another
+                size.
         """
         return self._checked(self._entry(name), name, size, orientation)
 
     def _checked(
         self, entry: CameraEntry, name: str, size: tuple[int, int], orientation: int
     ) -> pycolmap.Camera:
-        """Return the camera of an entry; raise :class:`InputError` if it does not fit the image."""
+        """Return a camera for an image; raise :class:`InputError` if the camera does not fit."""
         width, height = entry.size or size
         camera = pycolmap.Camera(
             model=entry.model,
@@ -162,15 +165,15 @@ class Intrinsics:
 
 
 def read_intrinsics(path: Path, images_folder: Path | None = None) -> Intrinsics:
-    """Read cameras from a file or folder.
+    """Read cameras from an intrinsics file, a COLMAP model or database, or ``transforms.json``.
 
     Args:
         path: ``intrinsics.yaml``, a COLMAP model, its ``cameras.txt``, a COLMAP database (``.db``)
             or ``transforms.json``.
-        images_folder: folder of the images, for a ``transforms.json`` without image sizes.
+        images_folder: folder of the images, needed by a ``transforms.json`` without image sizes.
 
     Raises:
-        InputError: the file cannot be read; the message names file, camera and fault.
+        InputError: the file cannot be read; the message names the file, camera and fault.
     """
     try:
         if path.is_dir():
@@ -321,7 +324,7 @@ def _check_lists(path: Path, entries: Sequence[CameraEntry]) -> None:
 
 
 def _fault(camera: pycolmap.Camera, entry: CameraEntry, size: tuple[int, int]) -> str | None:
-    """Return why the camera does not fit an image of this size and what to do, else None."""
+    """Return why a camera does not fit an image of this size and what to do, else None."""
     if entry.size is not None and entry.size != size:
         return (
             f"the intrinsics are for {entry.size[0]}x{entry.size[1]} pixels; give those of the "

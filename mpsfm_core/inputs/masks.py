@@ -1,4 +1,4 @@
-"""Masks of the original images: search, orientation and decoding."""
+"""Find, decode and orient the masks of the original images."""
 
 from __future__ import annotations
 
@@ -31,40 +31,40 @@ _log = logging.getLogger(__name__)
 MaskOrientation = Literal["auto", "stored", "upright"]
 
 _PREFERRED = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
-"""Lossless extensions, preferred if an image has several masks."""
+"""Lossless mask formats, preferred if an image has several mask files."""
 _PATTERNS = ("{}", "{}_mask", "{}-mask", "{}.mask", "{}_masks", "mask_{}", "dynamic_mask_{}")
-"""Names of masks without extension. ``{}`` is the image name with or without extension
-[COLMAP; OpenDroneMap, Metashape; instant-ngp]."""
+"""File stems of masks, where ``{}`` is the image name with or without extension [COLMAP,
+OpenDroneMap, Metashape, instant-ngp]."""
 _LOSSY_THRESHOLD = 127
-"""Values up to this one are black in lossy formats, whose black areas have noise."""
+"""Maximum gray value that counts as black in lossy mask formats, whose black areas have noise."""
 
 
 @dataclass(frozen=True)
 class MaskFile:
-    """Mask of an image."""
+    """Mask file of an image and its orientation."""
 
     path: Path
-    """File of the mask."""
+    """Path of the mask file."""
     orientation: int = 1
-    """EXIF orientation that turns the mask upright, 1 if it is upright already."""
+    """EXIF orientation that rotates the mask upright, 1 for an upright mask."""
 
     def read(self, max_pixels: int) -> Bool:
-        """Decode the mask upright, (H, W) bool, False where it is black."""
+        """Decode the upright mask, (H, W) bool, False at black pixels."""
         return _turn(decode_mask(self.path, max_pixels), self.orientation)
 
 
 def find_masks(folder: Path, names: Sequence[str], images_folder: Path) -> dict[str, Path]:
-    """Find the masks of images by name.
+    """Find the mask file of each image by name.
 
-    A mask is called as its image (``X.png``, ``X.jpg.png``, ``X.jpg``) or ``X_mask.png`` and the
-    like, in any image format. Case is ignored. The folder has the tree of the images folder, or all
-    masks are in it directly. It may be the images folder itself.
+    The mask of image ``X.jpg`` is ``X.png``, ``X.jpg.png``, ``X.jpg`` or ``X_mask.png`` (or
+    similar) in any image format. Case is ignored. The masks folder has the subfolders of the images
+    folder or no subfolders, and may be the images folder itself.
 
     Returns:
-        Image name -> file of its mask, for the images that have one. Warns if some have none.
+        Paths of mask files by image name; images without a mask cause a warning.
 
     Raises:
-        InputError: the folder does not exist, or no file in it is the mask of an image.
+        InputError: the masks folder does not exist, or contains no mask of an image.
     """
     if not folder.is_dir():
         raise InputError(f"masks folder {folder} does not exist")
@@ -103,7 +103,7 @@ def find_masks(folder: Path, names: Sequence[str], images_folder: Path) -> dict[
 
 @dataclass(frozen=True)
 class _ProbedMask:
-    """Size of a mask, whether it allows a pixel, and whether its EXIF has an orientation."""
+    """Size of a mask, whether any pixel is not black, and whether EXIF has an orientation."""
 
     size: tuple[int, int]
     allows_pixels: bool
@@ -117,24 +117,26 @@ def orient_masks(
     convention: MaskOrientation,
     max_pixels: int,
 ) -> tuple[dict[str, MaskFile], dict[str, str]]:
-    """Determine the orientation of masks, and find masks that exclude all pixels.
+    """Determine the orientation of masks, and find entirely black masks.
 
-    A mask belongs to the stored or to the upright pixels of its image. If its size fits only one of
-    them, the size decides. Other masks follow the majority of those, else are stored [COLMAP
-    mask_path]. An EXIF orientation in the mask itself turns it upright.
+    A mask fits its image before or after EXIF rotation. If the mask size fits only one of the two
+    orientations, the size decides. Masks that fit both follow the majority of the masks whose size
+    decides, else count as not rotated [COLMAP mask_path]. An EXIF orientation in the mask file has
+    precedence over both rules.
 
     Args:
-        masks: image name -> file.
-        sizes: image name -> (width, height) of the upright image.
-        orientations: image name -> EXIF orientation of the image.
-        convention: ``stored`` or ``upright`` for all masks that fit both, ``auto`` as above.
-        max_pixels: larger masks are refused.
+        masks: paths of mask files by image name.
+        sizes: (width, height) of the image after EXIF rotation, by image name.
+        orientations: EXIF orientation of the image, by image name.
+        convention: orientation of the masks that fit before and after EXIF rotation (``stored``,
+            ``upright``), or ``auto`` for the majority.
+        max_pixels: maximum number of pixels of a mask.
 
     Returns:
-        Masks by image name, and faults by image name for masks that are all black.
+        Mask files by image name, and error texts by image name for entirely black masks.
 
     Raises:
-        InputError: a mask cannot be decoded or has another size than its image.
+        InputError: a mask cannot be decoded, is too large, or has another size than its image.
     """
     with ThreadPoolExecutor(thread_limit()) as pool:
         probed = list(pool.map(lambda path: _probe(path, max_pixels), masks.values()))
@@ -173,16 +175,16 @@ def orient_masks(
 
 
 def decode_mask(path: Path, max_pixels: int) -> Bool:
-    """Decode a mask, upright by its own EXIF orientation.
+    """Decode a mask and apply the EXIF orientation of the mask file.
 
-    A pixel is False if it is black. If the color is constant and the alpha channel is not, alpha is
-    the mask.
+    Black pixels of a mask become False. If only the alpha channel varies, the alpha channel is the
+    mask.
 
     Returns:
         (H, W) bool.
 
     Raises:
-        InputError: the file cannot be decoded or has more than ``max_pixels`` pixels.
+        InputError: the mask cannot be decoded or has more than ``max_pixels`` pixels.
     """
     data = read_bytes(path)
     check_size(data, path, max_pixels)
@@ -202,7 +204,7 @@ def decode_mask(path: Path, max_pixels: int) -> Bool:
 
 
 def resize_mask(mask: Bool, size: tuple[int, int]) -> Bool:
-    """Resize a mask to (width, height) by the nearest pixel."""
+    """Resize a mask to (width, height) with nearest-neighbor sampling."""
     if (mask.shape[1], mask.shape[0]) == size:
         return mask
     resized = cv2.resize(mask.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST_EXACT)
@@ -220,7 +222,7 @@ def _turn(mask: Bool, orientation: int) -> Bool:
 
 
 def _find_mask(name: str, by_stem: Mapping[str, str]) -> str | None:
-    """Return the mask of an image; the full name precedes the name without extension."""
+    """Find the mask file of an image, by its name with extension, then without extension."""
     for base in (name, _strip(name)):
         parent, _, last = base.rpartition("/")
         prefix = f"{parent}/" if parent else ""
@@ -232,7 +234,7 @@ def _find_mask(name: str, by_stem: Mapping[str, str]) -> str | None:
 
 
 def _is_unique(name: str, names: Sequence[str]) -> bool:
-    """Return whether no other image has the same file name without folder and extension."""
+    """Return whether an image name is unique without its folder and extension."""
     stem = PurePosixPath(name).stem.casefold()
     return sum(PurePosixPath(other).stem.casefold() == stem for other in names) == 1
 

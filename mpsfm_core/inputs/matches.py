@@ -1,4 +1,4 @@
-"""Import of keypoints and matches from a COLMAP database or hloc's files."""
+"""Import keypoints and matches from a COLMAP database or from hloc's HDF5 files."""
 
 from __future__ import annotations
 
@@ -22,24 +22,24 @@ Pair = tuple[int, int]
 
 @dataclass(frozen=True, eq=False)
 class ImportedMatches:
-    """Keypoints and matches of the images of a run."""
+    """Imported keypoints and matches of the images of a run."""
 
     source: str
-    """Files that were read, for messages."""
+    """Paths of the imported files, for error messages."""
     keypoints: tuple[Float64, ...]
-    """Keypoints of each image, (n, 2) float64, pixels of the undistorted view."""
+    """Keypoints of each image, (n, 2) float64 in pixels of the undistorted view."""
     std_px: tuple[float, ...]
-    """Keypoint noise of each image, standard deviation in pixels of the view."""
+    """Keypoint standard deviation of each image in pixels of the undistorted view."""
     matches: Mapping[Pair, SparseMatches]
-    """(smaller, larger image index) -> matches as rows of keypoints."""
+    """Matches by pair (smaller, larger image index), as keypoint indices."""
 
 
 def matches_from_database(path: Path, images: ImageSet) -> ImportedMatches:
     """Import keypoints and matches of a COLMAP database.
 
     Raises:
-        InputError: the database is damaged, has none of the images, has no matches between them,
-            or its images have another size.
+        InputError: the database is damaged, has no keypoints or no matches of the images, or has
+            other image sizes.
     """
     database = read_database(path)
     matched = match_names(images.names, database.images)
@@ -60,7 +60,7 @@ def matches_from_database(path: Path, images: ImageSet) -> ImportedMatches:
 
 
 def matches_from_hloc(features: Path, matches: Path, images: ImageSet) -> ImportedMatches:
-    """Import keypoints and matches of hloc; raise as :func:`matches_from_database`."""
+    """Import hloc's keypoints and matches; raise the errors of :func:`matches_from_database`."""
     files = HlocFiles(features, matches)
     names = files.names()
     matched = match_names(images.names, names)
@@ -76,7 +76,7 @@ def matches_from_hloc(features: Path, matches: Path, images: ImageSet) -> Import
 
 
 class _Builder:
-    """Converts keypoints and matches of stored images to those of undistorted views."""
+    """Builder that converts keypoints and matches of stored images to undistorted views."""
 
     def __init__(self, source: str, source_names: Collection[str], images: ImageSet) -> None:
         self._source_names = source_names
@@ -90,7 +90,7 @@ class _Builder:
     def add(
         self, index: int, keypoints: Float64, size: tuple[int, int] | None, std_px: float
     ) -> None:
-        """Add the keypoints of an image; drop those outside of the undistorted view."""
+        """Add the keypoints of an image that lie inside its undistorted view."""
         image = self._images[index]
         xy = image.view_pixels(_upright(self._source, image, keypoints, size))
         visible = np.isfinite(xy).all(axis=1) & inside(xy, image.pinhole.size)
@@ -99,7 +99,7 @@ class _Builder:
         self._std_px[index] = std_px * image.pinhole.width / image.original_size[0]
 
     def match(self, first: int, second: int, indices: Int64, scores: Float32) -> None:
-        """Add matches of two images; ``indices`` (m, 2) are rows of the added keypoints."""
+        """Add matches of two images, given ``indices`` (m, 2) of the keypoints in their files."""
         if first == second or not len(indices):
             return
         if first > second:
@@ -135,7 +135,7 @@ class _Builder:
 def _upright(
     source: str, image: SourceImage, keypoints: Float64, size: tuple[int, int] | None
 ) -> Float64:
-    """Map keypoints of a stored image to pixels of the upright image."""
+    """Map keypoints from pixels before EXIF rotation to pixels of the upright image."""
     width, height = image.original_size
     stored = (height, width) if image.orientation >= 5 else (width, height)
     if size is None or size == stored:

@@ -1,7 +1,7 @@
-"""Conversion of models of stored pixels to upright images.
+"""Convert COLMAP models from stored pixels to upright images (after EXIF rotation).
 
-COLMAP ignores the EXIF orientation: its cameras, poses and keypoints belong to the stored pixels.
-The product works on upright images. The EXIF orientation maps camera coordinates by
+COLMAP ignores the EXIF orientation, so that its cameras, poses and keypoints belong to stored
+pixels. MP-SfM uses upright images instead. The EXIF orientation maps camera coordinates by
 ``x_upright = D x_stored``, where ``D`` permutes the x and y axes and flips their signs.
 """
 
@@ -33,18 +33,19 @@ _log = logging.getLogger(__name__)
 MIRRORED = frozenset((2, 4, 5, 7))
 """EXIF orientations that mirror the image."""
 _SWAPPED_PARAMS = (("fx", "fy"), ("cx", "cy"), ("p1", "p2"), ("sx1", "sy1"))
-"""Camera parameters along x and y. The tangential distortion is the vector ``(p2, p1)``."""
+"""Camera parameters that a transposition of x and y swaps. The tangential distortion along x and y
+is ``(p2, p1)``."""
 _MAX_COMPARED_IMAGES = 5
-"""Number of images whose point colors are compared with the pixels."""
+"""Maximum number of images whose pixels are compared with the colors of the 3D points."""
 _MIN_COLORED_POINTS = 20
-"""Minimum number of colored points of an image in this comparison."""
+"""Minimum number of colored 3D points of an image whose pixels are compared."""
 _MAX_ASPECT_DIFFERENCE = 0.02
-"""Difference of log aspect ratios within which a camera fits an image."""
+"""Maximum difference of log aspect ratios of a camera and its image."""
 
 
 @dataclass(frozen=True)
 class _ImageFile:
-    """EXIF orientation and upright (width, height) of the file of an image of the model."""
+    """Image file of a model with its EXIF orientation and upright (width, height)."""
 
     path: Path
     orientation: int
@@ -52,17 +53,17 @@ class _ImageFile:
 
     @property
     def stored_size(self) -> tuple[int, int]:
-        """(width, height) of the stored pixels."""
+        """(width, height) of the image before EXIF rotation."""
         return stored_size(self.size, self.orientation)
 
 
 def stored_size(size: tuple[int, int], orientation: int) -> tuple[int, int]:
-    """Return (width, height) of the stored pixels of an image of this upright size."""
+    """Return (width, height) of an image before EXIF rotation from its upright size."""
     return size[::-1] if orientation >= 5 else size
 
 
 def orientation_matrix(orientation: int) -> Float64:
-    """Return ``D`` (3, 3) of ``x_upright = D x_stored`` for camera coordinates."""
+    """Return the matrix ``D`` (3, 3) of ``x_upright = D x_stored`` in camera coordinates."""
     matrix = np.eye(3)
     if orientation >= 5:
         matrix = matrix[[1, 0, 2]]
@@ -74,7 +75,7 @@ def orientation_matrix(orientation: int) -> Float64:
 
 
 def orient_camera(camera: pycolmap.Camera, orientation: int) -> pycolmap.Camera:
-    """Return the camera of the upright image from that of the stored image."""
+    """Convert a camera from the stored pixels to the upright image."""
     names = [name.strip() for name in camera.params_info.split(",")]
     values = dict(zip(names, camera.params.tolist(), strict=True))
     width, height = camera.width, camera.height
@@ -103,21 +104,23 @@ def orient_model(
     images_folder: Path,
     match: Callable[[list[str], list[str]], dict[str, str]],
 ) -> pycolmap.Reconstruction:
-    """Return the model of the upright images.
+    """Convert a COLMAP model from stored pixels to upright images if necessary.
 
-    An image belongs to stored pixels if its camera has the stored size. If the size fits both, the
-    colors of the points decide, then the images whose size decides; else it is stored [COLMAP].
+    The pose of an image belongs to stored pixels if its camera has the size before EXIF rotation.
+    If the size fits both orientations, the colors of the 3D points decide, then the majority of the
+    other images. If nothing decides, the pose belongs to stored pixels [COLMAP].
 
     Args:
-        model: model of stored or upright images.
+        model: COLMAP model of stored or upright images.
         images_folder: folder with the image files.
-        match: matches the names of files with the names in the model.
+        match: function that matches file names with the image names in the model.
 
     Returns:
-        The model itself if no image has to be turned. Mirrored images mirror the world.
+        The model of the upright images, or ``model`` itself if all are upright. If EXIF mirrors the
+        images, the world is mirrored too.
 
     Raises:
-        InputError: some of the images are mirrored and others are not.
+        InputError: EXIF mirrors some of the images and not others.
     """
     files = _find_image_files(model, images_folder, match)
     turned = {i: f for i, f in files.items() if f.orientation != 1}
@@ -157,7 +160,7 @@ def orient_model(
 def _build_model(
     model: pycolmap.Reconstruction, orientations: dict[int, int], world: Float64
 ) -> pycolmap.Reconstruction:
-    """Return a copy with these images turned and the world multiplied by a reflection."""
+    """Return a copy of the model with rotated images and a world multiplied by a reflection."""
     upright = pycolmap.Reconstruction()
     cameras: dict[str, int] = {}
     next_id = max(model.cameras, default=0) + 1
@@ -198,7 +201,7 @@ def _find_image_files(
     images_folder: Path,
     match: Callable[[list[str], list[str]], dict[str, str]],
 ) -> dict[int, _ImageFile]:
-    """Return the files of the images of a model by image id, without those that are missing."""
+    """Return the existing image files of a model by image id."""
     ids = {str(image.name): image.image_id for image in model.images.values()}
     names = [n for n in walk_files(images_folder) if PurePosixPath(n).suffix.lower() in EXTENSIONS]
     files = {}
@@ -211,7 +214,7 @@ def _find_image_files(
                 size = upright_size(data, header, path)
                 files[ids[model_name]] = _ImageFile(path, header.orientation, size)
         except InputError:
-            continue  # reading the images reports the fault
+            continue  # a later stage reports the unreadable image
     return files
 
 
@@ -221,7 +224,7 @@ def _has_aspect(camera: pycolmap.Camera, size: tuple[int, int]) -> bool:
 
 
 def _compare_colors(model: pycolmap.Reconstruction, files: dict[int, _ImageFile]) -> bool | None:
-    """Return whether the point colors fit the stored pixels better, None if they do not tell."""
+    """Return whether point colors fit stored pixels better than upright ones, None if unclear."""
     cost_stored, cost_upright = 0.0, 0.0
     by_points = sorted(files, key=lambda i: -model.images[i].num_points3D)
     for image_id in by_points[:_MAX_COMPARED_IMAGES]:
@@ -248,7 +251,7 @@ def _compare_colors(model: pycolmap.Reconstruction, files: dict[int, _ImageFile]
 
 
 def _color_difference(rgb: Float64, xy: Float64, size: tuple[int, int], colors: Float64) -> float:
-    """Return the mean difference of an image from point colors at pixels of an image size."""
+    """Return the mean color difference of an image and its 3D points at their keypoints."""
     height, width = rgb.shape[:2]
     columns = np.clip((xy[:, 0] * width / size[0]).astype(int), 0, width - 1)
     rows = np.clip((xy[:, 1] * height / size[1]).astype(int), 0, height - 1)

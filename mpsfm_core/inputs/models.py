@@ -1,4 +1,4 @@
-"""Reader of models with cameras and poses, and matching of their image names to files."""
+"""Read COLMAP models and ``transforms.json``, and match their image names to files."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ from mpsfm_core.inputs.text_files import read_text_file
 
 _TEXT_FILES = ("cameras", "images", "points3D", "frames", "rigs")
 _NUM_IMAGE_FIELDS = 10
-"""Fields of an image line in ``images.txt``; the last one is the name."""
+"""Number of fields of an image line in ``images.txt``; the last field is the name."""
 
 
 def read_poses(path: Path, images_folder: Path | None = None) -> dict[str, Pose]:
-    """Read ``cam_from_world`` of the registered images of a model, by image name.
+    """Read the poses ``cam_from_world`` of the registered images of a model by image name.
 
     Args:
         path: as :func:`read_model`.
@@ -47,10 +47,10 @@ def read_model(path: Path, images_folder: Path | None = None) -> pycolmap.Recons
     """Read a COLMAP model (see :func:`find_model_folder`) or a ``transforms.json``.
 
     Args:
-        path: folder of the model, or the file.
-        images_folder: folder of the images. With it, the model is turned to the upright images if
-            it belongs to stored pixels (see :func:`orient_model`). A ``transforms.json`` without
-            image sizes needs it.
+        path: folder of the COLMAP model, or path of the ``transforms.json``.
+        images_folder: folder of the images. If given, a model of stored pixels is converted to
+            upright images (see :func:`orient_model`). A ``transforms.json`` without image sizes
+            needs the folder.
 
     Raises:
         InputError: the model does not exist or cannot be read.
@@ -62,7 +62,7 @@ def read_model(path: Path, images_folder: Path | None = None) -> pycolmap.Recons
 
 
 def _is_result(path: Path) -> bool:
-    """Return whether a model is in one of our result folders, and so of upright images."""
+    """Return whether a model is in a result folder of MP-SfM, and so has upright images."""
     path = path.resolve()
     if (path / SUMMARY).is_file():
         return True
@@ -72,7 +72,7 @@ def _is_result(path: Path) -> bool:
 
 
 def _read_stored_model(path: Path, images_folder: Path | None) -> pycolmap.Reconstruction:
-    """Read a model as it is in its files."""
+    """Read a model without conversion to upright images."""
     if path.suffix == ".json":
         return read_transforms(path, images_folder)
     folder = find_model_folder(path)
@@ -83,17 +83,17 @@ def _read_stored_model(path: Path, images_folder: Path | None) -> pycolmap.Recon
         else:
             model = _read_text_model(folder)
         for image in model.images.values():
-            str(image.name)  # pycolmap decodes a name on access, and this can fail
+            str(image.name)  # pycolmap decodes an image name on access, and decoding can fail
     except (OSError, RuntimeError, ValueError, IndexError) as error:
         raise InputError(f"{folder}: the COLMAP model cannot be read: {error}") from error
     return model
 
 
 def find_model_folder(folder: Path) -> Path:
-    """Find a COLMAP model (binary or text) in a folder, its ``sparse`` or ``sparse/0``.
+    """Find a COLMAP model (binary or text) in a folder or in its ``sparse`` or ``sparse/0``.
 
     Raises:
-        InputError: there is none.
+        InputError: the folder has no COLMAP model.
     """
     for candidate in (folder, folder / "sparse", folder / "sparse" / "0"):
         if any((candidate / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):
@@ -102,12 +102,12 @@ def find_model_folder(folder: Path) -> Path:
 
 
 def read_image_lines(path: Path) -> dict[int, tuple[int, str]]:
-    """Read camera id and name of the images in COLMAP's ``images.txt``, by image id.
+    """Read camera id and name of each image in COLMAP's ``images.txt``, by image id.
 
     Names may contain spaces, which COLMAP's reader does not support.
 
     Raises:
-        ValueError: a line is not an image line.
+        ValueError: a line of ``images.txt`` is not an image line.
     """
     images: dict[int, tuple[int, str]] = {}
     lines = iter(read_text_file(path).splitlines())
@@ -118,12 +118,12 @@ def read_image_lines(path: Path) -> dict[int, tuple[int, str]]:
         if len(fields) != _NUM_IMAGE_FIELDS:
             raise ValueError(f"{path}: {line!r} is not an image line of a COLMAP model")
         images[int(fields[0])] = int(fields[-2]), fields[-1].strip()
-        next(lines, None)  # the observations of the image; the line may be empty
+        next(lines, None)  # skip the line of observations of the image, which may be empty
     return images
 
 
 def _read_text_model(folder: Path) -> pycolmap.Reconstruction:
-    """Read a text model, also with byte-order marks, spaces in names, and without points."""
+    """Read a COLMAP text model, whose files may have byte-order marks and names with spaces."""
     images = read_image_lines(folder / "images.txt")
     texts = {
         name: read_text_file(path) if (path := folder / f"{name}.txt").is_file() else None
@@ -143,14 +143,14 @@ def _read_text_model(folder: Path) -> pycolmap.Reconstruction:
 
 
 def _replace_names(text: str, images: dict[int, tuple[int, str]]) -> str:
-    """Replace the names in ``images.txt`` by image ids."""
+    """Replace the image names in ``images.txt`` by image ids."""
     for image_id, (camera_id, name) in images.items():
         text = text.replace(f" {camera_id} {name}", f" {camera_id} {image_id}", 1)
     return text
 
 
 def describe_name_difference(ours: Collection[str], theirs: Collection[str]) -> str:
-    """Describe that names do not match, with an example of each side."""
+    """Describe why no image names match, with an example name from each source."""
     if not theirs:
         return "it has no images"
     example, other = min(ours, default="none"), min(theirs)
@@ -158,7 +158,7 @@ def describe_name_difference(ours: Collection[str], theirs: Collection[str]) -> 
 
 
 def reconstruction_poses(model: pycolmap.Reconstruction) -> dict[str, Pose]:
-    """Return ``cam_from_world`` of the registered images by name, sorted by name."""
+    """Return the poses ``cam_from_world`` of the registered images by name, sorted by name."""
     poses = {}
     for image in sorted(model.images.values(), key=lambda image: str(image.name)):
         if image.has_pose:
@@ -168,18 +168,18 @@ def reconstruction_poses(model: pycolmap.Reconstruction) -> dict[str, Pose]:
 
 
 def match_names(wanted: Iterable[str], available: Iterable[str]) -> dict[str, str]:
-    """Match image names to the names in another source, such as a model or a database.
+    """Match image names to the names in another source, such as a COLMAP model.
 
-    A name matches itself, else the same name with another extension, else the same name in another
-    folder, else a name that differs only in case. Backslashes of Windows paths count as slashes. An
-    available name that is itself wanted matches nothing else.
+    An image name matches itself, else the same name with another extension, in another folder, or
+    in another case, in this order. Backslashes of Windows paths count as slashes. An available name
+    that equals an image name matches no other image name.
 
     Args:
         wanted: names of the images of the run.
         available: names in the other source.
 
     Returns:
-        Wanted name -> available name, without names that have no match or an ambiguous one.
+        Available names by image name, without image names that have no or several matches.
     """
     remaining = list(wanted)
     names = {name: name.replace("\\", "/") for name in available}
@@ -196,7 +196,7 @@ def match_names(wanted: Iterable[str], available: Iterable[str]) -> dict[str, st
 
 
 def _match_names(wanted: list[str], available: dict[str, str]) -> dict[str, str]:
-    """Match names to the forms of available names; return wanted name -> available name."""
+    """Match image names to normalized available names; return available names by image name."""
     exact = {form: name for name, form in available.items()}
     by_stem: dict[str, list[str]] = {}
     by_tail: dict[str, list[str]] = {}

@@ -1,7 +1,8 @@
 """Reader of ``transforms.json``, the camera file of nerfstudio and instant-ngp.
 
 Each frame has intrinsics and ``world_from_cam`` with OpenGL's camera axes (x right, y up, z
-backward). The result is a COLMAP model without points in the same world frame.
+backward). The reader returns a COLMAP model without points, in the world frame of
+``transforms.json``.
 """
 
 from __future__ import annotations
@@ -32,30 +33,32 @@ DISTORTION_KEYS: Mapping[str, tuple[str, ...]] = {
     "OPENCV": ("k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
 }
-"""COLMAP camera model -> keys of its distortion parameters in ``transforms.json``."""
+"""Keys of the distortion parameters in ``transforms.json`` by COLMAP camera model."""
 _CAMERA_KEYS = (
     *("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x"),
     *("k1", "k2", "k3", "k4", "p1", "p2"),
 )
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Converts camera axes from OpenCV (x right, y down, z forward) to OpenGL; its own inverse."""
+"""Diagonal matrix that converts camera axes between OpenCV (y down, z forward) and OpenGL."""
 _LARGEST = 1 << 20
-"""Upper bound of width and height in pixels, above every camera."""
+"""Upper bound of image width and height in pixels."""
 _ROTATION_TOLERANCE = 1e-3
-"""Tolerance of the entries of ``R^T R - I``: files have few digits."""
+"""Tolerance of the entries of ``R^T R - I`` of a rotation ``R`` that was rounded in the file."""
 
 
 def read_transforms(path: Path, images_folder: Path | None = None) -> pycolmap.Reconstruction:
     """Read cameras and poses of all frames; image names are the ``file_path`` values.
 
-    Intrinsics are per frame or shared. If the file has no image size, the image file is read.
+    Intrinsics in ``transforms.json`` are per frame or shared by all frames. If ``transforms.json``
+    has no image size, the size is read from the image file.
 
     Args:
-        path: the file.
-        images_folder: folder with the images, if they are not at their ``file_path``.
+        path: path of the ``transforms.json``.
+        images_folder: folder of the images, if they have moved from their ``file_path``.
 
     Raises:
-        InputError: the file is damaged or a frame is invalid; the message names the frame.
+        InputError: ``transforms.json`` is damaged or a frame is invalid; the message names the
+            frame.
     """
     try:
         data = json.loads(read_text_file(path))
@@ -89,7 +92,7 @@ def read_transforms(path: Path, images_folder: Path | None = None) -> pycolmap.R
 
 
 def _world_from_camera(where: str, value: object) -> Float64:
-    """Return ``world_from_cam`` (4, 4) for OpenCV camera axes."""
+    """Return the pose ``world_from_cam`` (4, 4) of a frame with OpenCV camera axes."""
     try:
         matrix = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -113,7 +116,7 @@ def _world_from_camera(where: str, value: object) -> Float64:
 
 
 def _explain_matrix(rotation: Float64, scale: float) -> str:
-    """Return what is wrong with a matrix that is not a rotation, and what to do."""
+    """Describe why a matrix is not a rotation, and what the user can do."""
     if not np.isfinite(scale) or scale < 1e-12:
         return ""
     unscaled = rotation / scale
@@ -161,7 +164,7 @@ def _camera(where: str, values: Mapping[str, Any], picture: Path | None) -> pyco
 
 
 def _numbers(where: str, values: Mapping[str, Any]) -> dict[str, float]:
-    """Return the camera parameters; raise :class:`InputError` for one that is not a number."""
+    """Return the camera parameters of a frame; raise :class:`InputError` for invalid numbers."""
     numbers = {key: values[key] for key in _CAMERA_KEYS if values.get(key) is not None}
     for name, value in numbers.items():
         if not isinstance(value, (int, float)) or not math.isfinite(value):
@@ -170,7 +173,7 @@ def _numbers(where: str, values: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _find_image(path: Path, images_folder: Path | None) -> Path | None:
-    """Find the image file of a frame; the extension and leading folders may differ."""
+    """Find the image file of a frame, also with another extension or other leading folders."""
     candidates = [path]
     if images_folder is not None:
         parts = path.parts
@@ -184,7 +187,7 @@ def _find_image(path: Path, images_folder: Path | None) -> Path | None:
 
 
 def _picture_size(where: str, file: Path | None) -> dict[str, float]:
-    """Return width and height of the image file."""
+    """Return (width, height) of the image file of a frame."""
     if file is None:
         raise InputError(
             f"{where}: 'w' and 'h' are missing, and so is the image file; add them to the file"

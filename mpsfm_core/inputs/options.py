@@ -11,42 +11,45 @@ from mpsfm_core.data.options import Options, expert
 
 
 class VideoOptions(Options):
-    """Options of choosing frames of a video."""
+    """Options of the selection of video frames as images."""
 
     motion: float = expert(0.08, gt=0, lt=1)
-    """Median motion of tracked points to the next frame, as a share of the diagonal. Larger values
-    give fewer frames [3 to 5 degrees of rotation of a phone]."""
+    """Median motion of tracked points between selected frames over the image diagonal. Larger
+    motion selects fewer frames [3 to 5 degrees of rotation of a phone]."""
     overlap: float = expert(0.7, gt=0, lt=1)
-    """Share of tracked points below which the next frame is chosen. Larger values give more
-    frames."""
+    """Share of still tracked points below which the next frame is selected. A larger share selects
+    more frames."""
     max_frames: int = Field(300, ge=2)
-    """Maximum number of frames. Above it, evenly spaced frames are chosen."""
+    """Maximum number of frames of a video. If more frames are selected, an evenly spaced subset is
+    used."""
 
 
 class InputOptions(Options):
-    """Options of reading and undistorting images."""
+    """Options of the reading and undistortion of images."""
 
     max_image_size: int | None = Field(None, ge=32)
-    """Longer side in pixels to which larger images are reduced; null keeps the size [paper 4]. The
-    reference command uses 1200. Larger values give more accurate keypoints and take more time."""
+    """Maximum longer side in pixels of the images; larger images are downscaled, and null keeps the
+    size [paper 4]. The command of the MP-SfM reference code uses 1200. Larger images give more
+    accurate keypoints and take more time."""
     max_pixels: int = expert(250_000_000, ge=1024)
-    """Maximum number of pixels of an image or mask. Larger files are refused before decoding,
+    """Maximum number of pixels of an image or mask. Larger images are rejected before decoding,
     because a small file can decode to gigabytes [above all cameras on the market]."""
     strict: bool = False
-    """True: a damaged image ends the run. False: damaged images are left out with a warning, unless
-    more than half are damaged."""
+    """If true, a damaged image ends the run. If false, damaged images are left out with a warning,
+    unless more than half of the images are damaged."""
     masks: Path | None = None
-    """Folder of masks of the original images: ``X.jpg.png``, ``X.png``, ``X_mask.png`` or ``X.jpg``
-    for the image ``X.jpg``. Black pixels are not used [COLMAP mask_path]."""
+    """Folder of masks of the original images, named ``X.jpg.png``, ``X.png``, ``X_mask.png`` or
+    ``X.jpg`` for the image ``X.jpg``. Pixels that are black in the mask are ignored [COLMAP
+    mask_path]."""
     mask_orientation: Literal["auto", "stored", "upright"] = expert("auto")
-    """Orientation of masks of images with an EXIF orientation if their size does not decide.
-    ``stored``: as the stored pixels; ``upright``: as the image is displayed; ``auto``: as the masks
-    whose size decides, else stored [COLMAP, which ignores EXIF orientation]."""
+    """Orientation of masks whose size fits the image before and after EXIF rotation, either
+    ``stored`` (before) or ``upright`` (after). The value ``auto`` follows the masks whose size
+    decides, else uses ``stored`` [COLMAP, which ignores EXIF orientation]."""
     default_focal_ratio: float = expert(1.2, gt=0)
-    """Ratio of focal length to longer side for images without a known focal length [COLMAP
+    """Ratio of focal length to longer image side for images without a known focal length [COLMAP
     default_focal_length_factor]."""
     blank_pixels: float = expert(0.0, ge=0, le=1)
-    """Share of blank pixels after undistortion: 0 crops to valid pixels, 1 keeps all original
-    pixels and masks blank corners [COLMAP blank_pixels]."""
+    """Amount of blank pixels in undistorted images, where 0 crops to valid pixels and 1 keeps all
+    original pixels and masks blank corners [COLMAP blank_pixels]."""
     video: VideoOptions = Field(default_factory=VideoOptions)
-    """Options for a video as input."""
+    """Options of the frame selection if the input is a video."""

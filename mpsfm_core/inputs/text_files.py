@@ -1,4 +1,4 @@
-"""Reader of text files of other programs, with any byte-order mark."""
+"""Read text files that other programs wrote, with any byte-order mark."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _ENCODINGS = (
 def read_text_file(path: Path) -> str:
     """Read a text file in UTF-8, or in the encoding of its byte-order mark.
 
-    Windows editors and PowerShell write UTF-8 and UTF-16 with such a mark.
+    Windows editors and PowerShell write UTF-8 and UTF-16 with a byte-order mark.
 
     Raises:
-        OSError: the file cannot be read.
-        UnicodeDecodeError: the file is not text in this encoding.
+        OSError: the text file cannot be read.
+        UnicodeDecodeError: the file is not text in UTF-8 or the encoding of its byte-order mark.
     """
     data = path.read_bytes()
     encoding = next((name for mark, name in _ENCODINGS if data.startswith(mark)), "utf-8")

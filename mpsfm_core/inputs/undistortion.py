@@ -1,4 +1,4 @@
-"""Undistortion of images, masks and pixels to pinhole cameras."""
+"""Undistort images, masks and pixels to pinhole cameras."""
 
 from __future__ import annotations
 
@@ -11,27 +11,28 @@ from mpsfm_core.geometry import inside, pixel_centers, project, rays, scale_pixe
 from mpsfm_core.geometry.pycolmap_conversion import pinhole_from_colmap
 
 _ROWS = 256
-"""Rows of a map that are computed together: bounds the memory for large images."""
+"""Number of rows of an undistortion map that are computed together, to bound the memory."""
 
 
 def is_pinhole(camera: pycolmap.Camera) -> bool:
-    """Return whether the camera has no distortion."""
+    """Return whether a COLMAP camera has no lens distortion."""
     return bool(camera.is_perspective_pinhole() and camera.is_undistorted())
 
 
 def resize_camera(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Camera:
-    """Return the camera of the image after resizing to (width, height)."""
+    """Return the camera of an image after resizing the image to (width, height)."""
     resized = pycolmap.Camera(camera.todict())
     resized.rescale(*size)
     return resized
 
 
 def undistort_camera(camera: pycolmap.Camera, blank_pixels: float) -> PinholeCamera:
-    """Return the pinhole camera of the undistorted image.
+    """Return the pinhole camera of the undistorted image of a camera.
 
     Args:
         camera: original camera. A pinhole camera is returned unchanged.
-        blank_pixels: COLMAP's ``blank_pixels``, 0 for no empty pixels, 1 for all original pixels.
+        blank_pixels: COLMAP's ``blank_pixels``, 0 to crop blank pixels, 1 to keep all original
+            pixels.
     """
     if not is_pinhole(camera):
         options = pycolmap.UndistortCameraOptions()
@@ -52,7 +53,7 @@ def undistort_pixels(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float6
     """Map pixels (n, 2) of the original camera to pixels of the undistorted view.
 
     Returns:
-        (n, 2) float64, NaN where the distortion has no inverse.
+        (n, 2) float64 undistorted pixels, NaN where the distortion has no inverse.
     """
     if is_pinhole(camera):
         return scale_pixels(xy, (camera.width, camera.height), pinhole.size)
@@ -61,9 +62,9 @@ def undistort_pixels(pinhole: PinholeCamera, camera: pycolmap.Camera, xy: Float6
 
 
 class UndistortionMap:
-    """Precomputed resampling from a distorted image to its pinhole view.
+    """Precomputed pixel map that resamples a distorted image to its undistorted view.
 
-    ``valid``: (h, w) bool, False where the pixel is outside of the original image.
+    ``valid``: Mask of the undistorted view, (h, w) bool, False outside of the original image.
     """
 
     def __init__(self, camera: pycolmap.Camera, pinhole: PinholeCamera) -> None:
@@ -77,7 +78,7 @@ class UndistortionMap:
         self._source: Float32 = source - np.float32(0.5)
 
     def image(self, image: UInt8) -> UInt8:
-        """Undistort an image with bilinear interpolation; pixels outside of it are black."""
+        """Undistort an image with bilinear interpolation; pixels outside the image are black."""
         warped = cv2.remap(
             image, self._source, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
@@ -86,7 +87,7 @@ class UndistortionMap:
         return result
 
     def mask(self, mask: Bool) -> Bool:
-        """Undistort a mask with nearest-neighbor sampling; pixels outside of it are False."""
+        """Undistort a mask with nearest-neighbor sampling; pixels outside the mask are False."""
         warped = cv2.remap(
             mask.astype(np.uint8), self._source, None, cv2.INTER_NEAREST, borderValue=0
         )

@@ -1,4 +1,4 @@
-"""Selection of sharp frames of a video, as far apart as matching allows."""
+"""Select sharp frames of a video, as far apart as matching allows."""
 
 from __future__ import annotations
 
@@ -24,59 +24,60 @@ from mpsfm_core.support.format_versions import VERSION, check_version
 EXTENSIONS = frozenset((".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".wmv"))
 """Extensions of video files."""
 FRAMES = "frames"
-"""Subfolder of the output with the chosen frames."""
+"""Subfolder of the output folder with the selected video frames."""
 
 Progress = Callable[[int, int], None]
-"""Called with the number of decoded frames and the total number in the file header."""
+"""Progress callback with the number of decoded frames and the number in the video header."""
 
 _log = logging.getLogger(__name__)
 
 _LIST = "frames.json"
 FORMAT = 1
-"""Version of the list of frames."""
+"""Format version of ``frames.json``, the origin of the selected frames."""
 _TRACKED_SIDE = 480
-"""Longer side in pixels of the frames in which points are tracked."""
+"""Longer side in pixels of the downscaled frames in which points are tracked."""
 _MAX_POINTS = 300
-"""Maximum number of tracked points."""
+"""Maximum number of points tracked by Lucas-Kanade optical flow."""
 _SHARPNESS_SIDE = 960
-"""Longer side in pixels of the frames in which sharpness is measured."""
+"""Longer side in pixels of the downscaled frames whose sharpness is measured."""
 _MAX_BACKWARD_ERROR_PX = 1.0
-"""Maximum forward-backward tracking error in pixels."""
+"""Maximum forward-backward error in pixels of a tracked point."""
 _EARLY_RATIO = 0.5
-"""Share of the motion to the next frame from which a sharper frame may be chosen earlier."""
+"""Share of the required motion from which a sharper frame may be selected earlier."""
 _MIN_POINTS = 20
-"""Minimum number of tracked points to measure motion."""
+"""Minimum number of tracked points to measure the motion of a frame."""
 _MAX_CANDIDATES = 300
-"""Maximum number of candidate frames in memory: ten seconds of most videos."""
+"""Maximum number of candidate frames in memory, ten seconds of most videos."""
 _MIN_FRAME_RATIO = 0.9
-"""Share of the frames in the file header below which a file counts as cut off."""
+"""Minimum share of the frames in the video header; below it the video counts as cut off."""
 _JPEG_QUALITY = 95
-"""JPEG quality of written frames."""
+"""JPEG quality of the selected frames, from 0 to 100."""
 
 
 def is_video(path: Path) -> bool:
-    """Return whether a path has the extension of a video and is not a folder."""
+    """Return whether a path has a video extension and is not a folder."""
     return path.suffix.lower() in EXTENSIONS and not path.is_dir()
 
 
 def extract_frames(
     video: Path, output: Path, options: VideoOptions, progress: Progress | None = None
 ) -> Path:
-    """Write the chosen frames as JPEG files into ``output/frames``.
+    """Select frames of a video and write them as JPEG files into ``output/frames``.
 
-    File names contain the frame number. Frames of the same video and options are reused.
+    The name of a JPEG file contains the frame number. Existing frames of the same video and options
+    are reused.
 
     Args:
         video: video file.
         output: output folder.
-        options: choice of frames.
-        progress: called during decoding.
+        options: options of the frame selection.
+        progress: callback during decoding of the video.
 
     Returns:
-        The folder of the frames.
+        Path of the folder with the JPEG files.
 
     Raises:
-        InputError: the file is not a video, is damaged, or the camera does not move.
+        InputError: the file is not a video or is damaged, or the camera does not move.
     """
     folder = output / FRAMES
     origin: dict[str, Any] = {"sha256": _digest(video), "options": options.model_dump(mode="json")}
@@ -97,11 +98,11 @@ def extract_frames(
 def choose_frames(
     video: Path, options: VideoOptions, progress: Progress | None = None
 ) -> list[int]:
-    """Choose frames of a video; return their numbers in order.
+    """Select frames of a video; return their frame numbers in order.
 
-    Tracks points from each chosen frame. The next frame is chosen when the points have moved by
-    ``options.motion`` or only ``options.overlap`` of them are still tracked. A sharper frame
-    shortly before is preferred.
+    Points are tracked from each selected frame with Lucas-Kanade optical flow. The next frame is
+    selected when the tracked points have moved by ``options.motion`` or only the share
+    ``options.overlap`` of the points is still tracked. A sharper frame shortly before is preferred.
 
     Raises:
         InputError: as :func:`extract_frames`.
@@ -139,7 +140,7 @@ class _Frame:
 
 @dataclass
 class _Chooser:
-    """Tracks points from the last chosen frame and collects candidates for the next one."""
+    """Selector of frames by the motion of points tracked from the last selected frame."""
 
     options: VideoOptions
     chosen: list[int] = field(default_factory=list)
@@ -147,19 +148,19 @@ class _Chooser:
     _candidates: list[tuple[float, _Frame]] = field(default_factory=list)
 
     def process(self, frame: _Frame) -> None:
-        """Process the next frame of the video."""
+        """Track points into the next frame of the video and select frames."""
         if self._track is None:
             self._take(frame)
             return
         way = self._track.follow(frame.gray, self.options)
         if way < _EARLY_RATIO:
-            self._candidates.clear()  # the camera is back at the last chosen frame
+            self._candidates.clear()  # the camera has returned to the last frame
             if (
                 len(self.chosen) == 1
                 and frame.sharpness > self._track.sharpness
                 and way < _EARLY_RATIO / 2
             ):
-                self.chosen.clear()  # a sharper first frame from the same place
+                self.chosen.clear()  # prefer a sharper first frame of the place
                 self._take(frame)
             return
         self._candidates.append((way, frame))
@@ -167,7 +168,7 @@ class _Chooser:
             self._take_sharpest()
 
     def finish(self) -> list[int]:
-        """Choose from the remaining candidates; return the numbers of all chosen frames."""
+        """Select from the remaining candidates; return the numbers of all selected frames."""
         while self._candidates:
             self._take_sharpest()
         return self.chosen
@@ -187,7 +188,7 @@ class _Chooser:
 
 
 class _Track:
-    """Points of a chosen frame, tracked through the following frames (Lucas-Kanade)."""
+    """Points of a selected frame, tracked through the following frames (Lucas-Kanade)."""
 
     def __init__(self, frame: _Frame) -> None:
         self.sharpness = frame.sharpness
@@ -199,7 +200,7 @@ class _Track:
         self._last = frame.gray
 
     def follow(self, gray: UInt8, options: VideoOptions) -> float:
-        """Track into a frame; return the motion as a share of that to the next chosen frame."""
+        """Track points into a frame; return the motion over the motion required for selection."""
         height, width = gray.shape
         if len(self._now) >= _MIN_POINTS:
             there, ok, _ = cv2.calcOpticalFlowPyrLK(self._last, gray, self._now, None)
@@ -211,7 +212,7 @@ class _Track:
             self._start, self._now = self._start[tracked], there[tracked]
         self._last = gray
         if len(self._now) < _MIN_POINTS:
-            # A blank wall or a cut: the motion is unknown, so the frame is chosen.
+            # If a blank wall or a cut hides the motion, the frame is selected.
             return 1.0
         moved = np.median(np.linalg.norm(self._now - self._start, axis=2))
         lost = 1 - len(self._now) / self._count
@@ -228,12 +229,12 @@ def _gray(frame: UInt8, side: int) -> UInt8:
 
 
 def _sharpness(frame: UInt8) -> float:
-    """Return the variance of the Laplacian (Pech-Pacheco et al. 2000)."""
+    """Measure sharpness by the variance of the Laplacian (Pech-Pacheco et al. 2000)."""
     return float(cv2.Laplacian(_gray(frame, _SHARPNESS_SIDE), cv2.CV_32F).var())
 
 
 def _frames(video: Path, wanted: frozenset[int] | None = None) -> Iterator[tuple[int, UInt8]]:
-    """Yield number and upright BGR pixels of the wanted frames, or of all."""
+    """Yield number and upright BGR image of all frames, or of the frames ``wanted``."""
     with _opened(video) as capture:
         number = 0
         while capture.grab() and (wanted is None or number <= max(wanted)):
@@ -251,7 +252,7 @@ def _read_frame_count(video: Path) -> int:
 
 @contextmanager
 def _opened(video: Path) -> Iterator[cv2.VideoCapture]:
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # our message replaces FFmpeg's output
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")  # an InputError replaces FFmpeg's output
     try:
         capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG)
     except cv2.error as error:
@@ -272,7 +273,7 @@ def _digest(video: Path) -> str:
 
 
 def _read_list(path: Path) -> object:
-    """Return the origin of a folder of frames, None if its list cannot be read."""
+    """Read from ``frames.json`` which video and options the frames have, None if unreadable."""
     try:
         origin = json.loads(path.read_text(encoding="utf-8"))
         check_version(origin, FORMAT, path)
