@@ -1,6 +1,6 @@
 """Plugin interface of providers: protocols, hooks and specifications.
 
-The module :mod:`registry` finds the installed plugins.
+The registry of installed plugins is :class:`mpsfm_core.providers.registry.Registry`.
 """
 
 from mpsfm_core.providers.protocols import (

@@ -1,8 +1,8 @@
-"""Discovery of installed plugins; a plugin that fails to load is listed with the reason.
+"""Discovery of installed plugins, with the reason for each plugin that fails to load.
 
-Importing a plugin and calling its hooks runs foreign code. Both run in a thread with a time limit.
-A thread cannot be killed: a plugin that hangs remains as a daemon thread, and the process
-continues.
+Importing a plugin and calling its hooks runs foreign code, which therefore runs in a thread with a
+time limit. A Python thread cannot be killed. The thread of a plugin that hangs remains as a daemon
+thread, and the process continues without the plugin.
 """
 
 from __future__ import annotations
@@ -42,21 +42,21 @@ _REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_][\w.]*")
 
 @dataclass(frozen=True)
 class LoadedPlugin:
-    """Result of loading one plugin entry point: its module and providers, or the fault."""
+    """Result of loading one plugin, with its providers and hooks or the reason of the failure."""
 
     name: str
     distribution: str
     version: str
     module: object = None
-    """Imported plugin module, None if loading failed."""
+    """Imported plugin module, or None if loading the plugin failed."""
     specs: tuple[object, ...] = ()
-    """What ``mpsfm_providers`` returned."""
+    """Provider specifications that the plugin's hook ``mpsfm_providers`` returned."""
     hooks: tuple[str, ...] = ()
     """Names of the hooks that the plugin implements, without the prefix ``mpsfm_``."""
     fault: str = ""
-    """Reason why the plugin cannot be used, else empty."""
+    """Reason why the plugin cannot be used, or an empty string."""
     hint: str = ""
-    """Text for the user that explains how to repair the fault."""
+    """Advice for the user on how to make the plugin usable."""
 
 
 def create_plugin_manager() -> pluggy.PluginManager:
@@ -73,10 +73,11 @@ def installed_plugins(
 
     Args:
         timeout_s: Time limit for loading each plugin.
-        crashing: (name, module) of entry points to skip, see :func:`crashing_plugins`.
+        crashing: Pairs (name, module) of entry points that are not loaded, see
+            :func:`crashing_plugins`.
 
     Yields:
-        One result per entry point; a plugin that fails has a ``fault``.
+        One loaded plugin per entry point, with a ``fault`` if loading the plugin failed.
     """
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
     for entry in sorted(entries, key=lambda e: (_distribution(e)[0], e.name)):
@@ -93,14 +94,14 @@ def crashing_plugins(timeout_s: float) -> set[tuple[str, str]]:
     """Find the plugins that crash the process in which they are loaded.
 
     A child process prints the name of each entry point before loading the plugin. If the child
-    process crashes, the last printed entry point is the cause. The search for crashing plugins then
-    continues without this plugin.
+    process crashes, the plugin with the last printed name is the cause. The search for crashing
+    plugins then starts again without that plugin.
 
     Args:
         timeout_s: Time limit for loading each plugin.
 
     Returns:
-        Pairs (name, module) of the entry points.
+        Pairs (name, module) of the entry points of crashing plugins.
     """
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
     remaining = {(entry.name, entry.value) for entry in entries}
@@ -142,7 +143,7 @@ os._exit(0)
 
 
 def subprocess_environment() -> dict[str, str]:
-    """Return environment variables with which a child process finds the modules of this process."""
+    """Return environment variables that make this process's modules importable in a child."""
     return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
@@ -156,10 +157,12 @@ def inspect_plugin(module: object, name: str, distribution: str, version: str) -
         version: Version of the plugin's distribution package.
 
     Returns:
-        The loaded plugin, with a ``fault`` if the plugin implements an unknown hook.
+        Providers and hooks of the plugin, with a ``fault`` if the plugin implements an unknown
+        hook.
 
     Raises:
-        TypeError: The object implements no hook, or ``mpsfm_providers`` does not return a list.
+        TypeError: The plugin implements no hook, or its hook ``mpsfm_providers`` does not return a
+            list.
         Exception: Any exception that the plugin's ``mpsfm_providers`` raises.
     """
     manager = create_plugin_manager()
@@ -182,7 +185,7 @@ def inspect_plugin(module: object, name: str, distribution: str, version: str) -
 
 
 def find_spec_fault(spec: ProviderSpec) -> tuple[str, str]:
-    """Return why a provider specification is unusable and the repair, or two empty texts."""
+    """Return why a provider specification is unusable and advice for the user, or empty strings."""
     if not isinstance(spec.api_version, int) or spec.api_version > API_VERSION:
         return (
             f"is made for plugin API {spec.api_version}, this core has {API_VERSION}",
@@ -190,7 +193,7 @@ def find_spec_fault(spec: ProviderSpec) -> tuple[str, str]:
         )
     try:
         fault = _malformed(spec)
-    except Exception as error:  # Fields of the specification have unexpected types.
+    except Exception as error:  # Fields of the provider specification have unexpected types.
         fault = str(error)
     if fault:
         return f"has a wrong specification: {fault}", "tell the plugin's author"
@@ -202,9 +205,10 @@ def find_spec_fault(spec: ProviderSpec) -> tuple[str, str]:
 
 
 def _distribution(entry: metadata.EntryPoint) -> tuple[str, str]:
-    """Return the distribution name and version of a plugin's entry point.
+    """Return the name and version of the pip package that contains a plugin's entry point.
 
-    A plugin with damaged package metadata must still appear in lists.
+    A plugin with damaged package metadata gets placeholders, so that the list of plugins contains
+    it.
     """
     try:
         if entry.dist is not None:
@@ -217,7 +221,7 @@ def _distribution(entry: metadata.EntryPoint) -> tuple[str, str]:
 def _load(
     entry: metadata.EntryPoint, distribution: str, version: str, timeout_s: float
 ) -> LoadedPlugin:
-    """Load a plugin's entry point in a thread with a time limit."""
+    """Import a plugin and collect its providers in a thread with a time limit."""
     outcome: list[LoadedPlugin | BaseException] = []
 
     def work() -> None:
@@ -246,10 +250,10 @@ def _load(
 
 
 def _hint(error: BaseException, distribution: str) -> str:
-    """Return advice for the user about a plugin whose loading raised an error."""
+    """Return advice for the user about a plugin whose import raised an error."""
     absent = (error.name or "") if isinstance(error, ImportError) else ""
     if absent.partition(".")[0] == "mpsfm_core" or "ProviderSpec.__init__()" in str(error):
-        # The plugin was made for a newer API.
+        # The plugin was made for a newer plugin interface.
         return f"pip install --upgrade mpsfm-core, or uninstall {distribution}"
     if absent and isinstance(error, ModuleNotFoundError):
         return f"pip install the package of module {absent!r}, or uninstall {distribution}"
@@ -257,12 +261,12 @@ def _hint(error: BaseException, distribution: str) -> str:
 
 
 def _malformed(spec: ProviderSpec) -> str:
-    """Return the first rule that a provider specification violates, or an empty text."""
+    """Describe the first invalid field of a provider specification, or return an empty string."""
     if spec.kind not in KINDS:
         return f"unknown kind {spec.kind!r}{did_you_mean(str(spec.kind), KINDS)}"
     name = spec.name
     if isinstance(name, str) and callable(spec.factory):
-        name = name.partition("@")[0]  # The text after the separator is the name of an environment.
+        name = name.partition("@")[0]  # The text after "@" is the name of an environment.
     if not (isinstance(name, str) and _NAME.fullmatch(name)):
         return f"name {spec.name!r} may only have lower-case letters, digits and - . _"
     if not (callable(spec.factory) or _is_reference(spec.factory)):
@@ -290,7 +294,7 @@ def _is_reference(value: Any) -> bool:
 
 
 def _installed(name: str) -> bool:
-    """Return whether a Python package is installed, looking up its top level without an import."""
+    """Return whether a Python module's top-level package is installed, without importing it."""
     try:
         return importlib.util.find_spec(name.partition(".")[0]) is not None
     except (ImportError, ValueError):

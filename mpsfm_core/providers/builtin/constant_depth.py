@@ -1,4 +1,4 @@
-"""Depth provider without any prior knowledge, the fallback if no network is installed."""
+"""Depth provider that predicts the same depth everywhere, for use without a network."""
 
 from __future__ import annotations
 
@@ -9,19 +9,21 @@ from mpsfm_core.data.options import Options
 from mpsfm_core.providers import ProviderContext
 
 _GRID = (24, 32)
-"""Rows and columns of the constant depth map; normals from depth need several pixels."""
+"""Rows and columns of the constant depth map. Normals are fitted to windows of several pixels, so
+one pixel would not suffice."""
 
 
 class ConstantDepth:
     """Depth provider that returns the plane z = 1 parallel to the image, without a metric unit.
 
-    The specification declares a large std, with which the mapper can still lift keypoints to 3D.
-    Images with much overlap are reconstructed almost as if there were no depth prior.
+    The provider's specification declares a large depth std, with which the mapper can still lift
+    keypoints to 3D. With this std, the depth hardly influences the reconstruction of images with
+    much overlap.
     """
 
     def __init__(self, options: Options | None, context: ProviderContext) -> None:
         pass
 
     def predict(self, view: View) -> DepthPrior:
-        """Return z-depth 1 at every pixel."""
+        """Return a depth map with z-depth 1 at every pixel."""
         return DepthPrior.from_arrays(np.ones(_GRID), metric=False)

@@ -1,4 +1,4 @@
-"""Placeholder providers for depth that a matcher or a multi-view network predicts."""
+"""Placeholders for depth predicted by a dense matcher or a multi-view network."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from mpsfm_core.providers import ProviderContext
 
 
 class MatcherDepth:
-    """Placeholder for ``depth: {use: matcher}``: depth predicted by the matcher.
+    """Placeholder depth provider for the option ``depth.use=matcher``.
 
-    Feature extraction takes the depth of each image from its pair with the most certain depth, as
-    the MASt3R configuration of the paper does. A single view has no pair, so :meth:`predict` always
-    raises an error.
+    A matcher such as MASt3R predicts the depth of both images of a pair. Feature extraction uses,
+    for each image, the depth from the image pair with the smallest depth uncertainty, as the paper
+    does with MASt3R. A depth provider receives a single image instead of a pair, so :meth:`predict`
+    always raises an error.
     """
 
     source = "the pairs of a matcher that predicts depth"
@@ -22,10 +23,10 @@ class MatcherDepth:
         pass
 
     def predict(self, view: View) -> DepthPrior:
-        """Raise an error, because a single view has no matches.
+        """Raise an error, because the matcher predicts depth only for image pairs.
 
         Raises:
-            ProviderError: Always.
+            ProviderError: The error is raised for every image.
         """
         raise ProviderError(
             f"the depth of {view.name!r} is predicted by {self.source}, not from a single view"
@@ -33,10 +34,10 @@ class MatcherDepth:
 
 
 class MultiViewDepth(MatcherDepth):
-    """Placeholder for ``depth: {use: multiview}``: depth predicted by the multi-view network.
+    """Placeholder depth provider for the option ``depth.use=multiview``.
 
-    Feature extraction takes the depth from the groups of images that the multi-view network
-    received.
+    A multi-view network predicts depth for several images jointly. Feature extraction takes the
+    depth of each image from that prediction.
     """
 
     source = "a multi-view network"

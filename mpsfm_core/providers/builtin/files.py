@@ -1,4 +1,4 @@
-"""Depth, normals and masks from files: sensor data and predictions of other programs."""
+"""Providers that read depth, normals and masks of sensors or other programs from files."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from mpsfm_core.providers.builtin.options import (
 )
 
 _MIN_ENCODED_LENGTH = 0.5
-"""Smallest length of a normal decoded from an image file; shorter vectors are invalid. Mid-gray,
-which encodes an unknown normal, has a length near zero."""
+"""Smallest length of a valid normal vector that is decoded from a color. Mid-gray, which encodes an
+unknown normal, is decoded to a vector of length near zero."""
 
 
 class DepthFiles:
@@ -37,7 +37,7 @@ class DepthFiles:
             view: Undistorted image; its name selects the map file.
 
         Returns:
-            Depth with variance.
+            Depth map with the variance of each pixel.
 
         Raises:
             InputError: The file is missing, unreadable or does not cover the view. Also raised if
@@ -88,7 +88,7 @@ class NormalFiles:
 
         Args:
             view: Undistorted image; its name selects the map file.
-            depth: Not used.
+            depth: Depth prior, which this provider does not use.
 
         Returns:
             Unit normals in the camera frame.
@@ -147,7 +147,7 @@ class MaskFiles:
 
 
 def _grayscale(path: Path, stored: NDArray[Any]) -> NDArray[Any]:
-    """Return one channel of a depth map stored as gray RGB; raise an error for a color image."""
+    """Return one channel of a depth map stored as gray RGB; raise InputError for a color image."""
     if stored.ndim == 3 and stored.shape[2] == 3:
         if (stored == stored[..., :1]).all():
             return np.asarray(stored[..., 0])
@@ -158,7 +158,7 @@ def _grayscale(path: Path, stored: NDArray[Any]) -> NDArray[Any]:
 def _optional(
     path: Path, arrays: dict[str, NDArray[Any]], name: str, view: View
 ) -> NDArray[Any] | None:
-    """Return an optional array after checking its shape."""
+    """Return an optional array of a map file, such as ``valid``, after checking its shape."""
     values = arrays.get(name)
     if values is not None:
         check_map(path, values, view, 1)
@@ -166,7 +166,7 @@ def _optional(
 
 
 def _decoded(stored: NDArray[Any]) -> NDArray[Any]:
-    """Decode normals from unsigned integers; leave floating-point normals unchanged."""
+    """Decode unsigned integers to normals in [-1, 1]; leave floating-point normals unchanged."""
     if np.issubdtype(stored.dtype, np.unsignedinteger):
         return stored.astype(np.float64) / np.iinfo(stored.dtype).max * 2 - 1
     return stored.astype(np.float64)

@@ -1,4 +1,4 @@
-"""Files of depth, normal and mask maps in several formats, named after their image."""
+"""Readers of depth, normal and mask files, which are named after their image."""
 
 from __future__ import annotations
 
@@ -22,23 +22,23 @@ _SUFFIXES = (".npz", ".npy", ".exr", ".png", ".tif", ".tiff")
 _SINGLE_CHANNELS = ("Z", "Y", "depth.Z", "Depth.Z", "R", "V")
 _VECTOR_CHANNELS = (("X", "Y", "Z"), ("R", "G", "B"))
 _MAX_ASPECT_DIFFERENCE = 0.02
-"""Largest relative difference between the aspect ratios of a map file and its view. Rounding the
-width and height of a reduced map changes its aspect ratio by less than this limit."""
+"""Largest relative difference between the aspect ratios of a map file and its image. Rounding the
+width and height of a downsampled map changes the aspect ratio by less than 2 %."""
 
 
 def find_file(options: FileOptions, view: View, what: str) -> Path:
-    """Find the map file of a view.
+    """Find the depth, normal or mask file of an image.
 
     Args:
-        options: Folder and suffix.
+        options: Folder and file name suffix of the map files.
         view: Undistorted image; its name selects the map file.
-        what: Name of the quantity for messages, such as "depth".
+        what: Name of the quantity in error messages, such as "depth".
 
     Returns:
-        Path of the file.
+        Path of the existing map file.
 
     Raises:
-        InputError: There is no file for the view; the message has the expected path.
+        InputError: There is no file for the image; the message has the expected path.
     """
     suffixes = _SUFFIXES if options.suffix is None else (options.suffix,)
     full = options.directory / view.name
@@ -66,12 +66,12 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
     """Read the named arrays of a map file.
 
     Args:
-        path: File in NPZ, NPY, EXR or an image format; colors are returned as RGB.
-        main: Name of the required array. Files in formats other than NPZ contain one array, which
-            is returned under this name.
+        path: Path of an NPZ, NPY, EXR or image file; color channels are returned in the order RGB.
+        main: Name of the required array, such as "depth". Files in formats other than NPZ contain
+            one array, which is returned under this name.
 
     Returns:
-        Arrays by name.
+        Arrays of the file by name.
 
     Raises:
         InputError: The file cannot be read or lacks the required array.
@@ -93,17 +93,17 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
 
 
 def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> None:
-    """Require that a map has the expected number of channels and covers the view.
+    """Raise an error if a map has other channels or another aspect ratio than expected.
 
     Args:
-        path: Path of the map file, for messages.
+        path: Path of the map file, for error messages.
         values: Depth, normal or mask map, (h, w) or (h, w, channels).
         view: Undistorted image that the map belongs to.
         channels: Expected number of channels of the map.
 
     Raises:
-        InputError: The shape is wrong, or the aspect ratio of the map differs from that of the
-            view.
+        InputError: The number of channels is wrong, or the aspect ratio of the map differs from
+            that of the image.
     """
     expected = 2 if channels == 1 else 3
     if values.ndim != expected or (channels > 1 and values.shape[2] != channels):

@@ -15,19 +15,20 @@ from mpsfm_core.providers.builtin.options import MutualNearestOptions
 from mpsfm_core.support.jit import kernel
 
 _BLOCK = 128
-"""Number of descriptors per block of the distance matrix: 4 MB for 8192 descriptors in the second
-image, which fits into CPU caches."""
+"""Rows of the descriptor distance matrix that are computed together. 128 rows for 8192 descriptors
+in the second image are 4 MB, which fits into CPU caches."""
 _ROUNDING = np.float32(1e-5)
-"""Largest difference of two squared distances that count as equal, relative to the squared
-descriptor length. The summation order of float32, and thus the rounding error, depends on the
-processor."""
+"""Largest rounding error of a squared descriptor distance, relative to the squared descriptor
+length. Squared distances that differ by less count as equal, because the summation order of float32
+depends on the processor."""
 
 
 class MutualNearest:
-    """Matcher of mutual nearest descriptors by Euclidean distance, for any kind of features.
+    """Matcher of mutual nearest descriptors in Euclidean distance, for any local features.
 
-    The score of a match is ``1 - nearest / second nearest distance``, taking the larger distance
-    ratio of the two directions.
+    The score of a match is ``1 - ratio``. ``ratio`` is the distance to the nearest descriptor
+    divided by the distance to the second nearest. Of the ratios of the two match directions, the
+    larger one is used.
     """
 
     def __init__(self, options: MutualNearestOptions, context: ProviderContext) -> None:
@@ -43,17 +44,17 @@ class MutualNearest:
         """Match the features of two views one to one.
 
         Args:
-            view_a: Undistorted image, used for messages.
-            view_b: Undistorted image, used for messages.
+            view_a: First undistorted image, whose name appears in error messages.
+            view_b: Second undistorted image, whose name appears in error messages.
             features_a: Features of the first view, with descriptors.
             features_b: Features of the second view, with descriptors.
 
         Returns:
-            Sparse matches.
+            Matches as pairs of keypoint indices with scores.
 
         Raises:
-            ProviderError: Features are missing, or the descriptors of the two views differ in
-                length.
+            ProviderError: The features of an image are missing, or the descriptors of the two
+                images differ in dimension.
         """
         features_a, features_b = require_features(
             "mutual-nearest matches features", features_a, features_b
@@ -75,12 +76,13 @@ def mutual_nearest(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
     """Find the mutual nearest neighbors of two descriptor sets.
 
     Args:
-        a: Descriptors (n, d).
-        b: Descriptors (m, d).
+        a: Descriptors (n, d) of the first image.
+        b: Descriptors (m, d) of the second image.
 
     Returns:
-        Row indices (k, 2) of descriptors in a and b, their distances (k,), and the ratio (k,) of
-        nearest to second nearest distance. The ratio is the larger of the two directions.
+        Row indices (k, 2) of matching descriptors in ``a`` and ``b``, their distances (k,), and the
+        ratio (k,) of nearest to second nearest distance. The ratio is the larger one of the two
+        match directions.
     """
     if not (len(a) and len(b)):
         empty = np.empty(0, dtype=np.float32)
@@ -99,13 +101,13 @@ def mutual_nearest(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
     limit = np.maximum(np.minimum(from_a.second[in_a], from_b.second[in_b]), 0)
     rounding = (
         _ROUNDING * norms_a[in_a]
-    )  # If the nearest and second nearest distances are equal, their ratio is 1.
+    )  # Makes the ratio 1 if the nearest and second nearest distances are equal up to rounding.
     ratio = np.sqrt((nearest + rounding) / (limit + rounding))
     return pairs, np.sqrt(nearest), ratio
 
 
 class _Nearest(NamedTuple):
-    """Nearest descriptor of the second image per descriptor of the first."""
+    """Index of and distances to the two nearest descriptors in the other image, per descriptor."""
 
     best: Int64
     nearest: Float32
@@ -117,7 +119,7 @@ class _Nearest(NamedTuple):
         return cls(np.zeros(count, np.int64), far, far.copy())
 
     def select(self, rows: slice) -> _Nearest:
-        """Return the nearest-neighbor arrays restricted to some descriptors, as array views."""
+        """Return numpy views of the nearest-neighbor arrays for a range of descriptors."""
         return _Nearest(self.best[rows], self.nearest[rows], self.second[rows])
 
 
@@ -134,7 +136,7 @@ def _compare(
     nearest_of_b: Float32,
     second_of_b: Float32,
 ) -> None:
-    """Update the nearest neighbors by products ``-2 a b`` (n, m) of the rows from ``start``."""
+    """Update the nearest neighbors by the products ``-2 a b`` of a block of descriptors."""
     for i in range(len(norms_a)):
         best, nearest, second = 0, np.float32(np.inf), np.float32(np.inf)
         for j in range(len(norms_b)):

@@ -1,4 +1,4 @@
-"""Normals of planes that are fitted to the depth prior."""
+"""Normals provider that fits planes to the depth prior."""
 
 from __future__ import annotations
 
@@ -14,40 +14,42 @@ from mpsfm_core.providers import ProviderContext
 from mpsfm_core.providers.builtin.options import NormalsFromDepthOptions
 
 _MIN_SUPPORT = 0.5
-"""Smallest ratio of pixels with valid depth in the window of a plane fit."""
+"""Smallest ratio of pixels with valid depth in the pixel window of a plane fit."""
 _MIN_SPREAD = 1e-3
-"""Smallest ``det / trace^2`` of the covariance of pixel positions: 1/4 for a square, 0 on a
-line."""
+"""Smallest ``det / trace^2`` of the covariance of the pixel positions in a plane fit. The value is
+1/4 for a square of pixels and 0 if all pixels are on a line."""
 _NOISE_MARGIN = 6.0
-"""Depth-edge threshold in multiples of the std of the depth map's roughness."""
+"""Smallest deviation of the inverse depth from the neighbors' mean at a depth edge, in multiples of
+the noise std of the depth map."""
 _VARIANCE_RANGE = (1e-12, np.pi**2)
 _MEDIAN_BEND = 1.052
-"""Median of ``max(|e1|, |e2|)`` for independent Gaussian errors of std 1."""
+"""Median of ``max(|e1|, |e2|)`` for independent standard normal variables ``e1`` and ``e2``."""
 _BEND_NOISE = np.sqrt(1.5)
-"""Std of ``w1 - (w0 + w2) / 2`` for independent errors of std 1."""
+"""Std of ``w1 - (w0 + w2) / 2`` for inverse depths ``w`` with independent errors of std 1."""
 
 
 class NormalsFromDepth:
-    """Normals provider that fits least-squares planes in a window around each depth pixel.
+    """Normals provider that fits a least-squares plane in a window around each depth pixel.
 
-    A plane ``dot(g, X) = 1`` has the inverse depth ``1 / z = dot(g, r)`` along the ray
-    ``r = (x, y, 1)``. The inverse depth is linear in ``g``, so a linear least-squares fit gives
-    ``g``, and the normal is ``-g / |g|``. The provider shrinks windows until they contain no depth
-    edge.
+    A plane ``dot(g, X) = 1`` has the inverse depth ``1 / z = dot(g, r)`` along the ray ``r = (x, y,
+    1)``. The inverse depth ``1 / z`` is linear in the plane vector ``g``, so linear least squares
+    gives ``g``, and the normal is ``-g / |g|``. The provider halves the window of a fit until the
+    window contains no depth edge.
 
-    Errors of depth maps are smooth over many pixels, because a network bends a wall instead of
-    roughening the surface. Depth differences of neighboring pixels are therefore more accurate than
-    independent errors of the declared std would be. A depth error of relative std ``s`` that varies
-    over an angle of ``a`` radians tilts a surface by about ``s / a``. The option ``slope_std`` is
-    ``1 / a``. The fit residuals add the variance of the roughness, assuming one independent error
-    per pixel.
+    Errors of predicted depth maps are smooth over many pixels, because a network bends a wall
+    instead of roughening the surface. Depth differences of neighboring pixels are therefore more
+    accurate than they would be with independent errors of the declared std. A depth error of
+    relative std ``s`` that varies over an angle of ``a`` radians tilts a surface by about ``s /
+    a``. The option ``slope_std`` is the factor ``1 / a`` from relative depth std to normal std. The
+    normal variance is the sum of this term and the variance that the residuals of the plane fit
+    imply for independent pixel errors.
     """
 
     def __init__(self, options: NormalsFromDepthOptions, context: ProviderContext) -> None:
         self._options = options
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """Return normals with variance, invalid at depth edges, holes and the border of the map."""
+        """Return plane normals with variance; normals at depth edges and holes are invalid."""
         if depth is None:
             raise ProviderError("from-depth needs a depth prior with its variance")
         return fit_normals(view.camera, depth, self._options)
@@ -56,11 +58,11 @@ class NormalsFromDepth:
 def fit_normals(
     camera: PinholeCamera, depth: DepthPrior, options: NormalsFromDepthOptions
 ) -> NormalPrior:
-    """Fit normals to a depth map.
+    """Fit a plane around each pixel of a depth map and return the plane normals.
 
     Args:
-        camera: Camera of the view that the depth map covers.
-        depth: Depth with variance.
+        camera: Pinhole camera of the undistorted image that the depth map covers.
+        depth: Depth prior with variance.
         options: Options of the plane fit.
 
     Returns:
@@ -82,7 +84,7 @@ def fit_normals(
     fit = _fit_without_edges(xy, inverse, noise, depth.valid & ~edges, edges, radius)
     squared_length = np.maximum((fit.plane**2).sum(axis=-1), 1e-300)
     relative = depth.variance / np.maximum(depth.depth.astype(np.float64), 1e-12) ** 2
-    # At a grazing angle the same depth error along the ray tilts a surface less.
+    # Seen at a grazing angle, a surface is tilted less by the same relative depth error.
     tilt = options.slope_std**2 * relative * inverse**2
     return NormalPrior.from_arrays(
         -fit.plane / np.sqrt(squared_length)[..., None],
@@ -93,7 +95,7 @@ def fit_normals(
 
 
 class _Fit(NamedTuple):
-    """Planes g (h, w, 3), variance (h, w) of g perpendicular to itself, validity (h, w)."""
+    """Plane vectors g (h, w, 3), variance (h, w) of the components perpendicular to g, validity."""
 
     plane: Float64
     variance: Float64
@@ -101,10 +103,10 @@ class _Fit(NamedTuple):
 
 
 def _relative_bends(inverse: Float64, valid: Bool) -> Float64:
-    """Return the relative deviation of inverse depth from the mean of the neighboring pixels.
+    """Return the relative deviation of inverse depth from the mean of two neighboring pixels.
 
-    The deviation is computed along rows and columns: it is 0 on any plane, and set to 0 if a
-    neighbor is missing.
+    The neighbors are those in the row or in the column, whichever gives the larger deviation. The
+    deviation is 0 on any plane, and is set to 0 if a neighboring pixel is invalid.
     """
     largest = np.zeros(valid.shape)
     for axis in (0, 1):
@@ -118,7 +120,7 @@ def _relative_bends(inverse: Float64, valid: Bool) -> Float64:
 def _fit_without_edges(
     xy: Float64, inverse: Float64, noise: Float64, usable: Bool, edges: Bool, radius: int
 ) -> _Fit:
-    """Fit a plane to each pixel, halving the window radius until the window has no edge."""
+    """Fit a plane around each pixel, halving the window radius until the window has no edge."""
     best = _fit_planes(xy, inverse, noise, usable, edges, radius)
     while radius > 1:
         radius //= 2
@@ -134,9 +136,9 @@ def _fit_without_edges(
 def _fit_planes(
     xy: Float64, inverse: Float64, noise: Float64, usable: Bool, edges: Bool, radius: int
 ) -> _Fit:
-    """Fit planes ``g`` with ``inverse = dot(g, (x, y, 1))`` to the usable pixels of windows.
+    """Fit a plane ``inverse = dot(g, (x, y, 1))`` to the usable pixels around each pixel.
 
-    ``noise`` (h, w) is a lower bound for the variance of the inverse depth of a pixel.
+    The array ``noise`` (h, w) is a lower bound for the variance of the inverse depth of a pixel.
     """
     x, y = xy[..., 0], xy[..., 1]
     weight = usable.astype(np.float64)

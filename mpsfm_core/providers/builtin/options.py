@@ -11,107 +11,115 @@ from mpsfm_core.data.options import Options
 
 
 class SiftOptions(Options):
-    """Options of SIFT.
+    """Options of the SIFT features provider.
 
-    Option defaults are those of COLMAP unless another source is given.
+    Defaults of SIFT options are those of COLMAP unless another source is given.
     """
 
     max_keypoints: int = Field(8192, gt=0)
     """Largest number of keypoints per image; keypoints with the largest scale remain [COLMAP]."""
     resize: int | None = Field(3200, ge=32)
-    """Longer side in pixels to which the image is reduced for detection; null keeps the image
-    size."""
+    """Longer side in pixels to which a larger image is downsampled for keypoint detection; null
+    keeps the image size."""
     root: bool = True
-    """True takes the square root of L1-normalized descriptors (RootSIFT) [COLMAP L1_ROOT]."""
+    """True takes the square root of L1-normalized SIFT descriptors (RootSIFT) [COLMAP L1_ROOT]."""
     first_octave: int = -1
-    """First octave of the scale space; -1 doubles the image and detects the smallest keypoints."""
+    """First octave of the SIFT scale space; -1 doubles the image size and detects the smallest
+    keypoints."""
     octave_resolution: int = Field(3, ge=1)
-    """Scale-space levels per octave; raising it detects more keypoints and takes longer."""
+    """Number of SIFT scale-space levels per octave. More levels give more keypoints and take
+    longer."""
     peak_threshold: float = Field(0.02 / 3, ge=0)
-    """Smallest contrast of a keypoint; raising it gives fewer, stronger keypoints."""
+    """Smallest contrast of a SIFT keypoint. A larger threshold gives fewer, stronger keypoints."""
     edge_threshold: float = Field(10.0, gt=0)
-    """Largest ratio of principal curvatures; raising it accepts keypoints on edges."""
+    """Largest ratio of principal curvatures at a SIFT keypoint. A larger threshold accepts
+    keypoints on edges."""
     upright: bool = False
-    """True skips keypoint orientations: more distinctive descriptors, but only for cameras without
-    roll."""
+    """True sets the orientation of every keypoint to zero, which makes descriptors more distinctive
+    but requires cameras without roll."""
     affine: bool = False
-    """True estimates affine shapes of keypoints for wide baselines; about five times slower."""
+    """True estimates affine shapes of keypoints for wide baselines, which is about five times
+    slower."""
 
 
 class MutualNearestOptions(Options):
-    """Options of the matcher of mutual nearest neighbors."""
+    """Options of the matcher of mutual nearest descriptors."""
 
     ratio: float | None = Field(0.8, gt=0, le=1)
     """Largest ratio of nearest to second nearest descriptor distance, in both directions [COLMAP
-    max_ratio]. Raising the ratio accepts more ambiguous matches; null disables the ratio test, for
-    learned features."""
+    max_ratio]. Raising the ratio accepts more ambiguous matches. Null disables the ratio test, as
+    is usual for learned features."""
     max_distance: float | None = Field(None, gt=0)
-    """Largest Euclidean distance of matching descriptors; null sets no limit."""
+    """Largest Euclidean distance of matching descriptors; null accepts any distance."""
 
 
 class FileOptions(Options):
-    """Options that locate the map file of each image."""
+    """Options that locate the depth, normal or mask file of each image."""
 
     directory: Path
-    """Folder of the map files, with the same subfolders as the image folder."""
+    """Folder of the depth, normal or mask files, with the same subfolders as the image folder."""
     suffix: str | None = None
-    """File name suffix after the image name with or without its extension, such as ``.png`` or
-    ``_depth.exr``. Null tries ``.npz``, ``.npy``, ``.exr``, ``.png`` and ``.tif``."""
+    """Suffix that follows the image name in the file name of a map, such as ``.png`` or
+    ``_depth.exr``. The image name may be written with or without its extension. Null tries the
+    suffixes ``.npz``, ``.npy``, ``.exr``, ``.png``, ``.tif`` and ``.tiff``."""
 
 
 class DepthFileOptions(FileOptions):
-    """Options of depth map files: z-depth in 16-bit PNG or TIFF, EXR, NPY or NPZ.
+    """Options of files with z-depth maps in 16-bit PNG or TIFF, EXR, NPY or NPZ.
 
-    Depth values that are zero or not finite are invalid. An NPZ file has ``depth`` and optionally
-    ``variance`` (squared unit of depth) and ``valid``.
+    Depth values that are zero or not finite are invalid. An NPZ file has the array ``depth`` and
+    optionally the arrays ``variance`` (squared unit of depth) and ``valid``.
     """
 
     scale: float = Field(1.0, gt=0)
     """Meters per stored depth unit, such as 0.001 for millimeters."""
     metric: bool = True
-    """False if the scaled depth has no metric unit."""
+    """False declares that depth values, multiplied by ``scale``, are not in meters."""
     relative_std: float | None = Field(None, ge=0)
-    """Std relative to depth; required if the files have no variance."""
+    """Depth std divided by depth. The option or ``std_floor`` is required if the files have no
+    variance."""
     std_floor: float = Field(0.0, ge=0)
-    """Smallest depth std, in the unit of the scaled depth."""
+    """Smallest depth std, in the unit of depth multiplied by ``scale``."""
     variance: FileOptions | None = None
-    """Separate files with depth variance maps, in the squared stored unit."""
+    """Location of separate files with depth variance maps, in the squared unit of the stored
+    depth."""
 
 
 class NormalFileOptions(FileOptions):
-    """Options of normal map files in the camera frame: NPZ, NPY, EXR, PNG or TIFF.
+    """Options of files with normal maps in the camera frame in NPZ, NPY, EXR, PNG or TIFF.
 
-    An NPZ file has ``normals`` and optionally ``variance`` (rad^2) and ``valid``. PNG and TIFF of 8
-    or 16 bit encode ``(n / 2 + 0.5) * maximum`` as RGB.
+    An NPZ file has the array ``normals`` and optionally the arrays ``variance`` (rad^2) and
+    ``valid``. Images of 8 or 16 bit encode a normal ``n`` as RGB color ``(n / 2 + 0.5) * maximum``.
     """
 
     frame: Literal["opencv", "opengl"] = "opencv"
-    """Axes of the stored normals. ``opencv``: x right, y down, z forward. ``opengl``: x right, y
-    up, z backward."""
+    """Camera axes of the stored normals, which are x right, y down, z forward for ``opencv`` and x
+    right, y up, z backward for ``opengl``."""
     std_deg: float | None = Field(None, gt=0)
     """Angular std in degrees of the normals if the files have no variance."""
 
 
 class MaskFileOptions(FileOptions):
-    """Options of mask files in any image format, NPY, or NPZ with the array ``mask``.
+    """Options of files with masks in any image format, NPY, or NPZ with the array ``mask``.
 
-    Nonzero pixels of a mask may be used.
+    The reconstruction may use the pixels where the mask is not zero.
     """
 
     invert: bool = False
-    """True inverts the mask: pixels with value 0 may be used."""
+    """True inverts the mask, so that the reconstruction uses the pixels where the mask is zero."""
 
 
 class NormalsFromDepthOptions(Options):
-    """Options of normals that are fitted to the depth prior."""
+    """Options of the normals provider that fits planes to the depth prior."""
 
     radius: float = Field(0.012, gt=0)
-    """Half the side of the largest fit window relative to the longer side of the depth map. Raising
-    the window size reduces noise and loses small surfaces [tuned: rendered kitchen]."""
+    """Half the side of the largest plane-fit window divided by the longer side of the depth map.
+    Raising the window size reduces noise of the normals and loses small surfaces [tuned: rendered
+    kitchen]."""
     edge: float = Field(0.015, gt=0)
-    """Relative deviation of inverse depth from the neighbors' mean that counts as a depth edge.
-    Raising the edge threshold fits planes across small steps [reference: continuity ratio
-    1.015]."""
+    """Relative deviation of inverse depth from the neighbors' mean above which a pixel is on a
+    depth edge. Raising the edge threshold fits planes across small depth steps [reference:
+    continuity ratio 1.015]."""
     slope_std: float = Field(4.0, ge=0)
-    """Angular std of normals in radians per relative std of depth. Raising this factor lowers the
-    weight of the normals [tuned: rendered kitchen with FastDepth]."""
+    """Angular std of normals in radians divided by the relative std of depth. Raising this factor
+    lowers the weight of the normals [tuned: rendered kitchen with FastDepth]."""

@@ -1,6 +1,6 @@
-"""Plugin of the built-in providers, which need no weights.
+"""Plugin module that registers the built-in providers, which need no network weights.
 
-The plugin module imports no heavy library.
+The module imports no provider code, so that listing the providers is fast.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def _depth() -> list[ProviderSpec]:
             summary="depth maps of a sensor or any network, read from files",
             code_license=_LICENSE,
             contract="mpsfm_core.testing.builtin_contracts:depth_files",
-            # The map files declare their uncertainty, which is used unchanged.
+            # The variance that the depth files or their options declare is used unchanged.
             calibration=DepthCalibration(std_scale=1.0, relative_std=0.0, std_floor=0.0),
         ),
         ProviderSpec(
@@ -69,7 +69,8 @@ def _depth() -> list[ProviderSpec]:
             summary="a plane parallel to the image: no prior at all, for photos with much overlap",
             code_license=_LICENSE,
             accuracy="none: it does not look at the photo (a network: pip install mpsfm-compact)",
-            # [tuned: sample scene] relative_std from 0.3 to 0.5 gives the same poses, 1.0 is worse.
+            # [tuned: sample scene] A relative_std from 0.3 to 0.5 gives the same poses, 1.0 gives
+            # worse poses.
             calibration=DepthCalibration(relative_std=0.5),
         ),
         ProviderSpec(
@@ -80,7 +81,8 @@ def _depth() -> list[ProviderSpec]:
             summary="the depth that the matcher predicts for its pairs (pair-depth)",
             code_license=_LICENSE,
             contract="mpsfm_core.testing.builtin_contracts:depth_of_matcher",
-            # [reference] scale of MASt3R's confidence, without a std proportional to depth
+            # [reference] The factor converts MASt3R's confidence to a depth std; no std is
+            # proportional to depth.
             calibration=DepthCalibration(std_scale=0.862, relative_std=0.0),
         ),
         ProviderSpec(

@@ -1,4 +1,4 @@
-"""SIFT features from COLMAP's CPU extractor."""
+"""Features provider that runs COLMAP's SIFT extractor on the CPU."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from mpsfm_core.providers import ProviderContext
 from mpsfm_core.providers.builtin.options import SiftOptions
 
 _WARNING = 1
-"""glog level that hides COLMAP's output for each image."""
+"""Log level of glog that hides the line that COLMAP prints for each image."""
 
 
 class Sift:
-    """Deterministic SIFT features provider with COLMAP's CPU extractor (VLFeat)."""
+    """Features provider that runs COLMAP's deterministic CPU extractor of SIFT (VLFeat)."""
 
     def __init__(self, options: SiftOptions, context: ProviderContext) -> None:
         self._resize = options.resize
@@ -38,22 +38,23 @@ class Sift:
         sift.normalization = (
             pycolmap.Normalization.L1_ROOT if options.root else pycolmap.Normalization.L2
         )
-        if "GLOG_minloglevel" not in os.environ:  # COLMAP prints a line for every image on stderr.
+        if "GLOG_minloglevel" not in os.environ:  # COLMAP prints a line for each image.
             pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, _WARNING)
 
     def extract(self, view: View) -> Features:
-        """Extract keypoints with unit descriptors (n, 128), rounded to 8 bit as in COLMAP."""
+        """Extract SIFT keypoints with descriptors (n, 128) of unit length and 8 bit precision."""
         gray = self._detection_image(view)
         keypoints, descriptors = _run_colmap(gray, self._settings)
         size = gray.shape[1], gray.shape[0]
         factor = view.camera.width / size[0]
-        # COLMAP stores a keypoint as x, y and the affine shape a11, a12, a21, a22, whose columns
-        # are the axes.
+        # COLMAP stores a keypoint as x, y, a11, a12, a21, a22. The columns of the affine shape a
+        # are the axes of the keypoint.
         axes = np.hypot(keypoints[:, 2:4], keypoints[:, 4:6])
         xy = scale_pixels(keypoints[:, :2].astype(np.float64), size, view.camera.size)
         norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
         return Features(
-            # The sub-pixel fit of the SIFT detector may leave the image by a fraction of a pixel.
+            # The sub-pixel position of a SIFT keypoint may be outside of the image by a fraction of
+            # a pixel.
             np.clip(xy, 0, view.camera.size),
             descriptors / np.maximum(norms, np.float32(1e-6)),
             scales=axes.mean(axis=1) * np.float32(factor),
@@ -74,10 +75,10 @@ class Sift:
 def _run_colmap(
     gray: UInt8, settings: pycolmap.FeatureExtractionOptions
 ) -> tuple[Float32, Float32]:
-    """Extract SIFT keypoints (n, 6) and descriptors (n, 128) of an image.
+    """Extract SIFT keypoints (n, 6) and descriptors (n, 128) of a gray image.
 
-    ``pycolmap.Sift`` holds the GIL while it computes, so threads would wait for each other.
-    COLMAP's feature extraction command releases the GIL, but only works on files.
+    The class ``pycolmap.Sift`` keeps Python's GIL while it computes, so threads would wait for each
+    other. The function ``pycolmap.extract_features`` releases the GIL, but only works on files.
     """
     with tempfile.TemporaryDirectory(prefix="mpsfm-sift-") as folder:
         images, database = Path(folder, "images"), Path(folder, "database.db")

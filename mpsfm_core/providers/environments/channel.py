@@ -1,7 +1,8 @@
-"""Message channel between two processes: text through a pipe, arrays through shared memory.
+"""Message channel between two processes, with a pipe for text and shared memory for arrays.
 
-A block of shared memory is a mapped file, on an in-memory file system if there is one. A block
-grows as needed and is reused, because allocating memory costs more than copying into it.
+A block of shared memory is a memory-mapped file, on an in-memory file system if there is one. A
+block grows as needed and is reused, because allocating shared memory takes longer than copying
+arrays into existing memory.
 """
 
 from __future__ import annotations
@@ -21,21 +22,21 @@ from mpsfm_core.providers.environments.codec import EncodedMessage, decode_messa
 
 _IN_MEMORY = Path("/dev/shm")
 _HEADER = struct.Struct("<IIQ")
-"""Message header: bytes of text, number of the shared block for the reply, bytes of arrays. All
-versions of the protocol start with this header, so both processes can read the version in the first
-message."""
+"""Binary format of the message header, which has the number of text bytes, the index of the shared
+memory block for the reply and the number of array bytes. The header is the same in all versions of
+the message protocol, so both processes can read the version in the first message."""
 _LARGEST_TEXT = 1 << 28
 _EMPTY = np.empty(0, dtype=np.uint8)
 
 
 class ChannelClosed(Exception):
-    """The process at the other end of the channel has ended or closed its pipe."""
+    """Error raised if the process at the other end of a message channel has ended."""
 
 
 class Channel:
     """One end of the message channel between two processes.
 
-    Each message names the shared block that the next message in the other direction has to use.
+    Each message has the index of the shared memory block for the arrays of the reply.
     """
 
     def __init__(
@@ -52,12 +53,14 @@ class Channel:
         Args:
             reader: Pipe from which this end reads messages.
             writer: Pipe to which this end writes messages.
-            folder: Folder of the shared memory files of both ends.
-            own: File name prefix of the blocks that this end of the channel writes.
-            other: File name prefix of the blocks that the other end of the channel writes.
-            lent: Number of messages whose arrays may be alive at the same time. Received arrays are
-                views of their shared block; if all blocks are in use, the arrays are copies. With
-                None, arrays are valid until the next message arrives.
+            folder: Folder of the shared memory files of both processes.
+            own: File name prefix of the shared memory blocks that this end of the channel writes.
+            other: File name prefix of the shared memory blocks that the other end of the channel
+                writes.
+            lent: Number of received messages whose arrays may be alive at the same time without a
+                copy. Received arrays are numpy views of a shared memory block, or copies if all
+                blocks are in use. With None, received arrays are never copied and valid until the
+                next message arrives.
         """
         self._reader, self._writer = reader, writer
         self._own, self._other = folder / own, folder / other
@@ -67,7 +70,7 @@ class Channel:
         self._target, self._announced = 0, 0
 
     def send(self, value: Any) -> None:
-        """Send a value.
+        """Send a value to the other process.
 
         Raises:
             ChannelClosed: The process at the other end of the channel has ended.
@@ -77,7 +80,8 @@ class Channel:
             block = self._written.get(self._target) or _Block(Path(f"{self._own}{self._target}"))
             self._written[self._target] = block
             packed.write(block.for_writing(packed.size))
-        # If all blocks are in use, the last one receives the arrays and is copied.
+        # If all shared memory blocks are in use, the last block receives the arrays of the reply,
+        # which are then copied.
         free = (i for i, block in enumerate(self._inbox) if not block.in_use)
         self._announced = next(free, len(self._inbox) - 1)
         try:
@@ -95,7 +99,7 @@ class Channel:
         """
         length, self._target, size = _HEADER.unpack(self._read(_HEADER.size))
         if length > _LARGEST_TEXT:
-            raise ChannelClosed  # The pipe contains foreign output instead of a message.
+            raise ChannelClosed  # The pipe contains output of other code instead of a message.
         text = self._read(length)
         block = self._inbox[self._announced].for_reading(size) if size else _EMPTY
         return decode_message(
@@ -103,7 +107,7 @@ class Channel:
         )
 
     def close(self) -> None:
-        """Unmap the shared blocks; their files are removed together with their folder."""
+        """Unmap the shared memory blocks, without deleting their files."""
         for block in (*self._written.values(), *self._inbox):
             block.close()
 
@@ -115,7 +119,7 @@ class Channel:
 
 
 class _Block:
-    """Block of shared memory: a file that both processes map."""
+    """Block of shared memory, which is a file that both processes map into memory."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -125,11 +129,11 @@ class _Block:
 
     @property
     def in_use(self) -> bool:
-        """True while an array that views the shared block is alive."""
+        """True while a numpy array that refers to the shared memory block is alive."""
         return self._read is not None and self._read() is not None
 
     def for_writing(self, size: int) -> memoryview:
-        """Return a buffer of ``size`` bytes for writing, growing the shared file if necessary."""
+        """Return a writable buffer of ``size`` bytes, growing the shared memory file if needed."""
         if size > self._size:
             self.close()
             with self._path.open("a+b") as file:
@@ -139,17 +143,17 @@ class _Block:
         return memoryview(self._map)[:size]
 
     def for_reading(self, size: int) -> UInt8:
-        """Return the bytes that the other process wrote to the shared block."""
+        """Return the bytes that the other process wrote to the shared memory block."""
         if size > self._size:
             self.close()
             self._open(self._path.stat().st_size)
         assert self._map is not None
         content = np.frombuffer(self._map, dtype=np.uint8, count=size)
-        self._read = weakref.ref(content)  # Views of the array keep the memory map alive.
+        self._read = weakref.ref(content)  # Numpy views keep the memory map alive.
         return content
 
     def close(self) -> None:
-        """Drop the reference to the memory map, which lives as long as arrays that view it."""
+        """Drop the reference to the memory map, which is unmapped when no array refers to it."""
         self._map, self._size = None, 0
 
     def _open(self, size: int) -> None:
@@ -159,9 +163,10 @@ class _Block:
 
 
 def reserve_space(descriptor: int, size: int) -> None:
-    """Reserve disk space for a shared memory file of the given size.
+    """Reserve space on the file system for a shared memory file of the given size.
 
-    Writing to a mapped page without disk space would kill the process.
+    Without reserved space, writing to a memory-mapped file on a full file system would kill the
+    process.
     """
     if hasattr(os, "posix_fallocate"):
         os.posix_fallocate(descriptor, 0, size)
@@ -170,7 +175,11 @@ def reserve_space(descriptor: int, size: int) -> None:
 
 
 def create_shared_folder(needed: int) -> tempfile.TemporaryDirectory[str]:
-    """Create a folder for shared memory files, in memory if ``needed`` bytes are free."""
+    """Create a folder for shared memory files, if possible on ``/dev/shm``.
+
+    Args:
+        needed: Bytes that must be free on ``/dev/shm``; otherwise the temporary folder is used.
+    """
     place = None
     if _IN_MEMORY.is_dir() and os.access(_IN_MEMORY, os.W_OK):
         status = os.statvfs(_IN_MEMORY)

@@ -1,7 +1,7 @@
-"""Encoding of values as JSON text plus one block with the bytes of all arrays.
+"""Encoding of Python values as JSON text and one memory block with the bytes of all arrays.
 
-Pickle is not used: a message can only contain the types below, and both processes may have
-different versions of Python and numpy. Supported are None, bool, int, float, str, paths, lists,
+Messages are not pickled, because pickle can execute code and both processes may have different
+versions of Python and numpy. Messages may contain None, bool, int, float, str, paths, lists,
 tuples, dictionaries with text keys, numpy arrays, the data types of :mod:`mpsfm_core.data`, weights
 files and calibrations.
 """
@@ -49,16 +49,16 @@ _TYPES: Mapping[str, type] = MappingProxyType(
 
 
 class EncodedMessage:
-    """Encoded value: JSON ``text`` and the arrays that the text refers to, in order."""
+    """Encoded Python value, which consists of JSON ``text`` and numpy ``arrays``."""
 
     def __init__(self, value: Any) -> None:
         self.arrays: list[NDArray[Any]] = []
         self.size = 0
-        """Size in bytes of the block that holds all arrays."""
+        """Size in bytes of the memory block for all arrays of the message."""
         self.text = json.dumps(self._plain(value)).encode()
 
     def write(self, block: memoryview) -> None:
-        """Copy the arrays into a block of ``size`` bytes, each at its offset."""
+        """Copy the arrays of the message into a memory block, each at its offset."""
         start = 0
         for array in self.arrays:
             place = np.frombuffer(block, array.dtype, array.size, start).reshape(array.shape)
@@ -92,19 +92,19 @@ class EncodedMessage:
 
 
 def decode_message(text: bytes, block: UInt8, copy: bool) -> Any:
-    """Decode a value.
+    """Decode a Python value from a received message.
 
-    The decoder does not validate the restored data types. The constructors in the sending process
-    validated the values, and :mod:`mpsfm_core.providers.validation` validates every return value of
-    a provider.
+    The decoder does not validate the decoded instances of data types. The constructors in the
+    sending process validated the values, and :mod:`mpsfm_core.providers.validation` validates every
+    return value of a provider.
 
     Args:
         text: JSON text of the received message.
         block: Bytes of the arrays in the received message.
-        copy: True copies the received arrays; False returns read-only views of the block of bytes.
+        copy: True copies the received arrays, False returns read-only numpy views of ``block``.
 
     Returns:
-        The value.
+        The decoded Python value.
 
     Raises:
         DataError: The message does not follow the encoding protocol.
@@ -116,7 +116,7 @@ def decode_message(text: bytes, block: UInt8, copy: bool) -> Any:
 
 
 class _Decoder:
-    """Decoder of one message, whose decoded arrays keep the block of bytes alive."""
+    """Decoder of one message, whose decoded arrays keep the message's memory block alive."""
 
     def __init__(self, block: UInt8, copy: bool) -> None:
         self._block, self._copy = block, copy
@@ -153,7 +153,7 @@ class _Decoder:
 
 
 def _restore(kind: type, values: dict[str, Any]) -> Any:
-    """Create an instance of a data type without calling its validation."""
+    """Create an instance of a data type from field values without validating them."""
     if issubclass(kind, BaseModel):
         return kind(**values)
     assert is_dataclass(kind)

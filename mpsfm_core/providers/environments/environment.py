@@ -25,20 +25,20 @@ from mpsfm_core.support.user_folders import user_data_folder
 _log = logging.getLogger(__name__)
 
 FORMAT = 1
-"""Format version of the stored description of an environment."""
+"""Format version of the file that describes the providers of an environment."""
 FOLDER_VARIABLE = "MPSFM_ENVIRONMENTS"
-"""Environment variable that names the folder of all provider environments."""
+"""Environment variable with the path of the folder that contains all provider environments."""
 
 _NAME = re.compile(r"[a-z0-9]+([._-][a-z0-9]+)*")
 _CORE = "mpsfm-core"
 _DESCRIPTION = "providers.json"
 _UNFINISHED = ".unfinished-"
 _REQUEST_TIMEOUT_S = 120.0
-"""Time limit in seconds for a worker request that runs no network."""
+"""Time limit in seconds for a request to a worker process that runs no neural network."""
 
 
 class Environment:
-    """Python environment in its own folder that contains providers."""
+    """Python environment with installed provider plugins, in a folder of its own."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -50,12 +50,12 @@ class Environment:
 
     @property
     def name(self) -> str:
-        """Name in configurations."""
+        """Name of the environment in configurations."""
         return self.folder.name
 
     @property
     def label(self) -> str:
-        """Name in messages."""
+        """Name of the environment in messages to the user."""
         return f"environment {self.name!r}"
 
     @property
@@ -65,11 +65,11 @@ class Environment:
         return self.folder.joinpath("venv", *inside)
 
     def start(self) -> Worker:
-        """Start a worker process in the environment."""
+        """Start a worker process with the environment's Python interpreter."""
         return Worker(self.python, self.label)
 
     def ask(self, **request: Any) -> Any:
-        """Send a request about providers to a worker, which stays alive for the next request."""
+        """Send a request about providers to a worker process, reusing a running one."""
         with self._lock:
             if self._worker is None or not self._worker.alive:
                 self._worker = self.start()
@@ -77,17 +77,17 @@ class Environment:
         return worker.ask(request, _REQUEST_TIMEOUT_S)
 
     def close(self) -> None:
-        """End the worker process that answers requests about providers."""
+        """End the worker process that answers requests about the environment's providers."""
         if self._worker is not None:
             self._worker.close()
             self._worker = None
 
     def describe(self) -> list[dict[str, Any]]:
-        """Return the stored description of the environment's providers. Starts no process."""
+        """Return the stored description of the environment's providers; start no process."""
         path = self.folder / _DESCRIPTION
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            # The file was written before the description had a version.
+            # The file was written by a version of MP-SfM that stored no format version.
             if isinstance(content, list):
                 content = {"providers": content}
             check_version(content, FORMAT, path)
@@ -100,7 +100,7 @@ class Environment:
         return found
 
     def refresh(self) -> list[dict[str, Any]]:
-        """Request the description of the providers from a worker and store the description."""
+        """Let a worker process describe the environment's providers, and store the description."""
         found: list[dict[str, Any]] = self.ask(do="describe")
         content = {VERSION: FORMAT, "providers": found}
         text = json.dumps(content, indent=1, sort_keys=True)
@@ -109,13 +109,13 @@ class Environment:
 
 
 def environments_folder() -> Path:
-    """Return ``$MPSFM_ENVIRONMENTS``, or ``environments`` in the user data folder."""
+    """Return the folder of all provider environments, which ``$MPSFM_ENVIRONMENTS`` may set."""
     folder = os.environ.get(FOLDER_VARIABLE)
     return Path(folder) if folder else user_data_folder() / "environments"
 
 
 def all_environments() -> list[Environment]:
-    """List the existing provider environments by name."""
+    """List the existing provider environments, sorted by name."""
     root = environments_folder()
     if not root.is_dir():
         return []
@@ -128,7 +128,7 @@ def find_environment(name: str) -> Environment:
     """Return the provider environment with the given name.
 
     Raises:
-        InputError: There is none.
+        InputError: No environment has that name.
     """
     known = {environment.name: environment for environment in all_environments()}
     if name not in known:
@@ -146,16 +146,15 @@ def create_environment(
 
     Args:
         name: Name of the provider environment.
-        packages: Requirements or source folders to install, as for pip.
-        python: Python interpreter or version; by default the running interpreter.
+        packages: Pip requirements or source folders of the packages to install.
+        python: Path or version of the Python interpreter, by default the running interpreter.
 
     Returns:
         The new environment and the description of its providers.
 
     Raises:
-        InputError: The name is invalid or an environment with that name exists.
-        ProviderError: The environment cannot be created. MP-SfM removes a partly created
-            environment.
+        InputError: The environment name is invalid, or an environment with that name exists.
+        ProviderError: The environment cannot be created. A partly created environment is removed.
     """
     if not _NAME.fullmatch(name):
         raise InputError(f"{name!r} is not made of lower-case letters, digits and - . _")
@@ -163,8 +162,8 @@ def create_environment(
     if environment.folder.exists():
         raise InputError(f"{environment.label} exists; 'mpsfm env remove {name}' removes it")
     environments_folder().mkdir(parents=True, exist_ok=True)
-    # The environment is created next to its final folder, so that an interruption leaves nothing
-    # behind.
+    # The environment is created in a temporary folder next to its final folder, so that an
+    # interruption leaves no incomplete environment.
     with tempfile.TemporaryDirectory(prefix=_UNFINISHED, dir=environments_folder()) as scratch:
         made = Environment(Path(scratch) / name)
         for command in _commands(made, [*_core_requirement(), *packages], python):
@@ -184,7 +183,7 @@ def remove_environment(name: str) -> None:
 def _commands(
     environment: Environment, packages: Sequence[str], python: str | None
 ) -> list[list[str]]:
-    """Return the commands that create a Python environment and install packages."""
+    """Return the uv or pip commands that create a Python environment and install packages."""
     venv, inside = str(environment.folder / "venv"), str(environment.python)
     uv = shutil.which("uv")
     if uv:
@@ -199,18 +198,18 @@ def _commands(
 
 
 def _relocate_scripts(scripts: Path, before: Path, after: Path) -> None:
-    """Replace the interpreter path in the scripts of a moved environment."""
+    """Replace the interpreter path in the scripts of a Python environment that is moved."""
     old, new = os.fsencode(before), os.fsencode(after)
     for path in scripts.iterdir():
         if path.is_file() and not path.is_symlink():
             content = path.read_bytes()
-            # On Windows, the launchers of an environment are binary files.
+            # On Windows, the scripts of a Python environment are binary launchers.
             if old in content and b"\0" not in content:
                 path.write_bytes(content.replace(old, new))
 
 
 def _core_requirement() -> list[str]:
-    """Return the pip requirement of the running mpsfm-core: its source folder or its version."""
+    """Return pip arguments that install the mpsfm-core of this process in another environment."""
     distribution = metadata.distribution(_CORE)
     origin = json.loads(distribution.read_text("direct_url.json") or "{}")
     url = str(origin.get("url", ""))
@@ -221,7 +220,7 @@ def _core_requirement() -> list[str]:
 
 
 def _run(command: list[str], label: str) -> None:
-    """Run a command; raise ProviderError with the last output if the command fails."""
+    """Run an installation command; raise ProviderError with its error output if it fails."""
     try:
         done = subprocess.run(command, capture_output=True, text=True)
     except OSError as error:

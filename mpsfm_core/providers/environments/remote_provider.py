@@ -1,4 +1,4 @@
-"""Providers of other Python environments: specifications for the registry, and clients."""
+"""Specifications and clients of providers that are installed in other Python environments."""
 
 from __future__ import annotations
 
@@ -27,27 +27,28 @@ from mpsfm_core.providers.environments.worker_process import Worker, WorkerLost
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 _CONSTRUCTION_TIMEOUT_S = 1800.0
-"""Time limit in seconds for constructing a provider, such as large weights from a slow disk to a
-GPU. Downloads of weights have no time limit."""
+"""Time limit in seconds for constructing a provider, which may load large weights from a slow disk
+to a GPU."""
 _CALL_TIMEOUT_S = 600.0
-"""Time limit in seconds for one view or pair; minutes on a CPU are normal."""
+"""Time limit in seconds for a provider to process one image or image pair. Networks on a CPU may
+need minutes."""
 
 
 @dataclass(frozen=True)
 class ProviderLocation:
-    """Location of a remote provider: environment, kind, and name in the environment."""
+    """Location of a provider in another Python environment."""
 
     environment: Environment
     kind: Kind
     name: str
 
     def ask(self, do: str, **request: Any) -> Any:
-        """Send a request about the remote provider and return the reply."""
+        """Send a request about the provider to a worker of its environment and return the reply."""
         return self.environment.ask(do=do, kind=self.kind, name=self.name, **request)
 
 
 class RemoteOptions(Options):
-    """Options of a remote provider; the other environment has their class and validates them."""
+    """Options of a provider in another environment, whose worker process validates them."""
 
     model_config = ConfigDict(
         frozen=True, extra="allow", protected_namespaces=(), ser_json_inf_nan="constants"
@@ -57,19 +58,19 @@ class RemoteOptions(Options):
 
     @classmethod
     def model_validate(cls, values: Any, **_: Any) -> Any:  # type: ignore[override]
-        """Validate options as pydantic does, in the other environment; raise SettingsError."""
+        """Validate option values in the other environment, which may raise SettingsError."""
         return cls._from_values(cls.location.ask("options", values=dict(values)))
 
     @classmethod
     def model_construct(  # type: ignore[override]
         cls, _fields_set: Any = None, **values: Any
     ) -> Any:
-        """Construct options without validation, as pydantic does."""
+        """Construct the options of a remote provider without validation, as in pydantic."""
         return cls._from_values({**cls.defaults, **values})
 
     @classmethod
     def _from_values(cls, values: Mapping[str, Any]) -> Any:
-        """Create an options instance from validated values."""
+        """Create an options instance from validated option values."""
         return super().model_construct(**values)
 
     def __reduce__(self) -> Any:
@@ -88,11 +89,11 @@ def _options(
 
 
 class RemoteProvider:
-    """Client of a provider in a worker process.
+    """Client that forwards calls to a provider in a worker process.
 
-    The client has the methods of all provider kinds; the specification declares which of them work.
-    If the worker crashes, hangs or runs out of memory, the current call fails and the next call
-    starts another worker.
+    The client has the methods of all provider kinds, but only those of the provider's own kind
+    work. If the worker crashes, hangs or runs out of memory, the current call fails and the next
+    call starts another worker.
     """
 
     def __init__(
@@ -110,22 +111,22 @@ class RemoteProvider:
         return self._call("predict", *given)
 
     def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
-        """Predict depth and normals in one network pass."""
+        """Predict depth and normals in one network pass in the worker process."""
         depth, normals = self._call("predict_joint", view)
         return depth, normals
 
     def estimate_focal(self, view: View) -> float | None:
-        """Estimate the focal length of the view in pixels."""
+        """Estimate the focal length of an image in pixels in the worker process."""
         focal: float | None = self._call("estimate_focal", view)
         return focal
 
     def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
-        """Predict the depth of a group of views jointly."""
+        """Predict the depth of several images jointly in the worker process."""
         group: MultiViewPrior = self._call("predict_group", tuple(views))
         return group
 
     def extract(self, view: View) -> Features:
-        """Extract features."""
+        """Extract local features of an image in the worker process."""
         features: Features = self._call("extract", view)
         return features
 
@@ -136,17 +137,17 @@ class RemoteProvider:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match two views."""
+        """Match two images in the worker process."""
         matches: PairMatches = self._call("match", view_a, view_b, features_a, features_b)
         return matches
 
     def describe(self, view: View) -> Float32:
-        """Compute the global image descriptor of a view."""
+        """Compute the global descriptor of an image in the worker process."""
         descriptor: Float32 = self._call("describe", view)
         return descriptor
 
     def mask(self, view: View) -> Bool:
-        """Segment usable pixels."""
+        """Compute the mask of an image in the worker process."""
         mask: Bool = self._call("mask", view)
         return mask
 
@@ -155,7 +156,7 @@ class RemoteProvider:
         return self._running().ask(request, _CALL_TIMEOUT_S)
 
     def _running(self) -> Worker:
-        """Return a worker in which the provider is constructed; start a worker if necessary."""
+        """Return a worker process that has constructed the provider, starting it if necessary."""
         if self._worker is None or not self._worker.alive:
             worker, context = self._location.environment.start(), self._context
             request = {
@@ -180,7 +181,7 @@ class RemoteProvider:
 
 @dataclass(frozen=True)
 class _Factory:
-    """Picklable factory of a provider in another environment."""
+    """Picklable factory of the client of a provider in another environment."""
 
     location: ProviderLocation
 
@@ -191,7 +192,7 @@ class _Factory:
 
 @dataclass(frozen=True)
 class _Weights:
-    """Picklable function from the options of a remote provider to its weights files."""
+    """Picklable function that lists the weights files of a provider in another environment."""
 
     location: ProviderLocation
 
@@ -202,7 +203,7 @@ class _Weights:
 
 @dataclass(frozen=True)
 class RemoteSpec:
-    """Return the registry specification of a provider in another environment."""
+    """Specification of a provider in another environment, with its location and origin."""
 
     location: ProviderLocation
     spec: ProviderSpec
@@ -213,15 +214,17 @@ class RemoteSpec:
 
 
 def remote_providers(environment: Environment) -> list[RemoteSpec]:
-    """List the provider specifications of an environment from its stored description.
+    """List the provider specifications of an environment from its description file.
 
-    Starts no process. The names of the listed providers have the form ``NAME@ENVIRONMENT``.
+    The function starts no process. The names of the listed providers have the form
+    ``NAME@ENVIRONMENT``.
 
     Args:
-        environment: The environment.
+        environment: Python environment that contains the providers.
 
     Returns:
-        Provider specifications with their origin and fault.
+        Provider specifications, each with its pip package and the reason if the provider is
+        unusable.
     """
     specs: list[RemoteSpec] = []
     for entry in environment.describe():
@@ -250,7 +253,7 @@ def remote_providers(environment: Environment) -> list[RemoteSpec]:
 
 @dataclass(frozen=True)
 class _Contract:
-    """Contract function that requests the ContractSetup from the other environment."""
+    """Function that requests the setup of a provider's contract tests from its environment."""
 
     location: ProviderLocation
 
@@ -260,7 +263,7 @@ class _Contract:
 
 
 class EnvironmentHooks:
-    """Hook implementations that the registry calls for providers of other environments."""
+    """Plugin hooks of providers in other environments, which the registry calls."""
 
     def __init__(self, remotes: Sequence[RemoteSpec]) -> None:
         self._locations: dict[tuple[str, str], ProviderLocation] = {
@@ -271,7 +274,7 @@ class EnvironmentHooks:
     def mpsfm_calibration(
         self, kind: str, provider: str, options: BaseModel | None
     ) -> DepthCalibration | NormalCalibration | None:
-        """Return the calibration that the plugin declares in the other environment."""
+        """Return the uncertainty model that a plugin in another environment declares."""
         location = self._locations.get((kind, provider))
         if location is None:
             return None

@@ -1,6 +1,7 @@
-"""Worker process that serves the providers of its environment, one request at a time.
+"""Worker process that runs the providers of its Python environment, one request at a time.
 
-The client starts the worker as ``python -m mpsfm_core.providers.environments.worker FOLDER``.
+The client starts the worker process with the command ``python -m
+mpsfm_core.providers.environments.worker FOLDER``, where FOLDER is for shared memory files.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from mpsfm_core.support.threads import limit_threads
 
 
 class ProviderServer:
-    """Server that runs the providers of this environment for one client process."""
+    """Server that runs the providers of this Python environment for one client process."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
@@ -33,7 +34,7 @@ class ProviderServer:
         self._limit, self._num_limited_modules = ExitStack(), 0
 
     def serve(self) -> None:
-        """Send the version and answer requests until the client process has ended."""
+        """Send the protocol version, then answer requests until the client process has ended."""
         self._channel.send(
             {
                 "protocol": PROTOCOL,
@@ -54,7 +55,7 @@ class ProviderServer:
                 self._channel.send({"error": encode_error(error)})
 
     def _answer(self, request: Mapping[str, Any]) -> Any:
-        """Execute one request."""
+        """Execute one request of the client and return the reply."""
         action = request["do"]
         if action == "call":
             self._limit_threads()
@@ -87,14 +88,14 @@ class ProviderServer:
         raise ProviderError(f"unknown request {action!r}")
 
     def _limit_threads(self) -> None:
-        """Apply the thread limit again if new modules, which may create threads, were loaded."""
+        """Limit the threads of native libraries again if modules were imported meanwhile."""
         if self._num_limited_modules != len(sys.modules):
             self._limit.close()
             self._limit.enter_context(limit_threads(self._threads))
             self._num_limited_modules = len(sys.modules)
 
     def _resolve(self, uri: str, sha256: str | None) -> Path:
-        """Request the path of a weights file from the client, which finds or downloads the file."""
+        """Request the path of a weights file from the client, which may download the file."""
         self._channel.send({"resolve": [uri, sha256]})
         answer = self._channel.receive()
         if "error" in answer:
@@ -107,7 +108,8 @@ def _description(registry: Registry) -> list[dict[str, Any]]:
     """Describe the providers of the plugins that are installed in this environment.
 
     The description omits built-in providers, because every environment has them. The description
-    also omits wrappers, because a wrapper has to run in the process of its inner provider.
+    also omits wrapper providers, because a wrapper has to run in the process of the provider that
+    it wraps.
     """
     entries = []
     for line in registry.status():
@@ -140,7 +142,7 @@ def _description(registry: Registry) -> list[dict[str, Any]]:
 
 
 def _setup(registry: Registry, kind: Any, name: str, folder: Path) -> dict[str, Any]:
-    """Return the fields of a ContractSetup that can be sent to the client."""
+    """Return the fields of a provider's ContractSetup that can be sent to the client process."""
     from mpsfm_core.testing.contract_case import load_setup
 
     setup = load_setup(registry.spec(kind, name), folder)
@@ -157,7 +159,7 @@ def _setup(registry: Registry, kind: Any, name: str, folder: Path) -> dict[str, 
 
 
 def main() -> None:
-    """Serve over stdin and stdout, sending other output of providers to stderr."""
+    """Answer requests from stdin on stdout and redirect the output of providers to stderr."""
     reader = os.fdopen(os.dup(0), "rb")
     writer = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)

@@ -1,4 +1,4 @@
-"""Client of a worker process in another environment: start, requests and time limits."""
+"""Client that starts a worker process in another environment and sends requests to it."""
 
 from __future__ import annotations
 
@@ -20,15 +20,18 @@ from mpsfm_core.providers import API_VERSION
 from mpsfm_core.providers.environments.channel import Channel, ChannelClosed, create_shared_folder
 
 PROTOCOL = 3
-"""Version of the message protocol; client and worker must have the same version."""
+"""Version of the message protocol, which must be the same in client and worker process."""
 
 _MODULE = "mpsfm_core.providers.environments.worker"
 _START_TIMEOUT_S = 120.0
-"""Time limit in seconds until the worker has imported mpsfm-core, for slow network disks."""
+"""Time limit in seconds for a worker process to import mpsfm-core, perhaps from a slow network
+disk."""
 _NEEDED_BYTES = 256 << 20
-"""Free bytes of shared memory that a worker needs; with less, messages use the temporary folder."""
+"""Bytes that must be free on ``/dev/shm`` to use it for the messages of a worker process. Otherwise
+files in the temporary folder are used."""
 _NUM_LENT_BLOCKS = 2
-"""Number of replies whose arrays may be alive: one is computed while one is stored."""
+"""Number of replies of a worker whose arrays may be alive without a copy. Two replies suffice,
+because the worker computes one reply while this process stores the last one."""
 _EXIT_TIMEOUT_S = 5.0
 _MPSFM_ERRORS: Mapping[str, type[MpsfmError]] = MappingProxyType(
     {
@@ -39,21 +42,21 @@ _MPSFM_ERRORS: Mapping[str, type[MpsfmError]] = MappingProxyType(
 
 
 class WorkerLost(RuntimeError):
-    """Error for a worker that crashed or did not answer; the next call starts another worker."""
+    """Error for a worker process that crashed or did not reply; the next call starts another."""
 
 
 class Worker:
-    """Client of a running worker process in another environment."""
+    """Client of one running worker process in another Python environment."""
 
     def __init__(self, python: Path, label: str) -> None:
-        """Start a worker.
+        """Start a worker process and receive its protocol version.
 
         Args:
             python: Python interpreter of the environment.
-            label: Name of the environment, for messages.
+            label: Name of the environment in error messages.
 
         Raises:
-            ProviderError: The worker does not start, or has another version of the message
+            ProviderError: The worker process does not start, or has another version of the message
                 protocol.
         """
         self._label = label
@@ -107,21 +110,21 @@ class Worker:
         timeout_s: float,
         resolve_weights: Callable[[str, str | None], Path] | None = None,
     ) -> Any:
-        """Send a request to the worker and wait for the reply.
+        """Send a request to the worker process and wait for the reply.
 
         Args:
-            request: The request.
-            timeout_s: Time limit.
-            resolve_weights: Function that resolves weights files, which the worker may request
-                before it replies.
+            request: Action of the worker and its arguments by name.
+            timeout_s: Time limit in seconds for the reply.
+            resolve_weights: Function that returns the path of a weights file, which the worker may
+                request before it replies.
 
         Returns:
-            The answer.
+            Value that the worker replies.
 
         Raises:
             MpsfmError: Any MP-SfM exception that was raised in the worker.
             RuntimeError: Any other exception of the provider; the message has its type and text.
-            WorkerLost: The worker crashed or did not reply within the time limit.
+            WorkerLost: The worker process crashed or did not reply within the time limit.
         """
         with self._lock:
             self._send(dict(request))
@@ -135,7 +138,7 @@ class Worker:
                     return answer["value"]
 
     def close(self) -> None:
-        """End the process."""
+        """End the worker process."""
         self._channel.close()
         self._end()
 
@@ -146,7 +149,7 @@ class Worker:
             raise self._lost("") from error
 
     def _receive(self, timeout_s: float, late: str) -> Any:
-        """Receive the next message, killing a worker that exceeds the time limit."""
+        """Receive the next message, and kill a worker process that exceeds the time limit."""
         timed_out: list[bool] = []
 
         def kill() -> None:
@@ -164,7 +167,7 @@ class Worker:
             timer.cancel()
 
     def _lost(self, late: str) -> WorkerLost:
-        """Describe how the worker process ended and release its resources."""
+        """Release the worker's resources and return an error that describes how it ended."""
         try:
             code = self._process.wait(_EXIT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
@@ -178,7 +181,7 @@ class Worker:
 
 
 def _ended(code: int) -> str:
-    """Describe the exit code of a process in words."""
+    """Describe the exit code of a worker process in words."""
     if code == -getattr(signal, "SIGKILL", 9):
         return "was killed from outside, most likely because memory ran out"
     if code < 0:
@@ -189,7 +192,7 @@ def _ended(code: int) -> str:
 def _resolved(
     resolve: Callable[[str, str | None], Path] | None, uri: str, sha256: str | None
 ) -> dict[str, Any]:
-    """Resolve a weights file for the worker; return an error as a message."""
+    """Return the reply to a worker that requests a weights file, with its path or an error."""
     try:
         if resolve is None:
             raise ProviderError(f"weights {uri} cannot be resolved without a weight store")
@@ -199,7 +202,7 @@ def _resolved(
 
 
 def encode_error(error: BaseException) -> dict[str, Any]:
-    """Encode an exception as a protocol message; :func:`decode_error` is the inverse."""
+    """Encode an exception for a message to the other process, see :func:`decode_error`."""
     kind = next((k.__name__ for k in type(error).__mro__ if k.__name__ in _MPSFM_ERRORS), "")
     if isinstance(error, SettingsError):
         problems = [[list(p.path), p.text, p.missing] for p in error.problems]
@@ -211,7 +214,7 @@ def encode_error(error: BaseException) -> dict[str, Any]:
 
 
 def decode_error(message: Mapping[str, Any]) -> Exception:
-    """Decode an exception from a protocol message."""
+    """Decode an exception that :func:`encode_error` encoded in the other process."""
     if "settings" in message:
         problems = (
             SettingProblem(tuple(p), text, missing) for p, text, missing in message["settings"]
@@ -223,12 +226,12 @@ def decode_error(message: Mapping[str, Any]) -> Exception:
 
 
 def _environment() -> dict[str, str]:
-    """Return the environment variables without the Python search path of this process."""
+    """Return the environment variables of this process without its Python search path."""
     return {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
 
 
 def _kill(process: subprocess.Popen[bytes]) -> None:
-    """Kill a process and its children."""
+    """Kill a worker process and its child processes."""
     if process.poll() is None:
         if os.name == "posix":
             os.killpg(process.pid, signal.SIGKILL)
@@ -244,6 +247,6 @@ def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[s
         if pipe is not None:
             try:
                 pipe.close()
-            except OSError:  # Buffered bytes of the pipe could not be written.
+            except OSError:  # Buffered bytes could not be written.
                 continue
     folder.cleanup()
