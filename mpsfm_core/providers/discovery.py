@@ -227,13 +227,13 @@ def _load(
     def work() -> None:
         try:
             outcome.append(inspect_plugin(entry.load(), entry.name, distribution, version))
-        except BaseException as error:  # A SystemExit raised by a plugin must not end the program.
+        # A SystemExit that a plugin raises must not end the program.
+        except BaseException as error:
             outcome.append(error)
 
     thread = threading.Thread(target=work, name=f"mpsfm plugin {entry.name}", daemon=True)
-    with redirect_stdout(
-        sys.stderr
-    ):  # Keep the plugin's output away from the standard output of commands.
+    # Standard output is reserved for the output of mpsfm commands, which may be JSON.
+    with redirect_stdout(sys.stderr):
         thread.start()
         thread.join(timeout_s)
     if not outcome:

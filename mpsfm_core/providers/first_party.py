@@ -1,4 +1,4 @@
-"""Table of the distributions that contain the plugins of this project, for install hints."""
+"""Tables of the pip packages that contain this project's plugins, for install advice."""
 
 from __future__ import annotations
 
@@ -57,29 +57,29 @@ PLUGIN_PROVIDERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "mpsfm-sky": ("mask/sky", "mask/sky-simple"),
     }
 )
-"""Pip requirement that contains a provider, by ``kind/name``."""
+"""Providers, as ``kind/name``, that each pip requirement of this project installs."""
 
 EXECUTORS: Mapping[str, str] = MappingProxyType({"dask": "mpsfm-dask", "ray": "mpsfm-ray"})
-"""Distribution that contains an executor, by the name of the executor."""
+"""Pip package that contains an executor of extraction steps, by the name of the executor."""
 
 VIEWERS: Mapping[str, str] = MappingProxyType({"viser": "mpsfm-viser", "rerun": "mpsfm-rerun"})
-"""Distribution that contains a viewer, by the name of the viewer."""
+"""Pip package that contains a live viewer, by the name of the viewer."""
 
 EXPORTS: Mapping[str, str] = MappingProxyType({"rerun": "mpsfm-rerun"})
-"""Distribution that contains an export format, by the name of the format."""
+"""Pip package that contains an export format, by the name of the format."""
 
 
 def install_hint(distributions: Mapping[str, str], name: str) -> str:
-    """Return the install advice for a plugin as the end of a message, or an empty text.
+    """Return the pip command for a missing plugin as the end of a message, or an empty string.
 
     Args:
-        distributions: One of the tables :data:`EXECUTORS`, :data:`VIEWERS` and :data:`EXPORTS`.
+        distributions: Pip package by plugin name, such as the table :data:`VIEWERS`.
         name: Name of the executor, viewer or export format.
     """
     return f"; pip install {distributions[name]}" if name in distributions else ""
 
 
 def requirement_for(kind: str, name: str) -> str:
-    """Return the pip requirement that contains a provider, or an empty text."""
+    """Return the pip requirement that installs a provider of this project, or an empty string."""
     provider = f"{kind}/{name}"
     return next((r for r, provided in PLUGIN_PROVIDERS.items() if provider in provided), "")

@@ -1,4 +1,4 @@
-"""Configuration of one provider: name, options, wrappers, calibration and fallbacks."""
+"""Configuration of one provider with its options, wrappers and fallback providers."""
 
 from __future__ import annotations
 
@@ -10,33 +10,35 @@ from pydantic import Field, model_validator
 from mpsfm_core.data.options import Options
 
 SAME_NETWORK = "same-network"
-"""Name of a normals provider: use the normals that the depth network predicts in the same pass."""
+"""Name that selects, as normals provider, the network that already predicts the depth."""
 
 FROM_MATCHER = "matcher"
-"""Name of a depth provider: use the depth that the matcher predicts for its image pairs."""
+"""Name of the depth provider that uses the depth that the matcher predicts for image pairs."""
 
 FROM_MULTIVIEW = "multiview"
-"""Name of a depth provider: use the depth that the multi-view network predicts for its groups."""
+"""Name of the depth provider that uses the depth that a multi-view network predicts jointly for
+several images."""
 
 
 class ProviderConfig(Options):
     """Configuration of one provider, with fallback providers in order of preference."""
 
     use: str
-    """Name of the provider, as ``mpsfm plugins list`` shows it."""
+    """Name of the provider, as in the output of ``mpsfm plugins list``."""
     fallback: tuple[str, ...] = ()
-    """Fallback providers, tried in this order if ``use`` is unavailable: the plugin or its weights
-    are missing, or the provider rejects the options."""
+    """Names of fallback providers, tried in this order if the provider ``use`` is unavailable. A
+    provider is unavailable if its plugin or weights are missing, or if it rejects the options."""
     environment: str | None = None
-    """Python environment that contains the provider ``use`` (see ``mpsfm env create``). Validation
-    merges the environment into the provider's name: ``use: NAME@ENVIRONMENT``."""
+    """Name of the Python environment that contains the provider ``use`` (see ``mpsfm env create``).
+    Validation replaces the option by the provider name ``NAME@ENVIRONMENT``."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Options of the provider without its wrappers, validated by the provider's options class."""
     wrap: tuple[ProviderConfig, ...] = ()
-    """Configurations of the wrappers around the provider, innermost first."""
+    """Configurations of the wrapper providers that modify the provider's output, innermost
+    first."""
     calibration: dict[str, Any] | str | None = None
-    """Uncertainty model of a depth or normals provider: values, or the path of a YAML or JSON file.
-    Null uses the uncertainty model that the plugin declares."""
+    """Uncertainty model of a depth or normals provider, given by values or by the path of a YAML or
+    JSON file. Null uses the uncertainty model that the plugin declares."""
 
     @model_validator(mode="before")
     @classmethod
@@ -50,7 +52,7 @@ class ProviderConfig(Options):
 
     @property
     def is_unresolved(self) -> bool:
-        """True if several providers are possible and provider resolution has not chosen one.
+        """True if the configuration allows several providers and a run has to choose one of them.
 
         See :mod:`mpsfm_core.pipeline.provider_resolution`.
         """

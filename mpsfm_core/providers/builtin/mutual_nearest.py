@@ -99,9 +99,8 @@ def mutual_nearest(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
     in_a, in_b = pairs.T
     nearest = np.maximum(from_a.nearest[in_a], 0)
     limit = np.maximum(np.minimum(from_a.second[in_a], from_b.second[in_b]), 0)
-    rounding = (
-        _ROUNDING * norms_a[in_a]
-    )  # Makes the ratio 1 if the nearest and second nearest distances are equal up to rounding.
+    # Adding the rounding error to both squared distances makes the ratio of equal distances 1.
+    rounding = _ROUNDING * norms_a[in_a]
     ratio = np.sqrt((nearest + rounding) / (limit + rounding))
     return pairs, np.sqrt(nearest), ratio
 

@@ -99,7 +99,8 @@ class Channel:
         """
         length, self._target, size = _HEADER.unpack(self._read(_HEADER.size))
         if length > _LARGEST_TEXT:
-            raise ChannelClosed  # The pipe contains output of other code instead of a message.
+            # The pipe contains output of other code instead of a message header.
+            raise ChannelClosed
         text = self._read(length)
         block = self._inbox[self._announced].for_reading(size) if size else _EMPTY
         return decode_message(
@@ -149,7 +150,8 @@ class _Block:
             self._open(self._path.stat().st_size)
         assert self._map is not None
         content = np.frombuffer(self._map, dtype=np.uint8, count=size)
-        self._read = weakref.ref(content)  # Numpy views keep the memory map alive.
+        # The weak reference is alive while numpy views of ``content`` are in use.
+        self._read = weakref.ref(content)
         return content
 
     def close(self) -> None:

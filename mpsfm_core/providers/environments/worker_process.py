@@ -247,6 +247,7 @@ def _end(process: subprocess.Popen[bytes], folder: tempfile.TemporaryDirectory[s
         if pipe is not None:
             try:
                 pipe.close()
-            except OSError:  # Buffered bytes could not be written.
+            # Closing a pipe to an ended process fails if buffered bytes were not written.
+            except OSError:
                 continue
     folder.cleanup()

@@ -1,6 +1,6 @@
-"""Export of networks to ONNX from the authors' code and weights.
+"""Export of neural networks to ONNX from the code and weights of their authors.
 
-The authors' code runs in its own process, in a script of a plugin that uses :mod:`author_script`.
-The MP-SfM process (:mod:`export`) only compares the ONNX file with the outputs of the original
-network.
+A plugin script, which uses :mod:`author_script`, runs the authors' code in a process of its own.
+The MP-SfM process, with the module :mod:`export`, only compares the outputs of the ONNX file with
+those of the original network.
 """

@@ -1,6 +1,6 @@
-"""Helpers for plugin scripts that export a network in the process of its authors' code.
+"""Helpers for plugin scripts that run the authors' code of a network and export it to ONNX.
 
-A script runs as a program that has the authors' source checkouts on its search path::
+An export script runs as a program with the authors' source checkouts on its search path::
 
     from mpsfm_core.providers.model_export.author_script import ExportJob
 
@@ -11,7 +11,7 @@ A script runs as a program that has the authors' source checkouts on its search 
             job.load(model, job.checkpoint()["model"])
         job.export(model, [{"image": torch.rand(1, 3, 96, 128)}], ["normal"])
 
-Only such scripts may import this module, because it imports torch.
+Only export scripts may import this module, because it imports torch.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from torch.overrides import TorchFunctionMode
 OPSET = 17
 
 Inputs: TypeAlias = Mapping[str, torch.Tensor]
-"""Input arrays of a network by name, in the order of the network's arguments."""
+"""Input tensors of a network by name, in the order of the network's arguments."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,15 @@ class ExportJob:
     """Export request that MP-SfM sends to the export script of a plugin."""
 
     weights: Path | None
-    """Path of the checkpoint, None for seeded random weights."""
+    """Path of the authors' checkpoint, or None for seeded random weights."""
     output: Path
     """Path of the ONNX file to write."""
     size: str = ""
-    """Size of the network, such as "large", if there are several."""
+    """Variant of the network, such as "large", if the authors published several sizes."""
 
     @classmethod
     def from_arguments(cls) -> ExportJob:
-        """Read the export request from the program argument and seed torch for random weights."""
+        """Read the export request from the program's argument and seed torch's random numbers."""
         warnings.simplefilter("ignore")
         torch.manual_seed(0)
         job = json.loads(sys.argv[1])
@@ -56,10 +56,11 @@ class ExportJob:
         return cls(Path(weights) if weights else None, Path(job["output"]), job["size"])
 
     def checkpoint(self, *allowed: type) -> Any:
-        """Load the tensors of the authors' checkpoint to the CPU without running its code.
+        """Load the tensors of the authors' checkpoint to the CPU without running code in the file.
 
         Args:
-            allowed: Further classes without executable code that the checkpoint may contain.
+            allowed: Additional classes, which must be harmless, that the checkpoint file may
+                contain.
         """
         assert self.weights is not None
         if self.weights.suffix == ".safetensors":
@@ -70,7 +71,7 @@ class ExportJob:
             return torch.load(self.weights, map_location="cpu", weights_only=True)
 
     def load(self, model: torch.nn.Module, state: Mapping[str, torch.Tensor]) -> None:
-        """Load the checkpoint into a network and require every parameter of the network."""
+        """Load a checkpoint into a network and raise an error if a parameter is missing."""
         missing = model.load_state_dict(state, strict=False).missing_keys
         if missing:
             raise SystemExit(f"the checkpoint lacks {missing[0]} and {len(missing) - 1} more")
@@ -83,16 +84,17 @@ class ExportJob:
         dynamic: Mapping[str, Mapping[int, str]] | None = None,
         expected: Sequence[Sequence[torch.Tensor]] = (),
     ) -> None:
-        """Write the ONNX file, traced on the first input, and the network's outputs for all inputs.
+        """Write the ONNX file and an NPZ file with example inputs and the network's outputs.
 
         Args:
-            model: Network to export.
-            inputs: Input arrays by name, in the order of the network's arguments.
-            outputs: Names of the network's outputs.
-            dynamic: Names of the axes of variable length, by tensor name. The example inputs should
-                differ in the lengths of these axes.
-            expected: Outputs of the original network if ``model`` is a modified form of that
-                network.
+            model: Torch network to export.
+            inputs: Example inputs of the network. The exporter traces the network on the first
+                example.
+            outputs: Names of the network's outputs in the ONNX file.
+            dynamic: Names of the axes of variable length, by axis index and tensor name. The
+                example inputs should differ in the lengths of these axes.
+            expected: Outputs of the original network for each example, if ``model`` is a modified
+                form of that network.
         """
         expected = expected or run_network(model, inputs)
         register_custom_op_symbolic("aten::expm1", _expm1, OPSET)
@@ -119,11 +121,12 @@ class ExportJob:
 
 
 def gather_weights(output: Path, tensor_files: Collection[Path]) -> None:
-    """Merge the external weights of an ONNX network above 2 GB into one file.
+    """Merge the weights files of an ONNX network above 2 GB into one file.
 
     Args:
-        output: Path of the ONNX file; the weights go to a file with its name and ``.data``.
-        tensor_files: Files with one tensor each, written by torch's exporter.
+        output: Path of the ONNX file. The weights are written to a file with this path and the
+            suffix ``.data``.
+        tensor_files: Paths of the weights files, each with one tensor, that torch's exporter wrote.
     """
     import onnx
 
@@ -133,24 +136,24 @@ def gather_weights(output: Path, tensor_files: Collection[Path]) -> None:
 
 
 def run_network(model: torch.nn.Module, inputs: Sequence[Inputs]) -> list[tuple[torch.Tensor, ...]]:
-    """Run a network on several inputs and return its outputs."""
+    """Run a network on each of several inputs and return the outputs."""
     model = model.eval()
     with torch.inference_mode():
         return [_answer(model, tensors) for tensors in inputs]
 
 
 class MaskedWriteRewriter(TorchFunctionMode):
-    """Torch mode that replaces ``tensor[index][mask] = x`` by an equivalent ``where``.
+    """Torch mode that replaces masked writes ``tensor[index][mask] = x`` by ``torch.where``.
 
-    The exporter of torch 2.13 (``dynamo=False``) drops earlier writes to a tensor before a masked
-    write to a view of it: after ``axes[:, 0] = x; axes[:, 0][invalid] = 0.0`` the file has 0
-    everywhere.
+    The ONNX exporter of torch 2.13 (``dynamo=False``) has a bug with masked writes to a view of a
+    tensor. After ``axes[:, 0] = x`` and ``axes[:, 0][invalid] = 0.0``, the values of the exported
+    network are 0 everywhere.
     """
 
     def __init__(self) -> None:
         super().__init__()
         self._last: tuple[torch.Tensor, torch.Tensor, Any] | None = None
-        """Most recent view of a tensor that was created by indexing, its base tensor and the
+        """Most recent tensor view that was created by indexing, the indexed tensor and the
         index."""
 
     def __torch_function__(
@@ -160,7 +163,7 @@ class MaskedWriteRewriter(TorchFunctionMode):
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
-        """Execute a torch function, replacing masked writes as the class describes."""
+        """Execute a torch function, but replace a masked write by ``torch.where``."""
         if func is torch.Tensor.__getitem__:
             view = func(*args)
             self._last = view, args[0], args[1]
@@ -175,13 +178,14 @@ class MaskedWriteRewriter(TorchFunctionMode):
 
 
 def _expm1(graph: Any, x: Any) -> Any:
-    """Export ``exp(x) - 1``, which ONNX lacks, as ``2 sinh(x / 2) exp(x / 2)``, accurate near 0."""
+    """Export ``expm1``, which ONNX lacks, as ``2 sinh(x / 2) exp(x / 2)``, accurate near 0."""
     half = graph.op("Mul", x, graph.op("Constant", value_t=torch.tensor(0.5)))
     return graph.op("Add", *2 * (graph.op("Mul", graph.op("Sinh", half), graph.op("Exp", half)),))
 
 
 def _answer(model: torch.nn.Module, inputs: Inputs) -> tuple[torch.Tensor, ...]:
     result = model(*(tensor.clone() for tensor in inputs.values()))
-    if isinstance(result, Mapping):  # The exporter takes the values of the mapping in their order.
+    # If the network returns a mapping, torch's exporter writes the values in the mapping's order.
+    if isinstance(result, Mapping):
         result = tuple(result.values())
     return tuple(result) if isinstance(result, (list, tuple)) else (result,)

@@ -1,4 +1,4 @@
-"""Export of a network: run the authors' code, verify the ONNX file, write a manifest."""
+"""Export of a neural network to a verified ONNX file with a manifest of its origin."""
 
 from __future__ import annotations
 
@@ -23,12 +23,13 @@ from mpsfm_core.providers.weights import WeightStore, exports_folder, file_sha25
 from mpsfm_core.support.files import write_file
 
 RANDOM = "random"
-"""Checkpoint name that selects seeded random weights, to test an export without a download. An ONNX
-file with random weights gets no manifest."""
+"""Checkpoint name that selects seeded random weights, which tests an export without a download. An
+ONNX file with random weights is not listed in the folder of exports."""
 
 TOLERANCE = 1e-3
-"""Largest relative difference of 99.9 % of the values between the ONNX file and the network. CPU
-and GPU kernels differ in float32, and iterative networks amplify differences of single values."""
+"""Largest accepted relative difference between outputs of the ONNX file and of the original
+network, for 99.9 % of the values. The other 0.1 % may differ more, because iterative networks
+amplify float32 rounding of single values."""
 _QUANTILE = 0.999
 
 
@@ -44,29 +45,31 @@ def export_model(
     python: Path | None = None,
     store: WeightStore | None = None,
 ) -> dict[str, Any]:
-    """Export a network from its authors' code and weights to an ONNX file.
+    """Export a neural network from its authors' code and weights to an ONNX file.
 
-    A manifest is stored with the ONNX file, and ``export:NAME`` refers to the file from then on.
+    A JSON manifest with hashes and source commit is stored next to the ONNX file. Weights options
+    can then refer to the ONNX file as ``export:NAME``.
 
     Args:
-        name: Name under which the exported network is registered.
-        recipe: Export recipe that the plugin declares.
-        code: Source checkouts: first that of the network, then those of required libraries.
-        checkpoint: Path or URI of the authors' weights, or ``random``.
-        output: Path of the ONNX file, by default in the folder of exports.
-        sha256: Expected SHA-256 of the checkpoint in hex.
+        name: Name of the exported network in ``export:NAME``.
+        recipe: Recipe for the export of the network, which a plugin declares.
+        code: Folders with source checkouts, first that of the network, then those of required
+            libraries.
+        checkpoint: Path or URI of the authors' weights, or ``random`` for random weights.
+        output: Path of the ONNX file to write, by default in the folder of exports.
+        sha256: Expected SHA-256 of the authors' checkpoint in hex.
         size: Size of the network if there are several.
         python: Python interpreter for the authors' code, by default the running one.
         store: Weight store that finds or downloads the checkpoint.
 
     Returns:
-        The manifest.
+        Manifest of the export, as in the JSON file.
 
     Raises:
         InputError: A source checkout does not exist.
-        WeightsError: The checkpoint with the weights is not available.
-        ProviderError: The authors' code fails, or the ONNX file computes other outputs than the
-            network.
+        WeightsError: The checkpoint with the authors' weights is not available.
+        ProviderError: The authors' code fails, or the outputs of the ONNX file differ from those of
+            the original network.
     """
     for folder in code:
         if not folder.is_dir():
@@ -79,9 +82,9 @@ def export_model(
     target = (output or exports_folder() / f"{name}.onnx").expanduser().resolve()
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".export-", dir=target.parent) as scratch:
-        made = (
-            Path(scratch) / target.name
-        )  # The ONNX file refers to the file of large weights by its file name.
+        # The temporary ONNX file already has its final name, because it refers to the separate
+        # weights file of a large network by name.
+        made = Path(scratch) / target.name
         script = importlib.util.find_spec(recipe.script)
         if script is None or script.origin is None:
             raise ProviderError(f"the plugin of {name} has no script {recipe.script!r}")
@@ -113,9 +116,8 @@ def export_model(
             "largest_differences": differences,
             "made": datetime.now(timezone.utc).isoformat(timespec="seconds"),
         }
-        for part in sorted(
-            Path(scratch).glob(f"{target.name}*")
-        ):  # The pattern includes the file of large weights.
+        # The pattern matches the ONNX file and, for large networks, its separate weights file.
+        for part in sorted(Path(scratch).glob(f"{target.name}*")):
             shutil.move(part, target.with_name(part.name))
     text = json.dumps(manifest, indent=1) + "\n"
     write_file(target.with_suffix(".json"), text)
@@ -129,11 +131,12 @@ def compare_with_original(made: Path) -> dict[str, float]:
     """Compare the outputs of an exported ONNX file with those of the original network.
 
     Args:
-        made: ONNX file. An NPZ file next to it has the inputs and outputs that the script wrote.
+        made: Path of the ONNX file. The export script wrote example inputs and the original outputs
+            to an NPZ file next to the ONNX file.
 
     Returns:
-        Largest relative difference over all inputs by output name, see
-        :func:`measure_relative_difference`.
+        Relative difference by output name, which is the largest value of
+        :func:`measure_relative_difference` over all example inputs.
     """
     runtime = importlib.import_module("onnxruntime")
     session = runtime.InferenceSession(str(made), providers=["CPUExecutionProvider"])
@@ -153,15 +156,16 @@ def compare_with_original(made: Path) -> dict[str, float]:
 def measure_relative_difference(actual: Any, expected: Any) -> float:
     """Return the 99.9 % quantile of the relative differences between two arrays.
 
-    Differences are relative to the expected value, or to the median of the expected values if that
-    is larger.
+    Each difference is divided by the absolute expected value, or by the median of all absolute
+    expected values if the median is larger.
 
     Args:
         actual: Output array of the exported ONNX file.
         expected: Expected output array of the original network.
 
     Returns:
-        The quantile; infinite if the shapes differ or a value is not finite.
+        Quantile of the relative differences, infinite if the shapes differ or a value is not
+        finite.
     """
     if actual.shape != expected.shape or not np.isfinite([actual, expected]).all():
         return float("inf")
@@ -181,19 +185,20 @@ def run_script(
     size: str = "",
     python: Path | None = None,
 ) -> None:
-    """Run a plugin's export script with the authors' checkouts on its search path.
+    """Run a plugin's export script with the authors' source checkouts on its search path.
 
     Args:
-        script: Export script, see
+        script: Path of the export script, which uses
             :class:`~mpsfm_core.providers.model_export.author_script.ExportJob`.
-        code: Checkouts.
-        output: ONNX file that the script writes.
-        weights: Path of the checkpoint, None for random weights.
+        code: Folders with the authors' source checkouts.
+        output: Path of the ONNX file that the script writes.
+        weights: Path of the authors' checkpoint, or None for random weights.
         size: Size of the network if there are several.
         python: Python interpreter, by default the running one.
 
     Raises:
-        ProviderError: The script fails; the message is the last line of the script's output.
+        ProviderError: The export script fails; the message is the last line of the script's error
+            output.
     """
     job = {"weights": weights and str(weights.resolve()), "output": str(output), "size": size}
     environment = {
@@ -213,12 +218,12 @@ def run_script(
 
 
 def _core_folder() -> list[str]:
-    """Return the folder that contains mpsfm_core, for an interpreter without this package."""
+    """Return the folder that contains mpsfm_core, for the search path of an export script."""
     return [str(Path(__file__).parents[3])]
 
 
 def _commit(folder: Path) -> Mapping[str, Any]:
-    """Return the git commit and state of a source checkout; the commit is None without git."""
+    """Return the git commit of a source checkout and whether its files were changed."""
 
     def ask(*arguments: str) -> str | None:
         try:
