@@ -26,13 +26,13 @@ NORMAL_COVERAGE = (ONE_SIGMA, 0.9545, 0.9973)
 def compute_metrics(residuals: Residuals, std: Float64) -> dict[str, Any]:
     """Compute all metrics of a declared std (n,); images have equal weight except in curves.
 
-    ``coverage``: ratio of errors within 1, 2 and 3 stds. ``z_mad``: 1.4826 times the median of
-    ``|error / std|``, 1 for a correct std. ``nll``: mean negative log density of a normal
-    distribution with the std. ``nll_heavy``: mean negative log density of the fitted Student t
-    distribution with the same coverage of 1 std. ``ause``: area between the sensitivity curves for
-    errors sorted by std and by true error, relative to the total RMSE; 0 is a perfect order.
-    ``rmse``: RMSE in meters or rad. The remaining values are sensitivity and calibration curves,
-    and coverage by range.
+    The key ``coverage`` is the ratio of errors within 1, 2 and 3 stds. The key ``z_mad`` is 1.4826
+    times the median of ``|error / std|``, 1 for a correct std. The key ``nll`` is the mean negative
+    log density of a normal distribution with the std. The key ``nll_heavy`` is the same for the
+    fitted Student t distribution with the same coverage of 1 std. The key ``ause`` is the area
+    between the sensitivity curves for errors sorted by std and by true error, relative to the total
+    RMSE; 0 is a perfect order. The key ``rmse`` is the RMSE in meters or rad. The remaining keys
+    are the sensitivity curve, the calibration curve, and the coverage by range of depth or slant.
     """
     total, weights = np.hypot(std, residuals.noise), residuals.weights()
     heavy_scale = total / STD_OF_T
@@ -63,8 +63,9 @@ def sensitivity_curve(errors: Float64, std: Float64) -> dict[str, list[float]]:
     """Compute the sensitivity (sparsification) curve [paper, appendix C].
 
     Returns:
-        ``recall``, ratio of samples in (0, 1]. ``predicted`` and ``ideal``: RMSE of the samples
-        with the smallest std and with the smallest errors, relative to the RMSE of all samples.
+        Curve by key. The key ``recall`` is the ratio of samples in (0, 1]. The keys ``predicted``
+        and ``ideal`` are the RMSE of the samples with the smallest std and with the smallest
+        errors, relative to the RMSE of all samples.
     """
     count = len(errors)
     ends = np.unique(np.ceil(np.linspace(0, 1, CURVE_POINTS + 1)[1:] * count).astype(np.int64))

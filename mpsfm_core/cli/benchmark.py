@@ -67,8 +67,9 @@ def benchmark(
     """Compare mpsfm with COLMAP and others on scenes with true poses: AUC, images, time.
 
     A SCENE is a folder with images/, gt/, and optionally intrinsics.yaml, gt_depth/ and
-    testsets.yaml. Writes DIR/report.md, .json and .html. Finished results in DIR are reused.
-    With gt_depth/ and --set dense.enabled=true, also evaluates depth maps and clouds.
+    testsets.yaml. The report is written to DIR/report.md, .json and .html. Finished runs in DIR are
+    not repeated. With gt_depth/ and --set dense.enabled=true, the depth maps and dense clouds are
+    evaluated too.
     """
     from mpsfm_core.data.errors import InputError
 
@@ -102,7 +103,7 @@ def benchmark(
 
 
 def _print_record(record: BenchmarkRecord, cached: bool) -> None:
-    """Print images and time of a finished benchmark run on stderr."""
+    """Print registered images and time of a finished benchmark run on stderr."""
     images = f"{len(record.estimated)}/{len(record.truth)} images"
     end = "cached" if cached else record.error or f"{record.cpu_seconds:.1f} s"
     typer.echo(f"{record.scene} {record.set_name} {record.label}: {images}, {end}", err=True)

@@ -52,7 +52,7 @@ def prune(
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Only print sizes.")] = False,
     cache: CacheDir = None,
 ) -> None:
-    """Remove files that were not used for some time.
+    """Remove cached files that were not used for some time.
 
     Later runs compute or download missing files again.
     """

@@ -15,9 +15,10 @@ if TYPE_CHECKING:
     from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 
 _PROVIDER_KEYS = ("options.", "wrap.", "calibration")
-"""Prefixes of ``--set`` keys that are settings of the provider."""
+"""Prefixes of ``--set`` keys that are settings of the calibrated provider."""
 _GROUND_TRUTH_KEY = "ground_truth."
-"""Prefix of ``--set`` keys that are settings of the true maps."""
+"""Prefix of ``--set`` keys that are settings of the provider ``files``, which reads the true
+maps."""
 
 
 def calibrate(
@@ -83,9 +84,9 @@ def calibrate(
 ) -> None:
     """Fit the uncertainty of a depth or normals provider and report its quality.
 
-    Compares predictions with true maps or with the points of a COLMAP model. Without true maps and
-    model, reconstructs the photos and compares with the points. Writes FILE for `depth.calibration:
-    FILE`, and a report next to FILE.
+    The predicted maps are compared with true maps or with the points of a COLMAP model. Without
+    true maps and model, the photos are reconstructed and give the points. The calibration is
+    written to FILE, for the setting depth.calibration, with a report next to FILE.
     """
     from mpsfm_core.calibration.calibrate import CalibrationImages, calibrate
     from mpsfm_core.calibration.cross_validation import StudyOptions
@@ -134,10 +135,10 @@ def calibrate(
 def _check_names(
     kind: str, alignments: list[str]
 ) -> tuple[CalibratedKind, tuple[Alignment, ...] | None]:
-    """Check the names of the provider kind and of the alignments.
+    """Check the names of the provider kind and of the depth alignments.
 
     Raises:
-        InputError: The kind or an alignment is unknown.
+        InputError: The provider kind or a depth alignment is unknown.
     """
     from mpsfm_core.calibration.model_selection import Alignment
     from mpsfm_core.data.errors import InputError, did_you_mean

@@ -26,7 +26,8 @@ def demo(
 ) -> None:
     """Reconstruct the sample photos and print the errors of the poses.
 
-    gt/ is a COLMAP model with true cameras and poses. The run uses its cameras only.
+    gt/ is a COLMAP model with true cameras and poses. The run uses the cameras in gt/, but not the
+    poses.
     """
     from mpsfm_core.cli.reconstruct import run
     from mpsfm_core.evaluation import read_poses, reconstruction_poses

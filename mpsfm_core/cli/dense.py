@@ -28,10 +28,11 @@ def dense(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Run multi-view stereo on the photos of a model: DIR/depth, DIR/dense.ply and DIR/sparse.
+    """Run multi-view stereo on the photos of a model and write depth maps and a point cloud.
 
-    The search starts from MODEL/depth if MODEL is a result folder of mpsfm, else from the depth
-    range of the model's points.
+    The output is DIR/depth, DIR/dense.ply and DIR/sparse. The depth search starts from the maps in
+    MODEL/depth if MODEL is a result folder of mpsfm, else from the depth range of the model's
+    points.
     """
     from mpsfm_core.data.options import parse_settings
     from mpsfm_core.dense.options import DenseOptions

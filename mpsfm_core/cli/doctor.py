@@ -26,9 +26,9 @@ def doctor(
     offline: Offline = False,
     cache: CacheDir = None,
 ) -> None:
-    """List what is installed, what a run would use, and how to improve runs on this machine.
+    """List installed plugins, the providers of a run, and how to improve runs on this machine.
 
-    Downloads and computes nothing. Exit code 1 if a plugin is broken.
+    The check downloads and computes nothing. Exit code 1 if a plugin is broken.
     """
     from mpsfm_core.cli.cache import cache_size, format_size
     from mpsfm_core.config import load_config

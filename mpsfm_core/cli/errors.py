@@ -1,6 +1,6 @@
 """Error handling of commands: print one line on stderr and set the exit code.
 
-The option ``--debug`` prints a traceback instead. Exit codes: 0 success, 1 internal error or
+The option ``--debug`` prints the traceback of the error. Exit codes: 0 success, 1 internal error or
 machine failure, 2 wrong input or usage, 3 no reconstruction, 130 interrupted.
 """
 
@@ -59,7 +59,7 @@ def _explain(error: Exception) -> tuple[str, int]:
 
 
 def _is_control_flow(error: Exception) -> bool:
-    """Check for exits, usage errors and closed pipes, which typer handles."""
+    """Return True for exits, usage errors and closed pipes, which typer handles itself."""
     if isinstance(error, OSError):
         return error.errno == errno.EPIPE
     if isinstance(error, (typer.Exit, typer.Abort)):

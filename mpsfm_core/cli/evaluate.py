@@ -47,9 +47,10 @@ def evaluate(
 ) -> None:
     """Print pose AUC at 1, 5 and 20 degrees, trajectory errors and registered images as JSON.
 
-    Photos are matched by name. Photos of GT without pose in MODEL count as unregistered. With true
-    depth or a scan, also prints errors of the depth maps and the dense cloud of a result folder.
-    Without a scan, the true depth maps form the scan.
+    Photos of MODEL and GT are matched by name. Photos of GT without pose in MODEL count as
+    unregistered. With true depth or a scan, the errors of the depth maps and the dense cloud of a
+    result folder are printed too. Without a scan, the dense cloud is compared with the points of
+    the true depth maps.
     """
     import json
 

@@ -25,9 +25,9 @@ def mesh(
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Build a colored mesh from the depth maps: DIR/mesh.ply and DIR/mesh.glb.
+    """Build a colored mesh from depth maps and write DIR/mesh.ply and DIR/mesh.glb.
 
-    Requires pip install 'mpsfm-core[mesh]'.
+    The command needs the libraries of pip install 'mpsfm-core[mesh]'.
     """
     from mpsfm_core.data.options import parse_settings
     from mpsfm_core.dense.options import MeshOptions

@@ -89,8 +89,9 @@ def fetch(
 ) -> None:
     """Download missing weights, verify them, and print their files.
 
-    For a configuration, download all weights that a run needs. Licenses and the total size are
-    printed first. Weights that are not for commercial use need a confirmation by name.
+    For a configuration, download all weights that a run needs. Licenses and the total download size
+    are printed first. If a license forbids commercial use, the user must accept the license of each
+    provider by name.
     """
     from mpsfm_core.providers.weights import WeightStore
 

@@ -63,7 +63,7 @@ def check(
     device: Annotated[str, typer.Option(help="Run on cpu or cuda.")] = "cpu",
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Check that providers satisfy the contract; exit code 1 if one does not."""
+    """Check that providers pass the contract tests; exit code 1 if a provider fails."""
     if _CHECKING not in os.environ:
         arguments = [name, "--device", device, *(["--json"] if as_json else [])]
         arguments += [part for value in options or () for part in ("--set", value)]

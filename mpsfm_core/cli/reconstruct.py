@@ -133,7 +133,7 @@ def run(
 
 
 def _print_failure(summary: Mapping[str, Any], output: Path) -> None:
-    """Print the findings of a failed run and their remedies on stderr."""
+    """Print the problems of a failed run and their remedies on stderr."""
     from mpsfm_core.report.findings import findings
 
     for finding in findings(summary):
@@ -145,7 +145,7 @@ def _print_failure(summary: Mapping[str, Any], output: Path) -> None:
 
 
 def _print_outcome(result: ReconstructionResult, output: Path) -> None:
-    """Print the verdict, weak and missing photos, and the files of a successful run."""
+    """Print quality, weakly registered and missing photos, and files of a successful run."""
     from mpsfm_core.report.findings import findings, weakest
     from mpsfm_core.report.verdict import judge
 

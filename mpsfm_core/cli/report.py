@@ -13,9 +13,9 @@ def report(
         Path, typer.Argument(metavar="DIR", help="Result folder of 'mpsfm reconstruct'.")
     ],
 ) -> None:
-    """Write DIR/report.html again; every run writes the page once.
+    """Write the page DIR/report.html again, which every run writes at its end.
 
-    The command reads DIR only. The page opens in any browser without a network.
+    The command reads only the result folder DIR. The page opens in any browser without a network.
     """
     from mpsfm_core.report.page import write_report
 

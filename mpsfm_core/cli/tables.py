@@ -9,7 +9,7 @@ from rich.table import Table
 from rich.text import Text
 
 _PIPE_WIDTH = 2000
-"""Width in characters if the output is no terminal, so that lines are not wrapped."""
+"""Width of tables in characters if the output is no terminal, so that lines are not wrapped."""
 
 
 def print_table(header: Sequence[str], rows: Iterable[Sequence[str | Text]]) -> None:

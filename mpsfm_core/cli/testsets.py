@@ -30,9 +30,10 @@ def build(
     seed: Annotated[int, typer.Option(help="Seed; the same seed gives the same sets.")] = 0,
     replace: Annotated[bool, typer.Option(help="Replace an existing testsets.yaml.")] = False,
 ) -> None:
-    """Write SCENE/testsets.yaml with the buckets minimal, leq5, leq10, leq30, triplets and all.
+    """Write SCENE/testsets.yaml: test sets grouped by overlap into minimal, leq5, ..., all.
 
-    In leq5, the three-view overlap of any three photos of a set is at most 5 %.
+    The groups are minimal, leq5, leq10, leq30, triplets and all. In a test set of leq5, at most 5 %
+    of a photo's pixels are visible in both of any two other photos.
     """
     from mpsfm_core.evaluation.build_sets import build_test_sets
     from mpsfm_core.evaluation.sampling import SamplingOptions

@@ -88,7 +88,8 @@ def trajectory_errors(
     """Compute the trajectory errors of the images with estimated and true pose.
 
     Returns:
-        The errors, or None with fewer than three common images or coinciding camera centers.
+        The trajectory errors, or None if fewer than three images are common or camera centers
+        coincide.
     """
     names = [name for name in truth if name in estimated]
     if len(names) < 3:

@@ -42,19 +42,19 @@ from mpsfm_core.providers.registry import Registry, core_version
 from mpsfm_core.support.files import write_file
 
 RecordCallback = Callable[[BenchmarkRecord, bool], None]
-"""Callback that receives a record, and True if the record is from an earlier benchmark."""
+"""Callback that receives a benchmark record, and True if an earlier benchmark wrote the record."""
 
 
 @dataclass(frozen=True)
 class BenchmarkPlan:
-    """Plan of a benchmark: scenes, configurations, prior qualities and mappers."""
+    """Plan of a benchmark with its scenes, configurations, prior qualities and mappers."""
 
     scenes: tuple[Path, ...]
     """Scene folders."""
     configs: tuple[str, ...] = ("benchmark",)
     """Names or file paths of the compared configurations."""
     buckets: tuple[str, ...] | None = None
-    """Buckets of test sets, or None for all buckets."""
+    """Names of the overlap buckets whose test sets are reconstructed, or None for all buckets."""
     priors: tuple[str, ...] = ("config",)
     """Prior qualities (:mod:`~mpsfm_core.evaluation.prior_quality`) with which mpsfm runs."""
     peers: tuple[str, ...] = PEER_METHODS
@@ -64,7 +64,7 @@ class BenchmarkPlan:
     workers: int = 1
     """Number of test sets that are reconstructed in parallel."""
     results: Mapping[str, Path] = field(default_factory=dict)
-    """Label -> folder of models of another program
+    """Folder with the models of another program, by its label in the report
     (:mod:`~mpsfm_core.evaluation.external_results`)."""
     distances: tuple[float, ...] = TOLERANCES
     """Distance thresholds in meters for the accuracy of dense point clouds."""
@@ -87,7 +87,7 @@ def run_benchmark(
         on_record: Callback for each record, cached or new.
 
     Raises:
-        InputError: The plan is wrong, or a scene folder is invalid.
+        InputError: A name in the benchmark plan is unknown, or a scene folder is invalid.
         MpsfmError: The extraction of priors or matches fails.
     """
     registry = registry or Registry.discover()
@@ -136,7 +136,7 @@ class SetPairFilter:
 
 
 class PreparedSets(NamedTuple):
-    """Extraction results of all images of some test sets."""
+    """Extraction results for all images of the benchmark's test sets."""
 
     problem: MappingProblem
     """Priors and verified matches, before keypoint adjustment."""
@@ -169,7 +169,7 @@ def prepare_sets(
     work: Path,
     registry: Registry,
 ) -> PreparedSets:
-    """Extract priors and verified matches of all images of some test sets.
+    """Extract priors and verified matches for all images of the given test sets.
 
     Args:
         scene: Scene folder.
@@ -298,7 +298,7 @@ class _SceneRuns:
 def _sort_key(
     sets: Sequence[EvaluationSet], plan: BenchmarkPlan
 ) -> Callable[[BenchmarkRecord], tuple[int, int]]:
-    """Return a key that sorts records by test set, then method."""
+    """Return a key that sorts benchmark records by test set, then by method."""
     positions = {image_set.name: number for number, image_set in enumerate(sets)}
     labels = [_label(m, prior) for m in (OURS, *plan.peers) for prior in plan.priors]
     return lambda record: (positions[record.set_name], labels.index(record.label))
@@ -327,7 +327,7 @@ def _content_key(run: MethodRun) -> str:
 
 
 def _check_names(kind: str, names: Iterable[str], known: Collection[str]) -> None:
-    """Raise :class:`InputError` for an unknown name."""
+    """Raise :class:`InputError` if a scene, configuration or method name is unknown."""
     for name in names:
         if name not in known:
             raise InputError(f"no {kind} {name!r}{did_you_mean(name, known)}")

@@ -28,13 +28,13 @@ def build_test_sets(
 
     Args:
         folder: Scene folder.
-        source: Source of overlap: Source of overlap: ``depth`` (``gt_depth/``), ``model`` (points
-            of ``gt/``) or ``auto`` (depth if available).
+        source: Source of overlap: Source of the overlap, ``depth`` (maps in ``gt_depth/``),
+            ``model`` (points in ``gt/``) or ``auto`` (depth if available).
         options: Options for the sampling of test sets.
         replace: True to replace an existing ``testsets.yaml``.
 
     Returns:
-        Number of test sets by bucket.
+        Number of test sets by overlap bucket.
 
     Raises:
         InputError: ``testsets.yaml`` exists and `replace` is False, or the source of overlap is

@@ -2,7 +2,7 @@
 
 PnP estimates two poses per verified pair, with the depth of either image, and selects the pose with
 more inliers. The relative poses are chained along the maximum spanning tree by number of inliers.
-Depth priors are not rescaled, so that metric depth gives consistent lengths.
+Depth priors are not rescaled, because metric depth already gives baselines of consistent length.
 """
 
 from __future__ import annotations

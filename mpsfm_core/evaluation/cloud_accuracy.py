@@ -14,7 +14,7 @@ from mpsfm_core.data.errors import InputError
 TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 """Default distance thresholds in meters [ETH3D]."""
 _MEDIAN_SAMPLES = 1000
-"""Number of sampled points that estimate a median distance beyond all thresholds."""
+"""Number of points sampled to estimate a median distance beyond all thresholds."""
 
 
 def cloud_accuracy(
@@ -23,8 +23,8 @@ def cloud_accuracy(
     """Compare a point cloud with a scan in the same frame.
 
     The cloud and the scan are subsampled to one point per cube with half the smallest tolerance as
-    side. All regions then have equal weight. Points outside the scanned region count as errors;
-    crop the cloud first if the scan is partial.
+    side. Subsampling gives all regions of a surface equal weight. Points outside the scanned region
+    count as errors; crop the cloud first if the scan is partial.
 
     Args:
         points: (n, 3) points.
@@ -32,9 +32,9 @@ def cloud_accuracy(
         tolerances: Distance thresholds.
 
     Returns:
-        Accuracy as plain data for JSON. ``accuracy`` maps a tolerance to the ratio of cloud points
-        near the scan, ``completeness`` to the ratio of scan points near the cloud, ``f1`` to the
-        harmonic mean of accuracy and completeness.
+        Accuracy of the point cloud as plain data for JSON. ``accuracy`` maps a tolerance to the
+        ratio of cloud points near the scan, ``completeness`` to the ratio of scan points near the
+        cloud, ``f1`` to the harmonic mean of accuracy and completeness.
 
     Raises:
         InputError: The point cloud or the scan is empty.

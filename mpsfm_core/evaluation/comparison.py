@@ -2,9 +2,9 @@
 
 Two benchmarks are compared on their common test sets. Confidence intervals come from a paired
 bootstrap over test sets. P-values come from a randomization test that swaps the two benchmarks in
-each test set. If a bucket has too few test sets, image pairs are resampled instead of sets. Image
-pairs of a set share images, so pair resampling gives too narrow intervals; the table names the
-resampled unit.
+each test set. If an overlap bucket (test sets of similar overlap) has too few sets, image pairs are
+resampled. Image pairs of a set share images, so pair resampling gives too narrow intervals; the
+table states what was resampled.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from mpsfm_core.evaluation.pose_auc import (
 from mpsfm_core.evaluation.records import BenchmarkRecord, read_records
 
 MIN_SETS = 6
-"""Minimum number of test sets for a bootstrap over sets; fewer sets have too few distinct resamples
-[ours]."""
+"""Minimum number of test sets for a bootstrap over sets, because few sets have few distinct
+resamples [ours]."""
 RESAMPLES = 2000
 """Number of resamples of the bootstrap and of the randomization test."""
 _CONFIDENCE = 0.95
@@ -45,9 +45,9 @@ class AucDifference:
     config: str
     """Name of the configuration."""
     bucket: str
-    """Bucket of test sets."""
+    """Overlap bucket of the test sets, such as ``leq5``."""
     method: str
-    """Label of the method."""
+    """Label of the mapper, with its prior quality."""
     sets: int
     """Number of common test sets."""
     unit: str
@@ -61,7 +61,7 @@ class AucDifference:
 
 
 def read_benchmark(place: str) -> dict[str, list[BenchmarkRecord]]:
-    """Read the records of a benchmark by method.
+    """Read the records of a benchmark folder and group the records by method.
 
     Args:
         place: ``DIR`` for all methods of a benchmark, or ``DIR:METHOD`` for one method, with key
@@ -91,12 +91,12 @@ def compare_benchmarks(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> list[AucDifference]:
-    """Compute the differences of each common scene, configuration, bucket and method.
+    """Compute the AUC differences for each common scene, configuration, bucket and method.
 
     Args:
         first: Records of the first benchmark by method.
         second: Records of the second benchmark by method.
-        convention: Convention of the pose AUC: pairs, sign of the translation, and integration.
+        convention: Convention of the pose AUC for image pairs, translation sign and integration.
         resamples: Number of resamples.
         seed: Seed of the random resampling.
 
@@ -140,9 +140,9 @@ def format_differences(
 
 
 _Group = tuple[str, str, str, str]
-"""Key of a group of records: scene, configuration, bucket and method."""
+"""Key that groups benchmark records by scene, configuration, overlap bucket and method."""
 _SetErrors = tuple[Float64, ...]
-"""Errors (pairs, orders) in degrees of both benchmarks on one test set."""
+"""Relative pose errors (pairs, orders) in degrees of both benchmarks on one test set."""
 
 
 def _match_records(
@@ -181,7 +181,7 @@ def _compute_difference(
     resamples: int,
     rng: np.random.Generator,
 ) -> AucDifference:
-    """Compute AUC difference, bootstrap interval and p-value of a group of records."""
+    """Compute AUC difference, bootstrap interval and p-value of records with the same key."""
     units = list(errors) if len(errors) >= MIN_SETS else _split_pairs(errors)
     resampled = _auc_differences((_resample(units, rng) for _ in range(resamples)), convention)
     swapped = _auc_differences((_swap_sides(units, rng) for _ in range(resamples)), convention)
@@ -201,7 +201,7 @@ def _compute_difference(
 
 
 def _split_pairs(errors: Sequence[_SetErrors]) -> list[_SetErrors]:
-    """Split the errors of all test sets into single image pairs."""
+    """Split the pose errors of all test sets into single image pairs."""
     return [
         (a[None], b[None]) for first, second in errors for a, b in zip(first, second, strict=True)
     ]
@@ -213,7 +213,7 @@ def _resample(units: Sequence[_SetErrors], rng: np.random.Generator) -> list[_Se
 
 
 def _swap_sides(units: Sequence[_SetErrors], rng: np.random.Generator) -> list[_SetErrors]:
-    """Swap the two benchmarks in each resampled unit with probability 1/2."""
+    """Swap the two benchmarks in each test set (or image pair) with probability 1/2."""
     flips = rng.integers(2, size=len(units))
     return [unit[::-1] if flip else unit for unit, flip in zip(units, flips, strict=True)]
 
@@ -221,7 +221,7 @@ def _swap_sides(units: Sequence[_SetErrors], rng: np.random.Generator) -> list[_
 def _auc_differences(
     samples: Iterable[Sequence[_SetErrors]], convention: PoseConvention
 ) -> Float64:
-    """Compute AUC differences (samples, thresholds), second minus first, in percentage points."""
+    """Compute pose AUC differences (samples, thresholds) in percent, second minus first."""
     both = [
         [_compute_aucs([unit[k] for unit in sample], convention) for k in (0, 1)]
         for sample in samples
@@ -232,6 +232,6 @@ def _auc_differences(
 
 
 def _compute_aucs(errors: Sequence[Float64], convention: PoseConvention) -> Float64:
-    """Compute the pose AUC in percent of pooled errors at all thresholds."""
+    """Compute the pose AUC in percent of pooled pose errors at all thresholds."""
     pooled = np.concatenate([values.ravel() for values in errors])
     return 100 * np.array(list(pose_auc(pooled, convention).values()))

@@ -27,7 +27,7 @@ class DenseEvaluation:
     """Settings to densify and evaluate the reconstruction of a test set."""
 
     images: ImageSet
-    """Images that contain the images of the test set."""
+    """Image set that contains all images of the test set."""
     dense: DenseOptions
     """Options of densification."""
     results: ResultOptions
@@ -55,12 +55,12 @@ def evaluate_dense_geometry(
 ) -> dict[str, Any] | None:
     """Compare depth maps and cloud of a reconstruction with the true depth of a scene.
 
-    A similarity transform of the camera centers aligns the reconstruction. The true depth maps of
-    the reconstructed images form the scan.
+    A similarity transform of the camera centers aligns the reconstruction. The points of the true
+    depth maps of the reconstructed images are the true cloud.
 
     Args:
         model: Reconstruction with depth maps.
-        cloud: (n, 3) points, world frame of the reconstruction.
+        cloud: (n, 3) points of the dense cloud, world frame of the reconstruction.
         scene: Scene folder.
         cameras: Undistorted cameras of the true depth maps by image name.
         distances: Distance thresholds of the point cloud in meters.

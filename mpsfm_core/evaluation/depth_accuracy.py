@@ -49,7 +49,7 @@ def depth_accuracy(
             depth``.
 
     Returns:
-        The accuracy, or None if no pixel can be compared.
+        The depth accuracy, or None if no pixel can be compared.
     """
     _, predicted, true = sample_depth_at_truth(depth, valid, truth)
     if not len(true):

@@ -23,15 +23,15 @@ def read_external_records(
 ) -> list[BenchmarkRecord]:
     """Convert the models of another program to one benchmark record for each test set.
 
-    Without a model, all images of a test set are unregistered. The records have the times 0,
-    because the run times are unknown.
+    Without a model, all images of a test set are unregistered. The recorded run times are 0,
+    because they are unknown.
 
     Args:
-        label: Method label of the records.
-        folder: Folder with the models in ``SCENE/SET/`` or ``SET/``; for a single test set also
-            ``SCENE/`` or the folder of the model.
+        label: Label of the other program in the records.
+        folder: Folder with the models in ``SCENE/SET/`` or ``SET/``; the model of a single test set
+            may also be in ``SCENE/`` or in the folder itself.
         scene: Scene folder.
-        sets: Sets of images.
+        sets: Test sets of the scene.
         config: Name of the configuration in the records.
 
     Raises:

@@ -52,7 +52,8 @@ class MethodResult:
     error: str = ""
     """Error message of a failed run; empty on success."""
     dense: dict[str, Any] | None = None
-    """Result of :meth:`DenseEvaluation.evaluate` on the largest model."""
+    """Accuracy of depth maps and cloud of the largest model, from
+    :meth:`DenseEvaluation.evaluate`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +61,7 @@ class MethodRun:
     """Inputs of a benchmark run: a method and a test set of images."""
 
     label: str
-    """Method label of the benchmark record."""
+    """Label of the mapper and prior quality in the benchmark record."""
     method: str
     """Name of the method: :data:`OURS` or one of :data:`PEER_METHODS`."""
     problem: MappingProblem
@@ -76,7 +77,7 @@ class MethodRun:
 def run_methods(
     runs: Sequence[MethodRun], workers: int
 ) -> Iterator[tuple[MethodRun, MethodResult]]:
-    """Run methods in `workers` subprocesses and yield each result when the run is done."""
+    """Run benchmark methods in `workers` subprocesses and yield each result when its run ends."""
     processes = _WorkerProcesses()
     pool = ThreadPoolExecutor(max(1, workers), thread_name_prefix="mpsfm-benchmark")
     try:
@@ -105,7 +106,7 @@ def run_method(run: MethodRun) -> MethodResult:
             else:
                 reconstructions = mapper.reconstruct(run.problem, run.options).reconstructions
                 models = [model.poses for model in reconstructions]
-    except Exception as raised:  # A failed run is a result of the benchmark.
+    except Exception as raised:  # The benchmark continues, because a failed run is also a result.
         error = f"{type(raised).__name__}: {raised}"
     seconds, cpu_seconds = time.perf_counter() - started, time.process_time() - cpu_started
     if run.dense is not None and reconstructions:

@@ -1,10 +1,11 @@
 """Two-view and three-view overlap from true depth or from a COLMAP model [paper, appendix].
 
-* Two-view overlap: ratio of a view's units that the second view sees, minimum of both directions.
-* Three-view overlap: ratio of a view's units that both remaining views see, maximum over the views.
+The two-view overlap is the ratio of a view's pixels that are visible in the second view, and the
+minimum of both directions. The three-view overlap is the ratio of a view's pixels that are visible
+in both remaining views, and the maximum over the three views.
 
-A unit is a pixel with true depth, or an observed point of the COLMAP model. A second view sees a
-pixel if the pixel projects into the second view with a consistent depth.
+A pixel with true depth is visible in another view if the pixel projects into that view with
+consistent depth. With a COLMAP model, the observed points of a view replace the pixels.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ from mpsfm_core.geometry import (
 )
 
 DEPTH_TOLERANCE = 0.05
-"""Maximum relative difference of consistent depths."""
+"""Maximum relative difference between the depth of a projected pixel and the depth map that sees
+it."""
 _GRID_COLUMNS = 96
 """Number of columns of the pixel grid on which depth maps are compared."""
 _ONES: UInt8 = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(
@@ -42,10 +44,10 @@ class Overlap:
     names: tuple[str, ...]
     """Names of the n views."""
     seen: tuple[UInt8, ...]
-    """Visibility of the units of each view, (n, bytes) uint8; row j has the packed bits of the
-    units that view j sees."""
+    """(n, bytes) uint8 visibility for each view; row j has one bit per pixel (or point) of the
+    view, set if visible in view j."""
     counts: Float64
-    """(n,) number of units (pixels or points) of each view."""
+    """(n,) number of compared pixels (or points) of each view."""
     two_view: Float64
     """(n, n) two-view overlap in [0, 1], symmetric, 1 on the diagonal."""
 
@@ -57,7 +59,7 @@ class Overlap:
         return max(self._ratio(a, b, c), self._ratio(b, a, c), self._ratio(c, a, b))
 
     def _ratio(self, view: int, first: int, second: int) -> float:
-        """Compute the ratio of a view's units that two more views see."""
+        """Compute the ratio of a view's pixels (or points) that are visible in two other views."""
         both = self.seen[view][first] & self.seen[view][second]
         return float(_ONES[both].sum(dtype=np.int64)) / max(float(self.counts[view]), 1.0)
 
@@ -105,7 +107,7 @@ def overlap_from_model(model: pycolmap.Reconstruction, names: Sequence[str]) -> 
 
 
 def _build_overlap(names: Sequence[str], seen: Sequence[UInt8], counts: Float64) -> Overlap:
-    """Compute the two-view overlap matrix from packed visibility bits."""
+    """Compute the (n, n) two-view overlap from packed visibility bits."""
     shared = np.stack([_ONES[bits].sum(axis=1, dtype=np.int64) for bits in seen])
     one_way = shared / np.maximum(counts, 1.0)[:, None]
     two_view = np.minimum(one_way, one_way.T)

@@ -1,8 +1,8 @@
 """COLMAP mappers that the benchmark runs on the verified matches of mpsfm.
 
 All COLMAP mappers use the keypoints, verified matches and fixed intrinsics of mpsfm, and a fixed
-seed. Models with two images are results, as in mpsfm. COLMAP is not deterministic with several
-threads, so accuracy tables use one thread.
+seed. COLMAP models with only two images are accepted, as in mpsfm. COLMAP is not deterministic with
+several threads, so accuracy tables use one thread.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ PEERS: Mapping[str, Callable[[Path, Path], Models]] = MappingProxyType(
         "colmap-global": _global,
     }
 )
-"""Mapper name -> function ``run(database, output)``. The mapper ``colmap-structureless`` has the
-defaults of pycolmap 4.2."""
+"""Function ``run(database, output)`` of each COLMAP mapper, by mapper name. The mapper
+``colmap-structureless`` has the defaults of pycolmap 4.2."""
 
 
 def run_peer(name: str, problem: MappingProblem) -> list[dict[str, Pose]]:

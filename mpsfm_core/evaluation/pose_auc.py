@@ -1,8 +1,8 @@
 """Pose AUC: area under the recall curve of relative pose errors.
 
-Papers differ in three choices that change the result by several points: the pairs, the sign of the
-translation, and the integration of the recall curve. A :class:`PoseConvention` specifies these
-choices, and :data:`CONVENTIONS` lists common conventions.
+Papers differ in three choices that change the pose AUC by several percentage points, namely the
+counted pairs, the sign of the translation, and the integration of the recall curve. A
+:class:`PoseConvention` specifies these choices, and :data:`CONVENTIONS` lists common conventions.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ UNREGISTERED_DEG = 180.0
 
 @dataclass(frozen=True)
 class PoseConvention:
-    """Convention of the pose AUC: pairs, sign of the translation, and integration."""
+    """Convention of the pose AUC for image pairs, translation sign and integration."""
 
     name: str
     """Name of the convention on the command line."""
@@ -59,9 +59,9 @@ def interpolated_area(errors: Float64, threshold: int) -> float:
 
 
 def histogram_area(errors: Float64, threshold: int) -> float:
-    """Average the recalls at 1, 2, ... `threshold` degrees, as PoseDiffusion and VGGT do.
+    """Average the recalls at all integer errors up to `threshold` degrees, as VGGT does.
 
-    An error at a bin edge counts for the next bin, except in the last bin.
+    An error that is an integer counts for the next one-degree bin, except in the last bin.
     """
     counts, _ = np.histogram(errors, bins=np.arange(threshold + 1))
     return float(np.cumsum(counts).mean() / len(errors))
@@ -161,10 +161,10 @@ def pose_auc(
         thresholds: Thresholds in degrees.
 
     Returns:
-        Threshold in degrees -> pose AUC in [0, 1].
+        Pose AUC in [0, 1] by threshold in degrees.
 
     Raises:
-        ValueError: There are no pose errors.
+        ValueError: The array `errors` is empty.
     """
     if len(errors_deg) == 0:
         raise ValueError("no pairs to evaluate")

@@ -32,7 +32,7 @@ def evaluate(
         truth: True poses ``cam_from_world`` by image name.
         images: Names of the images to evaluate, extension optional; all images of `truth` by
             default.
-        convention: Convention of the pose AUC: pairs, sign of the translation, and integration.
+        convention: Convention of the pose AUC for image pairs, translation sign and integration.
 
     Returns:
         Report of pose AUC and trajectory errors as plain data for JSON.

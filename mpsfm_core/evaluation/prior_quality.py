@@ -1,11 +1,10 @@
 """Depth priors of known quality, made from the true depth of a scene.
 
-* ``sensor``: true depth with a declared relative std of 1 %, an upper bound of prior quality.
-* ``degraded``: true depth with the errors of a good monocular network
-  (:mod:`mpsfm_core.testing.synthetic.degraded_depth`). The declared std of degraded depth is the
-  std of its errors after the best scale per image. ``degraded-N`` uses the random seed N instead
-  of 0.
-* ``config``: depth from the provider of the configuration.
+The quality ``sensor`` is true depth with a declared relative std of 1 %, an upper bound of prior
+quality. The quality ``degraded`` is true depth with the errors of a good monocular network
+(:mod:`mpsfm_core.testing.synthetic.degraded_depth`). The declared std of degraded depth is the std
+of its errors after the best scale per image. The quality ``degraded-N`` uses the random seed N
+instead of 0. The quality ``config`` is depth from the provider of the configuration.
 """
 
 from __future__ import annotations

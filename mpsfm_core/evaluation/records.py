@@ -34,7 +34,7 @@ class BenchmarkRecord:
     config: str
     """Name of the configuration."""
     bucket: str
-    """Bucket of the test set."""
+    """Overlap bucket of the test set, such as ``leq5``."""
     set_name: str
     """Name of the test set."""
     label: str
@@ -114,7 +114,7 @@ def read_records(output: Path) -> list[BenchmarkRecord]:
     """Read all records of a benchmark in the order of their file names.
 
     Raises:
-        InputError: The folder has no records, or a record is damaged.
+        InputError: The folder has no benchmark records, or a record is damaged.
     """
     paths = sorted((output / RUNS).glob("*/*/*/*.json"))
     if not paths:

@@ -40,27 +40,27 @@ _DENSE_NOTE = (
 )
 
 GroupKey = tuple[str, str, str, str]
-"""Key of a group of records: scene, configuration, bucket and method."""
+"""Key that groups benchmark records by scene, configuration, overlap bucket and method."""
 
 
 @dataclass(frozen=True)
 class BenchmarkRow:
-    """Row of the report: results of a method on a bucket of test sets."""
+    """Row of the benchmark report with the results of a method on one overlap bucket."""
 
     scene: str
     """Name of the scene, or :data:`ALL_SCENES`."""
     config: str
     """Name of the configuration."""
     bucket: str
-    """Bucket of test sets."""
+    """Overlap bucket of the test sets, such as ``leq5``."""
     method: str
-    """Label of the method."""
+    """Label of the mapper, with its prior quality."""
     sets: int
     """Number of test sets."""
     pairs: int
     """Number of verified image pairs."""
     auc: Mapping[int, float]
-    """Threshold in degrees -> pose AUC in percent of the pooled errors of all test sets."""
+    """Pose AUC in percent of the pooled errors of all test sets, by threshold in degrees."""
     registered: float
     """Ratio of the images that are registered."""
     seconds: float
@@ -70,8 +70,9 @@ class BenchmarkRow:
     failed: int
     """Number of test sets on which the method failed."""
     dense: Mapping[str, Any] | None = None
-    """Mean dense evaluation with ``sets`` (number of test sets), ``abs_rel``, and a dictionary from
-    distance in meters to ratio for each of :data:`CLOUD_METRICS`, or None."""
+    """Mean accuracy of the dense results, or None without dense evaluation. The keys are ``sets``
+    (number of test sets), ``abs_rel`` (depth error), and the :data:`CLOUD_METRICS` with a ratio by
+    distance threshold in meters."""
 
     @property
     def group(self) -> GroupKey:
@@ -80,12 +81,12 @@ class BenchmarkRow:
 
 
 def pool_errors(records: Iterable[BenchmarkRecord], convention: PoseConvention) -> Float64:
-    """Concatenate the errors in degrees of all image pairs of some records."""
+    """Concatenate the relative pose errors in degrees of all image pairs of benchmark records."""
     return np.concatenate([record.errors_deg(convention) for record in records])
 
 
 def group_records(records: Iterable[BenchmarkRecord]) -> dict[GroupKey, list[BenchmarkRecord]]:
-    """Group records by scene, configuration, bucket and method.
+    """Group benchmark records by scene, configuration, overlap bucket and method.
 
     The records of several scenes are also pooled as the scene :data:`ALL_SCENES`.
     """
@@ -149,7 +150,7 @@ def format_markdown(
 
 
 def list_failures(records: Iterable[BenchmarkRecord]) -> list[str]:
-    """Return a text line with the error of each failed run."""
+    """Return a text line with the error message of each failed benchmark run."""
     return [f"{' / '.join(record.name)}: {record.error}" for record in records if record.error]
 
 

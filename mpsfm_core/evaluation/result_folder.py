@@ -27,7 +27,8 @@ def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
         truth: Folder of true depth maps as 16-bit PNG files in millimeters, named like the images.
 
     Returns:
-        Means over images: Depth accuracy ``raw`` (for results in meters) and ``median_scaled``.
+        Means over images: Depth accuracy without scaling (``raw``, only for results in meters) and
+        after scaling each map to the true median (``median_scaled``).
 
     Raises:
         InputError: No depth map of the results has a true depth map.

@@ -1,12 +1,13 @@
 """Sampling of image sets with little overlap, after the paper's low-overlap evaluation.
 
-A test set starts with a random image. An image is added if its two-view overlap with a member is
-sufficient and no triplet exceeds the three-view overlap of the bucket. A test set is complete when
-no image can be added. Sets of a bucket differ by at least two images. The sampling is deterministic
-for given overlap and seed.
+Test sets are sampled for buckets, each with a maximum three-view overlap. A test set starts with a
+random image. An image is added if its two-view overlap with an image of the set is sufficient and
+no triplet exceeds the three-view overlap of the bucket. A test set is complete when no image can be
+added. Test sets of a bucket differ by at least two images. The sampling is deterministic for given
+overlap and seed.
 
-In contrast to the paper, all triplets of a minimal set satisfy the overlap limit. The paper adds
-images of higher overlap to minimal sets, to span a whole scene.
+In contrast to the paper, all triplets of a set in the bucket ``minimal`` satisfy the overlap limit.
+The paper adds images of higher overlap to these sets, to span a whole scene.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from mpsfm_core.evaluation.overlap import Overlap
 LIMITS: Mapping[str, float] = MappingProxyType(
     {"minimal": 0.01, "leq5": 0.05, "leq10": 0.10, "leq30": 0.30}
 )
-"""Bucket -> maximum three-view overlap [paper, appendix]; the bucket minimal allows 0 up to
+"""Maximum three-view overlap of each bucket [paper, appendix]; the bucket minimal allows 0 up to
 rounding."""
 TRIPLETS: Mapping[str, tuple[float, float]] = MappingProxyType(
     {
@@ -36,7 +37,8 @@ TRIPLETS: Mapping[str, tuple[float, float]] = MappingProxyType(
         "40+": (0.40, 1.0),
     }
 )
-"""Group of triplets -> range of the three-view overlap, upper bound included [paper, appendix]."""
+"""Range of three-view overlap of each group of image triplets, upper bound included [paper,
+appendix]."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,7 @@ class SamplingOptions:
     """Options for the sampling of test sets."""
 
     min_two_view: float = 0.25
-    """Minimum two-view overlap of an image with a member of the test set."""
+    """Minimum two-view overlap of an added image with at least one image of the test set."""
     sets: int = 5
     """Number of test sets per bucket; the bucket minimal has twice as many [paper: 5 and 10]."""
     min_images: int = 5
@@ -52,13 +54,13 @@ class SamplingOptions:
     max_images: int | None = None
     """Maximum number of images of a test set, or None for no limit."""
     attempts: int = 20
-    """Number of random starts per requested test set."""
+    """Number of random start images that are tried per requested test set."""
     seed: int = 0
     """Seed of the random generator."""
 
 
 def sample_buckets(overlap: Overlap, options: SamplingOptions | None = None) -> dict[str, Any]:
-    """Sample test sets for the buckets of ``testsets.yaml``; empty buckets are omitted."""
+    """Sample test sets for the overlap buckets of ``testsets.yaml``; omit empty buckets."""
     options = options or SamplingOptions()
     buckets: dict[str, Any] = {}
     for number, (bucket, limit) in enumerate(LIMITS.items()):
@@ -116,7 +118,7 @@ def _grow_set(
 ) -> list[int]:
     """Add random images to a test set until no image satisfies the overlap limits.
 
-    A rejected image is not tested again, because members are never removed.
+    A rejected image is not tested again, because images are never removed from the set.
     """
     order = [int(i) for i in rng.permutation(len(overlap))]
     members, candidates = order[:1], order[1:]

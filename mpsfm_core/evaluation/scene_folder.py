@@ -9,9 +9,9 @@ The layout::
     testsets.yaml     optional: bucket -> sets of images, and ``format_version``; else one set of
                       all images
 
-A bucket is a list of test sets, or a mapping of group names to lists of test sets (for example
-``triplets/0-5``). A test set is a list of image names, extensions optional, or a mapping with the
-list under ``images``.
+In ``testsets.yaml``, a bucket is a list of test sets of similar overlap, or a mapping of group
+names to lists of test sets (for example ``triplets/0-5``). A test set is a list of image names,
+extensions optional, or a mapping with the list under ``images``.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class EvaluationSet:
     """Test set: images of a scene that are reconstructed together."""
 
     bucket: str
-    """Bucket of the test set."""
+    """Overlap bucket of the test set, such as ``leq5``."""
     index: int
     """Index of the test set in its bucket."""
     images: tuple[str, ...]
@@ -87,13 +87,13 @@ class SceneFolder:
         return folder if folder.is_dir() else None
 
     def select_sets(self, buckets: Sequence[str] | None) -> list[EvaluationSet]:
-        """Return the test sets of some buckets, by default of all buckets.
+        """Return the test sets of the named overlap buckets, by default of all buckets.
 
         Args:
             buckets: Names of buckets; The bucket ``triplets`` selects all groups ``triplets/...``.
 
         Raises:
-            InputError: A bucket does not exist in the scene folder.
+            InputError: A named bucket does not exist in ``testsets.yaml``.
         """
         known = dict.fromkeys(item.bucket for item in self.sets)
         selected = list(known) if buckets is None else list(buckets)
@@ -140,12 +140,12 @@ def write_sets(path: Path, buckets: Mapping[str, Sequence[Mapping[str, Any]]], n
 
 
 def _is_in_bucket(name: str, bucket: str) -> bool:
-    """Return True if a name is a bucket or a group of the bucket."""
+    """Return True if `name` is the bucket, or a group such as ``triplets/0-5`` of the bucket."""
     return name == bucket or name.startswith(bucket + "/")
 
 
 def _read_sets(file: Path) -> Iterator[tuple[str, int, list[str]]]:
-    """Yield bucket, index and image names of each test set in ``testsets.yaml``."""
+    """Yield overlap bucket, index and image names of each test set in ``testsets.yaml``."""
     try:
         # The YAML base loader reads all scalars as text, so that an image name such as 0008 is not
         # a number.

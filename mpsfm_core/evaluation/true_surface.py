@@ -33,13 +33,14 @@ def build_true_surface(
         images: Names of the images.
         cameras: Undistorted cameras, at any image size, by image name.
         poses: True poses ``cam_from_world`` by image name.
-        spacing: Side in meters of the cubes in which each depth map has one point.
+        spacing: Side in meters of grid cubes; each depth map contributes at most one point per
+            cube.
 
     Returns:
         Points (n, 3) of the true surface, world frame.
 
     Raises:
-        InputError: No image has depth, camera and pose.
+        InputError: No image has a true depth map, a camera and a pose.
     """
     parts = []
     for name in images:

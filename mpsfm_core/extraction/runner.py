@@ -1,9 +1,9 @@
 """Run the configured providers on all images, and assemble the mapper's problem.
 
-Order of the stages: masks, features, similarity or retrieval, matching, verification (the last two
-again for pairs between components), keypoint adjustment, groups of a multi-view network, depth,
-normals. Results are validated, then cached. Calibration and resizing follow the cache, so changing
-them computes no network again.
+The stages run in the order masks, features, image similarity, matching, verification, matching and
+verification of further pairs between components, keypoint adjustment, multi-view networks, depth,
+and normals. Provider results are validated before they are cached. Calibration and resizing are
+applied to cached results, so changing their options runs no network again.
 """
 
 from __future__ import annotations

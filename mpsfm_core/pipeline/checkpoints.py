@@ -1,8 +1,8 @@
 """Checkpoints of mapping and of the dense stage in the cache folder.
 
-Mapping writes one checkpoint file per mapping problem, the dense stage one file per image. A
-checkpoint is only used for the same problem, options, code and numerical libraries. A resumed run
-therefore gives the same result as an uninterrupted run.
+Mapping writes one checkpoint file per run, the dense stage one file per image. A checkpoint is only
+used for the same problem, options, code and numerical libraries. A resumed run therefore gives the
+same result as an uninterrupted run.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _NUMERICS = (
 
 
 class MappingCheckpoints:
-    """Checkpoint of the mapper for one mapping problem.
+    """Checkpoint of the mapper for one mapping problem (images, priors and verified matches).
 
     Implements :class:`mpsfm_core.mapping.checkpoints.CheckpointStore`.
 
@@ -164,7 +164,7 @@ class DenseCheckpoints:
     Args:
         cache_dir: Cache folder, or None for the platform's cache folder.
         reconstruction: Reconstruction whose depth maps the dense stage computes.
-        image_keys: Content keys of all images.
+        image_keys: Content hashes of all images.
         options: Options of the dense stage.
     """
 
@@ -186,11 +186,11 @@ class DenseCheckpoints:
         self._failed, self._warning_lock = False, Lock()
 
     def load(self, name: str) -> StereoDepth | None:
-        """Load the stereo depth of an image, or None if not stored."""
+        """Load the stereo depth map of an image, or None if no map is stored."""
         return self._cache.load("dense", self._key(name), StereoDepth)
 
     def save(self, name: str, depth: StereoDepth) -> None:
-        """Store the stereo depth of an image; after a disk error, warn once and disable."""
+        """Store the stereo depth map of an image; after a disk error, warn once and stop."""
         if self._failed:
             return
         try:

@@ -3,7 +3,8 @@
 A run without compiled kernels compiles all kernels in parallel to extraction, and waits for the
 compilation before mapping. ``python -m mpsfm_core.pipeline.precompile`` compiles all kernels at
 installation. Two processes reconstruct a small synthetic scene and share the kernels on disk. The
-first process starts with bundle adjustment, the second with depth integration.
+first process compiles the kernels of bundle adjustment first, the second process those of depth
+integration.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ def start_compilation() -> Compilation | None:
     """Start compiling the kernels in background processes.
 
     Returns:
-        The running compilation, or None if the kernels are compiled already, or cannot be stored on
+        The running compilation, or None if the kernels are already compiled or cannot be stored on
         disk.
     """
     stamp = _stamp_path()
@@ -81,7 +82,8 @@ def compile_kernels(first: str) -> None:
     """Compile all kernels by reconstructing a small synthetic scene.
 
     Args:
-        first: ``bundles`` starts with bundle adjustment, ``depth`` with depth integration.
+        first: Kernels to compile first, ``bundles`` (bundle adjustment) or ``depth`` (depth
+            integration).
     """
     scene, poses = room_scene(), arc_poses(3, 10.0)
     problem = make_mapping_problem(scene, _CAMERA, poses, points_per_view=60, map_width=64)

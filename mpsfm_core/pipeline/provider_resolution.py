@@ -1,4 +1,4 @@
-"""Resolution of providers, weights and files before the first image is decoded.
+"""Choice of providers, weights and files before the first image is decoded.
 
 A configuration block with ``fallback`` or ``same-network`` gets the first provider that is
 available on this machine. A provider is available if its plugin is installed and accepts the
@@ -38,7 +38,7 @@ class ProviderChoice:
     """Distribution and version of the provider."""
     reason: ChoiceReason
     passed_over: Mapping[str, Reason] = field(default_factory=dict)
-    """Preferred but unavailable providers by name, with the reason."""
+    """Reasons why preferred providers are unavailable, by provider name."""
     to_fetch: tuple[WeightsFile, ...] = ()
     """Weights files to download; empty after :func:`resolve_providers`."""
 
@@ -64,7 +64,8 @@ class ProviderResolution:
 
     config: Config
     choices: tuple[ProviderChoice, ...]
-    """One entry per provider block, in the order of :meth:`Config.provider_configs`."""
+    """Chosen provider of each configuration block, in the order of
+    :meth:`Config.provider_configs`."""
 
 
 def resolve_providers(
@@ -81,7 +82,7 @@ def resolve_providers(
         config: Configuration of the run.
         registry: Installed providers.
         stages: Receiver of messages about choices and downloads.
-        blocks: Configuration blocks to resolve; other blocks stay unchanged.
+        blocks: Names of the configuration blocks that get a provider; other blocks stay unchanged.
 
     Returns:
         The configuration with one provider per block, and the choices.
@@ -110,7 +111,7 @@ def resolve_providers(
 def preview_providers(
     config: Config, registry: Registry, blocks: Collection[str] = BLOCKS
 ) -> ProviderResolution:
-    """Resolve providers as if every download succeeded; download nothing.
+    """Choose the providers as if every download succeeded, without downloading anything.
 
     The function has the arguments and raises the errors of :func:`resolve_providers`.
     """
@@ -137,8 +138,8 @@ class _ProviderSearch:
 
     Args:
         registry: Installed providers.
-        require_weights: Makes a weights file available, or raises WeightsError. May add a file
-            that must be downloaded to ``absent``.
+        require_weights: Function that makes a weights file available, or raises WeightsError. The
+            function may append a file that must be downloaded to ``absent``.
         absent: Weights of the current candidate provider that must be downloaded.
     """
 
@@ -190,7 +191,7 @@ class _ProviderSearch:
     def _prepare(
         self, config: Config, path: SettingPath, kind: Kind, block: ProviderConfig, name: str
     ) -> ProviderConfig:
-        """Return a block with one provider, after making files and weights available."""
+        """Return a configuration block with one provider, after making its weights available."""
         candidate = block.model_copy(update={"use": name, "fallback": ()})
         if name == SAME_NETWORK:
             candidate = self._same_network(config.depth, candidate)

@@ -1,4 +1,4 @@
-"""Memory and disk space of a run: estimated before images are decoded, measured at the end.
+"""Estimation of memory and disk space before a run, and measurement at its end.
 
 The memory estimate is the sum of a fixed part, the caches, and the largest of three stages:
 extraction, dense depth and results. Constants are bytes per pixel of arrays in memory, or derived
@@ -47,17 +47,17 @@ _VIEW_BYTES = 3.0
 _GRAY_BYTES = 4.0
 """Bytes per pixel of a cached float32 gray image of keypoint adjustment."""
 _DECODE_BYTES = 9.0
-"""Bytes per pixel of a view during decoding: file, RGB and undistorted copies."""
+"""Bytes per pixel of an image during decoding, for the file, RGB and undistorted copies."""
 _DETECTOR_BYTES = 280.0
-"""Bytes per pixel of a detector's input: SIFT's pyramids of the upsampled image."""
+"""Bytes of detector memory per input pixel, for the scale-space pyramids of SIFT."""
 _NETWORK_RATIO = 2.0
 """Ratio of a loaded network's memory to the size of its weights file."""
 _ACTIVATION_RATIO, _MAX_ACTIVATION_MB = 3.0, 320.0
-"""Ratio of a network's activations to the size of its weights file, and the maximum in MB."""
+"""Ratio of a network's activations to its weights file, and the maximum activations in MB."""
 _PRIOR_BYTES = 106.0
 """Bytes per pixel of depth, normals and variances in the mapper, with derived maps."""
 _DENSE_WORKER_BYTES = 320.0
-"""Bytes per pixel of stereo matching: cost volume of 11 labels and its aggregation."""
+"""Bytes per pixel of stereo matching, for a cost volume of 11 labels and its aggregation."""
 _DENSE_MAP_BYTES = 20.0
 """Bytes per pixel of a dense depth map with variance and support."""
 _FUSION_BYTES = 4.6
@@ -68,7 +68,7 @@ _POINT_RATIO = 0.4
 """Ratio of points of the dense cloud to pixels of the depth maps."""
 
 _KEYPOINT_BYTES = 544.0
-"""Bytes per cached keypoint: position, scale and 128 float32 descriptor values."""
+"""Bytes per cached keypoint with position, scale and 128 float32 descriptor values."""
 _PIXELS_PER_KEYPOINT = 60.0
 """Minimum number of image pixels per SIFT keypoint."""
 _DEFAULT_MAX_KEYPOINTS = 4096
@@ -250,7 +250,7 @@ def _cached_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
 def _extraction_bytes(
     sizes: Sequence[tuple[int, int]], config: Config, networks: Sequence[int], workers: int
 ) -> float:
-    """Estimate the bytes of extraction workers: decoding, a detector or the networks."""
+    """Estimate the bytes of extraction workers for image decoding and a detector or networks."""
     decoding = _DECODE_BYTES * max(width * height for width, height in sizes)
     detector = _DETECTOR_BYTES * max(_detection_pixels(size, config) for size in sizes)
     limit = _MAX_ACTIVATION_MB * _MB
@@ -259,7 +259,7 @@ def _extraction_bytes(
 
 
 def _dense_bytes(sizes: Sequence[tuple[int, int]], config: Config, workers: int) -> float:
-    """Estimate the bytes of the dense stage: all maps, and a cost volume per worker."""
+    """Estimate the bytes of the dense stage, for all maps and a cost volume per worker."""
     if not config.dense.enabled:
         return _PRIOR_BYTES * _num_pixels(_prior_grids(sizes, config))
     grids = _final_grids(sizes, config)
@@ -268,7 +268,7 @@ def _dense_bytes(sizes: Sequence[tuple[int, int]], config: Config, workers: int)
 
 
 def _result_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    """Estimate the bytes of the results stage: all maps, and the points of the cloud."""
+    """Estimate the bytes of the results stage, for all maps and the points of the cloud."""
     fusion = _FUSION_BYTES * _num_pixels(_final_grids(sizes, config))
     return _map_bytes(sizes, config) + fusion + _POINT_BYTES * _num_points(sizes, config)
 
@@ -370,6 +370,6 @@ def _same_disk(a: Path, b: Path) -> bool:
 
 
 def _nearest_existing(folder: Path) -> Path:
-    """Return the folder, or its nearest existing ancestor."""
+    """Return a folder if it exists, else its nearest existing ancestor."""
     folder = folder.resolve()
     return next(path for path in (folder, *folder.parents) if path.exists())

@@ -163,7 +163,7 @@ class _Run:
 
     @contextmanager
     def environment(self) -> Iterator[None]:
-        """Limit the threads, lock the output folder and watch child processes."""
+        """Limit threads, lock the output folder and measure the memory of child processes."""
         with ExitStack() as stack:
             stack.enter_context(limit_threads(self._config.runtime.workers))
             if self._output is not None:
@@ -251,7 +251,7 @@ class _Run:
         return images
 
     def _extract(self, images: ImageSet) -> tuple[ImageSet, Extraction]:
-        """Run the providers; if configured, with features and matcher of the fast pass."""
+        """Run the providers, with features and matcher of a fast first pass if configured."""
         with self._stages.stage("extraction"):
             images = estimate_focal_lengths(images, self._config, self._registry, self._stages)
             config = self._config.fast_pass_config() or self._config
@@ -305,7 +305,7 @@ class _Run:
     def _map_from_seeds(
         self, extraction: Extraction, seeds: list[RegisteredImage]
     ) -> MappingResult:
-        """Map again from the fast pass's poses; poses that the user fixed take precedence."""
+        """Map again from the poses of the fast pass, or poses that the user fixed."""
         problem = extraction.problem.with_poses(self._known_poses)
         options = self._config.mapper_options()
         if not self._known_poses:
@@ -520,7 +520,7 @@ class _Run:
 
 
 def _without_matching(config: Config) -> Config:
-    """Remove the provider blocks that imported matches replace from a configuration."""
+    """Remove features and matchers from a configuration, because matches are imported."""
     if config.depth.use == FROM_MATCHER:
         raise ConfigError(
             "depth.use: 'matcher' needs a matcher, and imported matches replace it: "

@@ -52,7 +52,7 @@ def summarize_run(
 
     Args:
         status: ``success`` or ``failed``.
-        resolution: Configuration with one provider per block, and the choices.
+        resolution: Configuration with one provider per block, and the reasons of the choices.
         stages: Records of times, memory and warnings.
         usage: Provider entries of the extraction report.
     """
@@ -89,7 +89,7 @@ def summarize_resources(
 def _describe_providers(
     resolution: ProviderResolution, usage: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Describe each provider: reason of the choice, licenses, number of results and time."""
+    """Describe reason of the choice, licenses, number of results and time of each provider."""
     used = {(line["kind"], line["name"]): line for line in usage}
     unused = {"computed": 0, "from_cache": 0, "seconds": 0.0}
     described = []

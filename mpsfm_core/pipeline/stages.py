@@ -26,7 +26,7 @@ class StageRecord:
     """Peak resident memory of this process, or None if the operating system reports none."""
 
     def after(self, earlier: StageRecord | None) -> StageRecord:
-        """Combine with an earlier record of the same stage: sum of times, maximum of peaks."""
+        """Add the time of an earlier record of the stage, and use the higher memory peak."""
         if earlier is None:
             return self
         peaks = [p for p in (earlier.peak_memory_mb, self.peak_memory_mb) if p is not None]

@@ -31,7 +31,7 @@ IMPORTERS: Mapping[str, Callable[[Path], list[Frame]]] = MappingProxyType(
         "scannet": scannet.read_frames,
     }
 )
-"""Dataset name -> function that reads the frames of a scene."""
+"""Function that reads the frames of a scene, by name of the dataset."""
 
 
 def import_scene(kind: str, source: Path, target: Path, every: int = 1) -> SceneFolder:

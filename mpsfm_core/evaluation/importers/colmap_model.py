@@ -20,7 +20,8 @@ def model_frames(folder: Path, photo_of: Callable[[str], Path]) -> list[Frame]:
 
     Args:
         folder: COLMAP model.
-        photo_of: Returns the file of an image name; images without a file are skipped.
+        photo_of: Function that returns the file path for an image name; images without a file are
+            skipped.
     """
     model = read_model(folder)
     frames = []

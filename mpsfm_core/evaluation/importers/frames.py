@@ -49,7 +49,7 @@ class Frame:
     pose: Float64
     """(3, 4) true pose ``cam_from_world``."""
     depth: Callable[[], Float32] | None = None
-    """Function that reads the depth map in meters, 0 where unknown, on a grid over the whole
+    """Function that reads the true depth map in meters, 0 where unknown, on a grid over the whole
     image."""
     observations: FrameObservations | None = None
     """Observations of 3D points, if the dataset has points."""

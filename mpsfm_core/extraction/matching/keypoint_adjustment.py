@@ -2,11 +2,11 @@
 
 Detectors localize a scene point differently in each image, and many networks return whole pixels of
 a downscaled image. Two steps correct the keypoints, as in Lindenberger et al., Pixel-Perfect
-Structure-from-Motion, ICCV 2021, with gray values instead of learned features:
+Structure-from-Motion, ICCV 2021, with gray values instead of learned features.
 
-1. Align the patches around each verified match. The first warp assumes a fronto-parallel plane at
-   the depth of the match.
-2. Solve for the shifts of all keypoints that fit all alignments (IRLS with a Cauchy loss).
+The first step aligns the image patches around each verified match, with the warp of a
+fronto-parallel plane at the depth of the match as start. The second step solves for the shifts of
+all keypoints that fit all patch alignments (IRLS with a Cauchy loss).
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
 """Image similarity from a few local features, to select image pairs without retrieval.
 
-1. Match score: mutual nearest neighbors among the strongest descriptors, weighted by the ratio of
-   nearest to second nearest distance.
-2. Excess: subtract the match score that two images reach by chance, because images with repetitive
-   texture match many images.
-3. Diffusion: two images that are similar to a third image are similar to each other. Diffusion
-   finds pairs of small overlap (Zhou et al., Ranking on Data Manifolds, NIPS 2003).
+The match score of two images counts mutual nearest neighbors among their strongest descriptors,
+weighted by the ratio of nearest to second nearest distance. The similarity is the match score minus
+the score that both images reach by chance, because images with repetitive texture match many
+images. Diffusion of the similarities then raises the similarity of two images that are both similar
+to a third image. Diffusion finds pairs of small overlap (Zhou et al., Ranking on Data Manifolds,
+NIPS 2003).
 """
 
 from __future__ import annotations
