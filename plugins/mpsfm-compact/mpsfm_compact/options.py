@@ -17,6 +17,7 @@ class CompactOptions(Options):
     sha256: str | None = None
     """Expected SHA-256 hash of the file ``weights``."""
     size: int = Field(256, ge=32, multiple_of=32)
-    """Longer side of the network input in pixels. The network is trained at 256. Larger inputs
-    resolve thinner structures, but their depth is less accurate on average.
+    """Longer side of the network input in pixels. The compact network is trained on images of about
+    256 x 192 pixels. Larger network inputs resolve thinner structures, but the depth is less
+    accurate on average.
     """

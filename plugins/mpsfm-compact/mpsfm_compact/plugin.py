@@ -21,7 +21,7 @@ _ACCURACY: dict[Kind, str] = {
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register the providers of depth (with normals of the same pass), normals and a mask."""
+    """Register the compact network as a provider of depth and normals, of normals, and of masks."""
     return [
         _spec("depth", "Depth", "metric depth and normals", "metric", "variance", "joint-normals"),
         _spec("normals", "Normals", "normals", "variance"),

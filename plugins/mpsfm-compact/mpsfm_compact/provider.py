@@ -15,14 +15,14 @@ from mpsfm_core.geometry import resize_map
 
 
 class CompactDepth(DescribedJoint):
-    """Provider of metric depth and of normals from the same forward pass."""
+    """Provider of metric depth and normals from one forward pass of the compact network."""
 
     def __init__(self, options: CompactOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context)
 
 
 class CompactNormals(DescribedNormals):
-    """Provider of normals with their angular variance."""
+    """Provider of normals and their angular variance from the compact network."""
 
     def __init__(self, options: CompactOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context)
@@ -44,7 +44,7 @@ class CompactMask:
 
 
 def describe(options: CompactOptions) -> Description:
-    """Return the network description with the weights and the input size of ``options``."""
+    """Return the compact network's description with the weights and input size of ``options``."""
     general = load_description(str(Path(__file__).with_name("description.yaml")))
     size = general.input.size.model_copy(update={"side": options.size})
     update = {

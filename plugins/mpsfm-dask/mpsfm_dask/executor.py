@@ -13,8 +13,8 @@ from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.data.options import Options, SettingsError, parse_settings
 
 MAX_TASKS = 50_000
-"""Maximum number of Dask tasks per extraction step. If a step has more items, several items share a
-task, because the scheduler keeps all tasks in memory. [ours]
+"""Maximum number of Dask tasks per extraction step. If an extraction step has more images or pairs,
+several of them share a Dask task, because the scheduler keeps all tasks in memory. [ours]
 """
 
 
@@ -30,7 +30,7 @@ class DaskOptions(Options):
 
 
 class DaskExecutor:
-    """Executor that sends a step to every Dask worker once, and then its items as tasks."""
+    """Executor that sends an extraction step to each Dask worker once, then its items as tasks."""
 
     def __init__(self, options: Mapping[str, Any]) -> None:
         """Connect to the Dask scheduler, or start workers on this machine.
@@ -55,7 +55,7 @@ class DaskExecutor:
             raise ConfigError(f"no Dask workers at {where}: {error}") from error
 
     def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
-        """Run a step on all items, see :meth:`mpsfm_core.providers.Executor.run`."""
+        """Run an extraction step on all images or pairs, see ``mpsfm_core.providers.Executor``."""
         name, size = f"mpsfm-{uuid.uuid4().hex}", 1 + len(items) // MAX_TASKS
         parts = [list(items[n : n + size]) for n in range(0, len(items), size)]
         self._client.register_plugin(_StepOnWorker(step), name=name)
@@ -78,7 +78,7 @@ class DaskExecutor:
 
 
 class _StepOnWorker(WorkerPlugin):  # type: ignore[misc, unused-ignore]
-    """Dask plugin that sends a step to every worker, including workers that join later."""
+    """Dask plugin that sends an extraction step to every worker, including later workers."""
 
     def __init__(self, step: Callable[[Any], None]) -> None:
         self.step = step

@@ -14,18 +14,18 @@ SIDE = 56
 """Longer side of the network input in pixels in the contract tests."""
 _SEED = 3
 _ANGLE = 1.0
-"""Fixed angle of view in radians. Random weights could predict angles whose tangent is
-undefined."""
+"""Angle of view in radians that the test network always predicts. Random weights could predict
+angles whose tangent is undefined."""
 
 
 def contract(folder: Path) -> ContractSetup:
-    """Write a network with random weights, whose predictions are valid but not accurate."""
+    """Write a Depth Anything 3 with random weights, whose predictions are valid but inaccurate."""
     path = write_weights(folder / "model.safetensors")
     return ContractSetup(options={"weights": str(path), "resize": SIDE}, truth_source="none")
 
 
 def write_weights(path: Path) -> Path:
-    """Write random weights of the smallest network in the file format of the published weights."""
+    """Write random weights of the smallest Depth Anything 3 in the published file format."""
     with torch.random.fork_rng():
         torch.manual_seed(_SEED)
         network = network_of("da3-small")

@@ -45,6 +45,6 @@ class DepthAnything3Options(Options):
 
 
 def weights(options: Any) -> tuple[WeightsFile, ...]:
-    """Return the weights files that the options select, with hash and license."""
+    """Return the Depth Anything 3 weights that the options select, with hash and license."""
     license = LICENSES[options.network] if options.weights is None else "unknown"
     return (WeightsFile(options.file, options.sha256, license),)

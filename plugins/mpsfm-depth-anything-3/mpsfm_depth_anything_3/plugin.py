@@ -24,7 +24,8 @@ def mpsfm_providers() -> list[ProviderSpec]:
             code_license="Apache-2.0",
             weights_license=f"{LICENSES['da3-small']} (small, base), {LICENSES['da3-large']}",
             weights=weights,
-            # [assumed: the calibration was not measured, because the weights were not available]
+            # [assumed: the depth variance was not calibrated, because the weights were not
+            # available]
             calibration=DepthCalibration(std_scale=1.0, relative_std=0.05),
             contract="mpsfm_depth_anything_3.contract:contract",
         )

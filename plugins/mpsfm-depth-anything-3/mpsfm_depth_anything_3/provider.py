@@ -28,8 +28,9 @@ _WARNINGS = 1
 class DepthAnything3:
     """Provider of depth in one unit for a group of images, with their poses and intrinsics.
 
-    Images are resized with their aspect ratio. The smaller images of a group are padded with the
-    mean color on all sides, while the loader in the authors' package crops the larger images.
+    Images are resized without changing their aspect ratio. The smaller images of a group are padded
+    with the mean color on all sides. In contrast, the image loader of Depth Anything 3 crops the
+    larger images.
     """
 
     def __init__(self, options: DepthAnything3Options, context: ProviderContext) -> None:
@@ -53,11 +54,11 @@ class DepthAnything3:
         """Predict depth in one unit, its std, poses and intrinsics for a group of images.
 
         Args:
-            views: The undistorted images of the group.
+            views: The undistorted images that the network processes jointly.
 
         Returns:
-            The prior of the group. Its depth is in meters for the nested network, and in an
-            arbitrary unit for other networks.
+            Depth, std, poses and intrinsics of the group. Depth is in meters for the nested
+            network, and in an arbitrary unit for other networks.
         """
         sizes = [_network_size(view, self._options.resize) for view in views]
         width, height = np.max(sizes, axis=0).tolist()
@@ -87,17 +88,17 @@ class DepthAnything3:
 def network_of(name: str) -> Any:
     """Create the network ``name`` from the configuration files of ``depth_anything_3``."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # hides deprecation warnings of omegaconf and torch
+        warnings.simplefilter("ignore")  # hide deprecation warnings of omegaconf and torch
         from depth_anything_3.cfg import create_object, load_config
         from depth_anything_3.registry import MODEL_REGISTRY
         from depth_anything_3.utils.logger import logger
 
-        logger.level = _WARNINGS  # the package would print progress to the terminal
+        logger.level = _WARNINGS  # ``depth_anything_3`` would print its progress to the terminal
         return create_object(load_config(MODEL_REGISTRY[name])).eval()
 
 
 def as_published(network: Any) -> torch.nn.Module:
-    """Return the network with the tensor names of the published weights files.
+    """Return the Depth Anything 3 network with the tensor names of its published weights.
 
     A tensor that several network parts share is stored once.
     """
@@ -105,7 +106,7 @@ def as_published(network: Any) -> torch.nn.Module:
 
 
 def _network_size(view: View, longest: int) -> tuple[int, int]:
-    """Compute the network ``(width, height)`` in patches, close to the view's aspect ratio."""
+    """Compute the input size ``(width, height)`` in patches from the aspect ratio of the view."""
     scale = longest / max(view.camera.size)
     width, height = (max(1, round(side * scale / _PATCH)) for side in view.camera.size)
     return width * _PATCH, height * _PATCH

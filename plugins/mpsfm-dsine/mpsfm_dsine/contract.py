@@ -12,6 +12,6 @@ from mpsfm_dsine.provider import describe
 
 
 def setup(folder: Path) -> ContractSetup:
-    """Write a network of DSINE's interface that decodes normals from the colors of test images."""
+    """Write a network with DSINE's tensors that decodes normals from the colors of test images."""
     model = stand_in(describe(DsineOptions(model="")), folder)
     return ContractSetup(options={"model": str(model)}, truth_source="painted")

@@ -1,6 +1,7 @@
 """Export of DSINE, with normals and their concentration kappa, to ONNX by its authors' code.
 
-This module runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+The command ``mpsfm models export`` runs this module as a program, see
+:mod:`mpsfm_core.providers.model_export`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ _SIDES = ((96, 128), (160, 96))
 
 
 class LastRefinement(torch.nn.Module):
-    """Module that returns only DSINE's last refinement, like the authors' test scripts."""
+    """Torch module that returns only the output of DSINE's last refinement iteration."""
 
     def __init__(self, model: torch.nn.Module) -> None:
         super().__init__()
@@ -32,7 +33,7 @@ class LastRefinement(torch.nn.Module):
 
 
 class _CpuCoordinates:
-    """Pixel coordinates that stay on the CPU, where DSINE would move them to the first GPU."""
+    """Pixel coordinates that stay on the CPU, although DSINE moves them to the first GPU."""
 
     def __init__(self, coordinates: torch.Tensor) -> None:
         self._coordinates = coordinates
@@ -64,7 +65,7 @@ def network(encoder: int) -> LastRefinement:
 
 
 def export(job: ExportJob, model: LastRefinement) -> None:
-    """Export the network for images with sides in multiples of 32 and for their intrinsics."""
+    """Export DSINE for inputs of images, with sides in multiples of 32, and their intrinsics."""
     examples = []
     for height, width in _SIDES:
         intrinsics = torch.tensor([[100.0, 0, width / 2], [0, 100.0, height / 2], [0, 0, 1]])

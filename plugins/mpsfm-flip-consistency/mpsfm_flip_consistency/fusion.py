@@ -1,9 +1,10 @@
 """Mean and variance of the predictions for an image and its mirror (paper, appendix B).
 
-The covariance is the sum of the outer products of both deviations from the mean, which is the
-unbiased sample covariance of two predictions. If the network predicts a variance, the larger of
-both variances is used. The errors of both predictions are correlated, so the variance of the mean
-is not smaller than that of one prediction.
+The covariance of depth or normals is the unbiased sample covariance of the two predictions. For two
+predictions, this covariance is the sum of the outer products of their deviations from the mean. If
+the network predicts a variance, the fused variance is the larger one of predicted and sample
+variance. The errors of the predictions for an image and its mirror are correlated, so the variance
+is not halved for the mean of both.
 """
 
 from __future__ import annotations
@@ -14,8 +15,8 @@ from mpsfm_core import DepthPrior, NormalPrior
 from mpsfm_core.data import Bool, Float32, Float64
 
 _SMALLEST_RELATIVE_STD = 1e-4
-"""Minimum std of depth relative to depth. A variance must be positive even if both predictions
-agree."""
+"""Minimum std of depth relative to depth. This minimum keeps the variance positive if both
+predictions agree."""
 _SMALLEST_STD_RAD = 1e-3
 
 

@@ -1,4 +1,4 @@
-"""Horizontal mirroring of views and priors. Mirroring twice returns the original."""
+"""Horizontal mirroring of views and priors, which returns the original if applied twice."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from mpsfm_core import ProviderSpec, hookimpl
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register one wrapper class for depth and for normals."""
+    """Register the flip-consistency wrapper for depth providers and normals providers."""
     return [
         ProviderSpec(
             kind="wrapper",

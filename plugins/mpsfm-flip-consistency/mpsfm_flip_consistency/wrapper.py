@@ -17,7 +17,7 @@ class FlipConsistency:
         self._inner = inner
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> DepthPrior | NormalPrior:
-        """Predict the prior of the wrapped provider, with a variance from both passes.
+        """Predict a prior, with a variance from the predictions for the view and its mirror image.
 
         Args:
             view: The view.

@@ -20,12 +20,12 @@ neighbor."""
 
 
 class AdalamMatcher:
-    """Matcher of features with any descriptors, without learned weights.
+    """AdaLAM matcher for features with any descriptors, without learned weights.
 
-    AdaLAM accepts the matches of a neighborhood if one affine map explains enough of them.
-    Orientations are not compared, because ``Features`` have none. Scales are compared if both
-    images have them. The score of a match is ``c / (c + min_confidence)``, where c is AdaLAM's
-    confidence in the neighborhood.
+    AdaLAM accepts the matches of an image neighborhood if one affine map explains enough of them.
+    Keypoint orientations are not compared, because ``Features`` have none. Keypoint scales are
+    compared if the features of both images have scales. The score of a match is ``c / (c +
+    min_confidence)``, where c is AdaLAM's confidence in the neighborhood.
     """
 
     def __init__(self, options: AdalamOptions, context: ProviderContext) -> None:
@@ -40,8 +40,7 @@ class AdalamMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match features with local affine support. Each feature of an image has at most one
-        match."""
+        """Match features one-to-one where a local affine map explains the neighboring matches."""
         features_a, features_b = require_features("adalam matches features", features_a, features_b)
         if features_a.descriptors.shape[1] != features_b.descriptors.shape[1]:
             raise ProviderError(
@@ -78,7 +77,7 @@ class AdalamMatcher:
             "scale_rate_threshold": options.scale_ratio if use_scales else None,
             "device": torch.device(self._device),
         }
-        return AdalamFilter(config)  # kornia documents None as "disabled"
+        return AdalamFilter(config)  # kornia disables thresholds that are None
 
     def _tensors(self, features: Features) -> tuple[torch.Tensor, ...]:
         arrays = (features.keypoints, features.descriptors, features.scales)

@@ -1,8 +1,8 @@
 """Memory-efficient cross attention for LightGlue on CPUs.
 
-On a GPU, kornia calls ``scaled_dot_product_attention``. On a CPU, kornia builds the attention
-matrix between all keypoints of both images for each head and layer, and spends most of the time on
-memory transfers.
+On a GPU, kornia computes LightGlue's attention by ``scaled_dot_product_attention``. On a CPU,
+kornia builds the attention matrix between all keypoints of both images for each head and layer, and
+spends most of the time on memory transfers.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ class KorniaFeatures(ABC):
 
 
 class XFeatFeatures(KorniaFeatures):
-    """XFeat features, detected at sides in multiples of 32 to avoid a second resizing."""
+    """XFeat features, with image sides in multiples of 32 so that XFeat does not resize again."""
 
     multiple = 32
 
@@ -112,8 +112,8 @@ class AlikedFeatures(KorniaFeatures):
 class DiskFeatures(KorniaFeatures):
     """DISK features.
 
-    DISK's heatmap h > 0 is unbounded. The score is ``h / (1 + h)``, because the logistic function
-    would saturate in float32.
+    DISK's keypoint heatmap h > 0 has no upper bound. The keypoint score is ``h / (1 + h)``, because
+    the logistic function would saturate in float32.
     """
 
     def __init__(self, options: DiskOptions, context: ProviderContext) -> None:
@@ -138,7 +138,7 @@ class DiskFeatures(KorniaFeatures):
 
 
 class DedodeFeatures(KorniaFeatures):
-    """DeDoDe features, whose scores are probabilities of pixels that sum to 1 over the image."""
+    """DeDoDe features, whose scores are keypoint probabilities that sum to 1 over the image."""
 
     def __init__(self, options: DedodeOptions, context: ProviderContext) -> None:
         super().__init__(options, context)

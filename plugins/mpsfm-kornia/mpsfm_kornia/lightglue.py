@@ -16,8 +16,8 @@ from mpsfm_kornia.attention import fuse_cross_attention
 from mpsfm_kornia.options import LightGlueOptions
 from mpsfm_kornia.runtime import load_state, load_weights
 
-# All settings that determine the network's shape are listed, because other packages are known to
-# overwrite kornia's class-level defaults.
+# These dictionaries list all settings that determine LightGlue's shape, because other packages are
+# known to overwrite kornia's class-level defaults.
 _LIGHTGLUE = {"input_dim": 128, "descriptor_dim": 256, "n_layers": 9, "num_heads": 4}
 LIGHTGLUE_256 = {**_LIGHTGLUE, "input_dim": 256}
 _LIGHTERGLUE = {"input_dim": 64, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1}
@@ -33,7 +33,7 @@ _FIXED = {
 
 
 class LightGlueMatcher:
-    """LightGlue for the 128-dimensional ALIKED and DISK features."""
+    """LightGlue matcher for the 128-dimensional ALIKED and DISK features."""
 
     architecture: dict[str, int] = _LIGHTGLUE
 
@@ -41,7 +41,7 @@ class LightGlueMatcher:
         use_threads(context)
         self._device = context.device
         self._network = LightGlue(
-            None,  # type: ignore[arg-type]  # documented: no weights of a family
+            None,  # type: ignore[arg-type]  # kornia: None loads no weights
             **self.architecture,
             **_FIXED,
             depth_confidence=options.depth_confidence,
@@ -67,7 +67,7 @@ class LightGlueMatcher:
             Mutual matches, with LightGlue's confidence as score.
 
         Raises:
-            ProviderError: The descriptors do not have the dimension that this network requires.
+            ProviderError: The descriptors do not have the dimension that this LightGlue requires.
         """
         features_a, features_b = require_features(
             "LightGlue matches features", features_a, features_b

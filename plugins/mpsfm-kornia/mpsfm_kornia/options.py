@@ -71,7 +71,7 @@ KNOWN_HASHES = {
         LOFTR,
     )
 }
-"""SHA-256 hash of each default weights file. Weights files of users need no hash."""
+"""SHA-256 hash of each default weights file. Other weights files that users select need no hash."""
 
 
 class FeatureOptions(Options):
@@ -89,7 +89,8 @@ class NetworkOptions(FeatureOptions):
     """Options of all learned feature detectors of kornia."""
 
     sha256: str | None = None
-    """Expected SHA-256 hash of the file ``weights``. Hashes of the default files are known."""
+    """Expected SHA-256 hash of the file ``weights``. The hashes of the default weights files are in
+    :data:`KNOWN_HASHES`."""
 
 
 class SiftOptions(FeatureOptions):
@@ -194,8 +195,8 @@ class DedodeLightGlueOptions(LightGlueOptions):
 class LighterGlueOptions(LightGlueOptions):
     """Options of LighterGlue, the small LightGlue network for XFeat features.
 
-    The published ``width_confidence`` of 0.95 is faster, but verifies 3 % fewer matches on
-    rendered_kitchen.
+    The published ``width_confidence`` of 0.95 is faster, but gives 3 % fewer geometrically verified
+    matches on the scene rendered_kitchen.
     """
 
     weights: str = LIGHTERGLUE.uri
@@ -215,7 +216,7 @@ class AdalamOptions(Options):
     """Minimum ratio of a neighborhood's inlier density to the density expected by chance."""
     scale_ratio: float | None = Field(1.5, gt=1)
     """Maximum ratio of the scale changes of two matches in a neighborhood. null sets no limit.
-    The ratio is ignored for features without a scale.
+    This limit has no effect on features without a scale.
     """
 
 

@@ -1,4 +1,4 @@
-"""Loading of weights, and conversion of pixels between a view and the network input."""
+"""Loading of weights, and conversion of positions between a view and the network input."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def load_state(module: torch.nn.Module, state: dict[str, Any], uri: str) -> None
     """Load all learned tensors of a network, and switch the network to evaluation mode.
 
     Raises:
-        WeightsError: The file lacks tensors of the network, or their shapes differ.
+        WeightsError: The weights file lacks tensors of the network, or tensor shapes differ.
     """
     try:
         mismatch = module.load_state_dict(state, strict=False)
@@ -58,7 +58,7 @@ class Grid:
 
     @classmethod
     def fit(cls, view: View, longest: int | None, multiple: int = 1) -> Grid:
-        """Compute a network input of at most ``longest`` pixels, rounding sides down to multiples.
+        """Compute an input size of at most ``longest`` pixels, rounding sides down to multiples.
 
         Views are only enlarged to reach the minimum side of the networks.
         """

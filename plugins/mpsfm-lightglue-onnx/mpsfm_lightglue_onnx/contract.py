@@ -79,7 +79,7 @@ def disk(folder: Path) -> ContractSetup:
 
 
 def lightglue(folder: Path) -> ContractSetup:
-    """Write a mutual nearest-neighbor matcher for the patch descriptors of the blob detectors."""
+    """Write a mutual nearest-neighbor matcher for patch descriptors, with LightGlue's tensors."""
     numbers = {"one": 1, "zero": 0, "one_step": 1, "none": -1}
     model = save_model(
         _MATCHER,

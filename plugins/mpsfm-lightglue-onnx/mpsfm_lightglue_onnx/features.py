@@ -77,7 +77,7 @@ class SuperPoint(OnnxFeatures):
 
 
 class Disk(OnnxFeatures):
-    """DISK features. DISK's network halves its input four times."""
+    """DISK features, from a network whose input sides are multiples of 16 pixels."""
 
     multiple = 16
 

@@ -21,7 +21,7 @@ class LightGlue:
     The inputs ``kpts0`` and ``kpts1`` (1, n, 2) are normalized keypoints, and ``desc0`` and
     ``desc1`` (1, n, d) are descriptors. The outputs ``matches0`` and ``mscores0`` are either
     matches (m, 2) and their scores (m,), or index and score (1, n) for every keypoint of the first
-    view. The index is -1 for keypoints without a match.
+    view. In the second form, ``matches0`` is -1 for keypoints without a match.
     """
 
     def __init__(self, options: LightGlueOptions, context: ProviderContext) -> None:
@@ -56,7 +56,7 @@ class LightGlue:
 def _normalised(view: View, features: Features) -> Float64:
     """Normalize keypoints to the image center and half of the longer side, as in training.
 
-    LightGlue was trained with the center of the first pixel at (0, 0).
+    LightGlue was trained on keypoints with the center of the first pixel at (0, 0).
     """
     size = np.array(view.camera.size, dtype=np.float64)
     normalised: Float64 = (features.keypoints - 0.5 - size / 2) / (size.max() / 2)

@@ -30,12 +30,12 @@ _TENSORS = (
 
 
 def dense(folder: Path) -> ContractSetup:
-    """Write the replacement network with a small input, where comparing all pixels is fast."""
+    """Write MASt3R's replacement network, with small inputs to compare all pixels quickly."""
     return ContractSetup(options={**_stand_in(folder), "subsample": 8}, truth_source="image")
 
 
 def sparse(folder: Path) -> ContractSetup:
-    """Write the replacement network for matching the keypoints of any detector."""
+    """Write MASt3R's replacement network for matching the keypoints of any detector."""
     return ContractSetup(options=_stand_in(folder), truth_source="image")
 
 

@@ -1,6 +1,7 @@
 """Export of MASt3R to ONNX by its authors' code.
 
-This module runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+The command ``mpsfm models export`` runs this module as a program, see
+:mod:`mpsfm_core.providers.model_export`.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import torch
 
 from mpsfm_core.providers.model_export.author_script import ExportJob, run_network
 
-sys.modules["models.curope"] = None  # replaced by rotary embeddings in plain torch
+sys.modules["models.curope"] = None  # torch code replaces the CUDA embeddings
 
 from mast3r.model import AsymmetricMASt3R  # noqa: E402
 from models.pos_embed import RoPE2D  # noqa: E402
@@ -36,19 +37,19 @@ _NARROW = {
     "dec_embed_dim": 128,
     "dec_num_heads": 2,
 }
-"""Constructor arguments of the network size ``tiny`` for tests. The classes and heads are those of
-MASt3R, which need 12 decoder blocks.
+"""Constructor arguments of the network size ``tiny`` for tests. The ``tiny`` network has the
+classes and heads of MASt3R, which need 12 decoder blocks.
 """
 _POSITIONS = 256
 """Number of patches along an image side for which rotary embeddings are stored in the file. This
-number limits images to 4096 pixels."""
+number limits image sides to 4096 pixels."""
 _SIDES = (((96, 128), (128, 64)), ((64, 160), (64, 160)))
 _KEYS = ("pts3d", "conf", "desc", "desc_conf")
 _OUTPUTS = [f"{key}_{side}" for side in (1, 2) for key in _KEYS]
 
 
 class TwoViews(torch.nn.Module):
-    """Module that calls MASt3R with two images, like the authors' scripts."""
+    """Torch module that calls MASt3R with two images, like the authors' scripts."""
 
     def __init__(self, model: AsymmetricMASt3R) -> None:
         super().__init__()
@@ -66,7 +67,7 @@ class TwoViews(torch.nn.Module):
 
 
 class AnySize(torch.nn.Module):
-    """Module for image sides in multiples of the patch size.
+    """Torch module that runs MASt3R on images whose sides are multiples of the patch size.
 
     Each image is encoded separately, and patch positions are computed from the input size.
     """
@@ -114,7 +115,7 @@ def network(size: str) -> AsymmetricMASt3R:
 
 
 def export(job: ExportJob, model: AsymmetricMASt3R) -> None:
-    """Export the network for two images with sides in multiples of 16 pixels."""
+    """Export MASt3R for two images with sides in multiples of 16 pixels."""
     given = [
         {f"img{n}": torch.rand(1, 3, *sides) * 2 - 1 for n, sides in enumerate(pair, start=1)}
         for pair in _SIDES

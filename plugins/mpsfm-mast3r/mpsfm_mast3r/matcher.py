@@ -1,7 +1,8 @@
 """MASt3R as a dense and as a sparse matcher, both with depth of the image pair.
 
-The network runs twice, with either view as the first one. Depth is most accurate in the frame of
-the first view, and the merged matches of both passes are better than those of one pass.
+The MASt3R network runs twice, with either view of a pair as the first one. Depth is most accurate
+in the frame of the first view, and the merged matches of both passes are better than those of one
+pass.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ _STD_NETWORK_PX = 0.5
 
 
 class DenseMatcher:
-    """Dense matcher by reciprocal nearest neighbors among the descriptors of all pixels."""
+    """Dense matcher by reciprocal nearest neighbors among MASt3R's descriptors of all pixels."""
 
     network: ClassVar[Callable[..., PairNetwork]] = OnnxPairNetwork
 
@@ -47,7 +48,7 @@ class DenseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Return the matches of both passes. A match found twice has the larger of both scores."""
+        """Match two views, and return the merged matches of both network passes."""
         passes = self._network.both(view_a, view_b)
         pairs_by_pass = [self._reciprocal(a, b) for a, b in passes]
         scores = [_scores(a, b, pairs) for (a, b), pairs in zip(passes, pairs_by_pass, strict=True)]
@@ -60,7 +61,7 @@ class DenseMatcher:
         return PairMatches(dense=dense, depth=_depth(passes))
 
     def _reciprocal(self, a: ViewOutput, b: ViewOutput) -> Int64:
-        """Find matching descriptor rows (m, 2) by reciprocal search from pixels of both views."""
+        """Find index pairs (m, 2) of matching descriptors by reciprocal search from both views."""
         there = find_reciprocal(a.descriptors, b.descriptors, self._start(a))
         back = find_reciprocal(b.descriptors, a.descriptors, self._start(b))
         return np.unique(np.concatenate([there, back[:, ::-1]]), axis=0)
@@ -89,7 +90,7 @@ class SparseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match keypoints by the mean descriptor similarity of both passes."""
+        """Match keypoints by the mean descriptor similarity of both network passes."""
         features_a, features_b = require_features(
             "mast3r-sparse matches keypoints", features_a, features_b
         )
@@ -110,9 +111,9 @@ class SparseMatcher:
 
 
 def _scores(a: ViewOutput, b: ViewOutput, cells: Int64) -> Float32:
-    """Compute scores ``c / (1 + c)`` in [0, 1) of pairs (m, 2) of descriptor rows.
+    """Compute the scores (m,) in [0, 1) of matches from their descriptor indices (m, 2).
 
-    The confidence c of a match is the geometric mean of both descriptor confidences.
+    The score is ``c / (1 + c)``, where c is the geometric mean of both descriptor confidences.
     """
     certainty = np.sqrt(a.match_certainty[cells[:, 0]] * b.match_certainty[cells[:, 1]])
     scores: Float32 = (certainty / (1 + certainty)).astype(np.float32)
@@ -120,7 +121,7 @@ def _scores(a: ViewOutput, b: ViewOutput, cells: Int64) -> Float32:
 
 
 def _merge(pairs: Int64, scores: Float32) -> tuple[Int64, Float32]:
-    """Merge duplicate matches, and assign the largest of their scores."""
+    """Merge duplicate matches (m, 2), and assign the largest of their scores."""
     order = np.argsort(-scores, kind="stable")
     unique, first = np.unique(pairs[order], axis=0, return_index=True)
     return unique, scores[order][first]

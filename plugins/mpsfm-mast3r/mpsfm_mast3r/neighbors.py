@@ -7,14 +7,15 @@ import numpy as np
 from mpsfm_core.data import Float32, Int64
 
 _BLOCK = 1 << 24
-"""Number of similarities that are computed together, which take 64 MB."""
+"""Number of descriptor similarities in one matrix product, which take 64 MB."""
 _ROUNDS = 10
 """Maximum number of iterations of the reciprocal search [MASt3R]. Nearly all searches converge in
-three."""
+three iterations."""
 
 
 def find_nearest(queries: Float32, base: Float32) -> Int64:
-    """Find the row of ``base`` (m, d) with the largest dot product for each query (n, d)."""
+    """Find the index (n,) of the descriptor in ``base`` (m, d) most similar to each query (n,
+    d)."""
     step = max(1, _BLOCK // max(len(base), 1))
     blocks = [
         (queries[start : start + step] @ base.T).argmax(axis=1)
@@ -24,7 +25,7 @@ def find_nearest(queries: Float32, base: Float32) -> Int64:
 
 
 def find_reciprocal(a: Float32, b: Float32, start: Int64) -> Int64:
-    """Find pairs (m, 2) of mutual nearest neighbors, searching from the rows ``start`` of ``a``.
+    """Find index pairs (m, 2) of mutual nearest neighbors, starting at the rows ``start`` of a.
 
     The search iterates from a row to its nearest neighbor and back until the pair is stable (fast
     reciprocal matching, Leroy et al., ECCV 2024).

@@ -39,7 +39,7 @@ class ViewOutput:
     match_certainty: Float32
 
     def depth(self) -> DepthPrior:
-        """Return the depth of the first view, which is invalid where the canvas crops the view.
+        """Return the depth of the first view, which is invalid where the network input crops it.
 
         The std of depth is ``1 / certainty`` meters [reference].
         """
@@ -48,13 +48,13 @@ class ViewOutput:
         return DepthPrior.from_arrays(z, 1 / certainty.astype(np.float64) ** 2)
 
     def positions(self, cells: Int64) -> Float64:
-        """Convert rows of the descriptors to pixels (n, 2) of the view."""
+        """Convert descriptor indices (n,) to pixels (n, 2) of the view."""
         rows, columns = np.divmod(cells, self.canvas.size[0])
         xy = np.stack([columns, rows], axis=-1) + 0.5
         return self.canvas.to_view(xy, self.view.camera.size)
 
     def cells(self, xy: Float64) -> Int64:
-        """Convert pixels (n, 2) of the view to rows of the descriptors, -1 in cropped borders."""
+        """Convert pixels (n, 2) of the view to descriptor indices (n,), -1 in cropped borders."""
         placed = np.floor(self.canvas.from_view(xy, self.view.camera.size)).astype(np.int64)
         width, height = self.canvas.size
         inside = ((placed >= 0) & (placed < (width, height))).all(axis=1)
@@ -62,12 +62,12 @@ class ViewOutput:
 
     @property
     def pixel_size(self) -> float:
-        """Return the longer side of a canvas pixel, in pixels of the view."""
+        """Return the longer side of a network input pixel, in pixels of the view."""
         return max(v / i for v, i in zip(self.view.camera.size, self.canvas.image, strict=True))
 
 
 class PairNetwork(ABC):
-    """Interface of the MASt3R networks, with images resized to the longer side ``size``."""
+    """Interface of MASt3R networks, whose input images have the longer side ``size`` in pixels."""
 
     def __init__(self, size: int) -> None:
         self._rule = ImageInput(
@@ -80,7 +80,7 @@ class PairNetwork(ABC):
 
     @abstractmethod
     def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
-        """Run the network on two RGB images (1, 3, h, w) with values in [-1, 1].
+        """Run MASt3R on two RGB images (1, 3, h, w) with values in [-1, 1].
 
         Returns:
             For each image, points (h, w, 3) in the camera frame of the first image, their
@@ -90,7 +90,7 @@ class PairNetwork(ABC):
     def both(
         self, view_a: View, view_b: View
     ) -> tuple[tuple[ViewOutput, ViewOutput], tuple[ViewOutput, ViewOutput]]:
-        """Return the outputs for a and b of two passes, with a first and with b first."""
+        """Run one pass with view a first and one with view b first, and return all outputs."""
         backward = self._run(view_b, view_a)
         return self._run(view_a, view_b), (backward[1], backward[0])
 

@@ -17,7 +17,7 @@ class FileOptions(Options):
 
 
 class SizeOptions(Options):
-    """Options of the image size that MASt3R sees."""
+    """Option for the size of MASt3R's input images."""
 
     size: int = Field(512, ge=16)
     """Longer side of the network input in pixels. Smaller images are enlarged. [reference]"""
@@ -27,8 +27,8 @@ class DenseSearch(SizeOptions):
     """Options of MASt3R's dense matching."""
 
     subsample: int = Field(8, ge=1)
-    """Step in network pixels between the pixels from which the reciprocal search starts. Larger
-    steps are faster and find fewer matches. [reference]"""
+    """Step in pixels of the network input between the pixels from which the reciprocal search
+    starts. Larger steps are faster and find fewer matches. [reference]"""
 
 
 class SparseSearch(SizeOptions):

@@ -12,7 +12,7 @@ from mpsfm_metric3d_onnx.provider import describe
 
 
 def setup(folder: Path) -> ContractSetup:
-    """Write a network of Metric3D's interface that decodes depth and normals from image colors."""
+    """Write a network with Metric3D's tensors that decodes depth and normals from image colors."""
     model = stand_in(describe(Metric3dOptions(weights="", confidence=True)), folder)
     return ContractSetup(
         options={"weights": str(model), "confidence": True}, truth_source="painted"

@@ -1,6 +1,7 @@
 """Export of Metric3D v2, with all of its outputs, to ONNX by its authors' code.
 
-This module runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+The command ``mpsfm models export`` runs this module as a program, see
+:mod:`mpsfm_core.providers.model_export`.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from mono.model.decode_heads.RAFTDepthNormalDPTDecoder5 import (  # noqa: E402
 )
 
 SIZE = 616, 1064
-"""Height and width of the network input in pixels. The exported file supports no other size."""
+"""Height and width of the network input in pixels. The exported ONNX file supports no other input
+size."""
 _MEAN, _STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 _MODELS = {
     "": hubconf.metric3d_vit_small,
@@ -84,7 +86,7 @@ def network(size: str) -> Named:
 
 
 def export(job: ExportJob, model: Named) -> None:
-    """Export the network for images of the fixed input size, with values from 0 to 255."""
+    """Export Metric3D for images of the fixed input size, with values from 0 to 255."""
     given = [{"pixel_values": torch.rand(1, 3, *SIZE) * 255} for _ in range(2)]
     outputs = ["predicted_depth", "predicted_normal", "normal_confidence", "confidence"]
     job.export(model, given, outputs)

@@ -13,7 +13,7 @@ WEIGHTS_LICENSE = "CC0-1.0 (export; the authors name none for their weights)"
 RELATIVE_STD_ALONE = 0.08
 """Std of depth relative to depth, for ONNX files without the output ``confidence``.
 
-[assumed from the reference values 0.079 and 0.0875 of other networks]
+[assumed from the relative depth std of other networks, 0.079 and 0.0875 in the reference]
 """
 
 
@@ -39,8 +39,9 @@ class Metric3dOptions(Options):
     sha256: str | None = None
     """Expected SHA-256 hash of the file ``weights``."""
     confidence: bool = False
-    """Set to true if the ONNX file has the output ``confidence``. Depth then has a variance, and
-    the calibration of the reference applies. The public ONNX files have no output ``confidence``.
+    """Set to true if the ONNX file has the output ``confidence``. The depth variance is then
+    computed from this confidence, and calibrated as in the reference. The public ONNX files have no
+    output ``confidence``.
     """
 
 
@@ -67,7 +68,7 @@ class Giant2Options(Metric3dOptions):
 class Size:
     """Weights, options and calibration of one Metric3D size.
 
-    The calibration is for ONNX files with the output ``confidence`` [reference].
+    The variance calibration is for ONNX files with the output ``confidence`` [reference].
     """
 
     name: str
@@ -76,13 +77,13 @@ class Size:
     calibration: DepthCalibration
 
     def files(self, options: Metric3dOptions) -> tuple[WeightsFile, ...]:
-        """Return the weights files that the options select."""
+        """Return the Metric3D weights files that the options select."""
         companions = (WeightsFile(uri, license=WEIGHTS_LICENSE) for uri in options.companions)
         return (*companions, *weights_from_option("weights", *self.weights)(options))
 
     @property
     def calibration_alone(self) -> DepthCalibration:
-        """Return the calibration for ONNX files without the output ``confidence``."""
+        """Return the depth calibration for ONNX files without the output ``confidence``."""
         return self.calibration.model_copy(update={"relative_std": RELATIVE_STD_ALONE})
 
 

@@ -14,13 +14,13 @@ _NORMALS = NormalCalibration(std_scale=1.0, std_floor_deg=1.0)
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register providers of depth (with normals of the same pass) and of normals for every size."""
+    """Register each Metric3D size as a provider of depth with normals, and of normals."""
     return [_spec(kind, size) for kind in ("depth", "normals") for size in SIZES]
 
 
 @hookimpl
 def mpsfm_exports() -> dict[str, ModelExport]:
-    """Register the ONNX export, with confidence, that runs the authors' code and checkpoint."""
+    """Register the ONNX export of Metric3D, with confidence, by its authors' code."""
     return {
         "metric3d": ModelExport(
             script="mpsfm_metric3d_onnx.export",
@@ -36,7 +36,7 @@ def mpsfm_exports() -> dict[str, ModelExport]:
 def mpsfm_calibration(
     kind: str, provider: str, options: BaseModel | None
 ) -> DepthCalibration | NormalCalibration | None:
-    """Return the calibration of depth, which depends on the option ``confidence``."""
+    """Return the calibration of the depth variance, which depends on the option ``confidence``."""
     if kind == "depth" and isinstance(options, Metric3dOptions):
         for size in SIZES:
             if provider == _name(size) and not options.confidence:

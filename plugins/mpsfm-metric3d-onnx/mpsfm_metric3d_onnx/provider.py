@@ -12,21 +12,21 @@ from mpsfm_metric3d_onnx.options import Metric3dOptions
 
 
 class Metric3dDepth(DescribedJoint):
-    """Provider of metric depth and of normals from the same forward pass."""
+    """Provider of metric depth and normals from one forward pass of Metric3D."""
 
     def __init__(self, options: Metric3dOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context)
 
 
 class Metric3dNormals(DescribedNormals):
-    """Provider of normals with their angular variance."""
+    """Provider of normals and their angular variance from Metric3D."""
 
     def __init__(self, options: Metric3dOptions, context: ProviderContext) -> None:
         super().__init__(describe(options), context)
 
 
 def describe(options: Metric3dOptions) -> Description:
-    """Return the network description that matches the options."""
+    """Return the description of the Metric3D network that the options select."""
     general = load_description(str(Path(__file__).with_name("description.yaml")))
     weights = Weights(uri=options.weights, sha256=options.sha256, companions=options.companions)
     update: dict[str, object] = {"weights": weights}

@@ -72,10 +72,10 @@ class Canvas:
         return np.ascontiguousarray(values[None])
 
     def cut(self, planes: Float32) -> Float32:
-        """Cut the part that covers the view from an output (h, w, c) that covers the canvas.
+        """Cut an output (h, w, c) of the whole network input to the part that covers the view.
 
-        The result covers the view exactly, and is NaN where the canvas crops the view. If the image
-        border is not between two output pixels, the output is sampled bilinearly.
+        The returned map covers the view exactly, and is NaN where the network input crops the view.
+        If the image border is not between two output pixels, the output is sampled bilinearly.
         """
         height, width = planes.shape[:2]
         scale = (width / self.size[0], height / self.size[1])
@@ -100,21 +100,21 @@ class Canvas:
         return np.stack(sampled, axis=-1).astype(np.float32)
 
     def camera(self, camera: PinholeCamera) -> PinholeCamera:
-        """Return the camera of the view in pixels of the canvas."""
+        """Return the view's camera with intrinsics in pixels of the network input."""
         resized = camera.resized(*self.image)
         (width, height), (x, y) = self.size, self.offset
         return PinholeCamera(width, height, resized.fx, resized.fy, resized.cx + x, resized.cy + y)
 
     def from_view(self, xy: Float64, view: tuple[int, int]) -> Float64:
-        """Convert pixels (n, 2) of a view of ``(width, height)`` pixels to pixels of the canvas."""
+        """Convert pixels (n, 2) of a view of size ``(width, height)`` to network input pixels."""
         return scale_pixels(xy, view, self.image) + self.offset
 
     def to_view(self, xy: Float64, view: tuple[int, int]) -> Float64:
-        """Convert pixels (n, 2) of the canvas to pixels of a view of ``(width, height)`` pixels."""
+        """Convert network input pixels (n, 2) to pixels of a view of size ``(width, height)``."""
         return scale_pixels(xy - np.array(self.offset, dtype=np.float64), self.image, view)
 
     def _overlap(self, axis: int) -> tuple[slice, slice]:
-        """Compute the range of the resized image along an axis, in canvas and in image pixels."""
+        """Compute the range of the resized image along an axis, in input and in image pixels."""
         start = max(self.offset[axis], 0)
         stop = min(self.offset[axis] + self.image[axis], self.size[axis])
         return slice(start, stop), slice(start - self.offset[axis], stop - self.offset[axis])

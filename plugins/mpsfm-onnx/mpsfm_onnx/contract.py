@@ -20,7 +20,7 @@ from mpsfm_onnx.description import Description, ImageInput, load_description
 from mpsfm_onnx.stand_in import save_model
 
 KAPPA = (1 + np.sqrt(1 - NORMALS_STD**2)) / NORMALS_STD
-"""Concentration kappa whose expected angle is :data:`NORMALS_STD`."""
+"""Concentration kappa of normals whose expected angular error is :data:`NORMALS_STD`."""
 
 _TINY = """
 name: tiny
@@ -71,7 +71,7 @@ moge (float[1,3,h,w] image, int64 num_tokens) => (
 
 
 def setup(folder: Path) -> ContractSetup:
-    """Write a network and its description with canonical camera, padding and confidences."""
+    """Write a network whose description has a canonical camera, padding and confidences."""
     return ContractSetup(options=_tiny(folder), truth_source="painted")
 
 
@@ -94,8 +94,8 @@ def stand_in(description: Description, folder: Path) -> Path:
     """Write an ONNX network that decodes depth and normals from the colors of test images.
 
     The description must have a named input, NCHW tensors, ``output: depth`` and an uncertainty of
-    the normals. Pixels whose color encodes no depth are invalid. A canonical camera has the focal
-    length of the main test image on the network input.
+    the normals. Pixels whose color encodes no depth are invalid. If the description has a canonical
+    focal length, the network assumes the focal length of the main test image.
     """
     outputs, rule = description.outputs, description.input
     weights, bias = _unnormalised(rule)
@@ -168,7 +168,7 @@ def _tiny(folder: Path) -> dict[str, str]:
 
 
 def _unnormalised(rule: ImageInput) -> tuple[Float64, Float64]:
-    """Create the layer that decodes depth and slopes from normalized colors."""
+    """Create the weights and bias that decode depth and surface slopes from normalized colors."""
     weights, bias = decoder()
     if rule.channels == "BGR":
         weights = weights[:, ::-1]

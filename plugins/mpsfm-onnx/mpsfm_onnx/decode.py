@@ -19,11 +19,11 @@ from mpsfm_onnx.description import (
 )
 
 _GRID = np.arange(64)
-"""Rows and columns of the pixel grid on which the z-shift of points is estimated."""
+"""Number of rows and columns of the pixel grid that estimates the unknown z-shift of points."""
 _GAUSS_NEWTON_STEPS = 20
 _SMALLEST_RELATIVE_STD = 1e-4
-"""Minimum std of depth relative to depth, because a variance must be positive. The calibration of a
-network has its own, larger minimum.
+"""Minimum std of depth relative to depth, because a variance must be positive. The variance
+calibration of a network sets its own, larger minimum.
 """
 
 
@@ -46,15 +46,15 @@ def decode_depth(
     std_rule: ConfidenceOutput | None = None,
     valid: Bool | None = None,
 ) -> DepthPrior:
-    """Decode the depth of a view and its variance from output tensors.
+    """Decode the depth of a view and its variance from the output tensors of a network.
 
     Args:
         value: The depth tensor (h, w, c), in units of the network.
         rule: Description of the depth tensor.
         camera: Camera of the view that ``value`` covers.
-        factor: Multiplier of depth and std for the focal length and the unit of the network.
-        std: The uncertainty tensor (h, w), or None.
-        std_rule: Description of the uncertainty tensor.
+        factor: Multiplier of depth and std that corrects for focal length and network unit.
+        std: The depth uncertainty tensor (h, w), or None.
+        std_rule: Description of the depth uncertainty tensor.
         valid: Mask (h, w) of valid pixels that the network predicts, or None.
 
     Returns:
@@ -98,7 +98,7 @@ def estimate_z_shift(points: Float64, xy: Float64, valid: Bool | None = None) ->
 
     ``xy`` (h, w, 2) are x and y of the rays. The shift minimizes the reprojection error ``sum
     |(x_i, y_i) / (z_i + t) - xy_i|^2`` on a grid of 64 x 64 pixels by Gauss-Newton, as in MoGe. The
-    initial value minimizes the linear error ``sum |(x_i, y_i) - xy_i (z_i + t)|^2 / z_i^2``.
+    initial t minimizes the linear error ``sum |(x_i, y_i) - xy_i (z_i + t)|^2 / z_i^2``.
     """
     usable = np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
     if valid is not None:
@@ -122,7 +122,8 @@ def estimate_z_shift(points: Float64, xy: Float64, valid: Bool | None = None) ->
 
 
 def _step(miss: Float64, slope: Float64) -> float:
-    """Compute the Gauss-Newton step from the residual ``miss`` and the Jacobian ``slope``."""
+    """Compute the Gauss-Newton step of the z-shift from residual ``miss`` and Jacobian
+    ``slope``."""
     return float((miss * slope).sum() / max((slope**2).sum(), 1e-12))
 
 
@@ -167,8 +168,7 @@ def compute_expected_angle(kappa: Float64) -> Float64:
     The density of normals over the sphere is ``(k^2 + 1) exp(-k a) / (2 pi (1 + exp(-k pi)))``,
     where a is the angle to the mean normal (Bae et al., ICCV 2021, DSINE and Metric3D v2). The mean
     angle of this density is ``2k / (k^2 + 1) + pi e / (1 + e)`` with ``e = exp(-k pi)``. For large
-    k, the squared mean angle overestimates the std by 15 %. For large k, this overestimates the std
-    by 15 %.
+    k, the mean angle overestimates the std by 15 %.
     """
     k = np.maximum(kappa, 0)
     tail = np.exp(-k * np.pi)

@@ -1,7 +1,7 @@
-"""Description of a network in an ONNX file by names and meaning of its tensors.
+"""Description of a network in an ONNX file by the names and meanings of its tensors.
 
-A description is a YAML file with the fields of :class:`Description`. The shipped descriptions are
-in the folder ``descriptions/``, and are named after their files.
+A description is a YAML file with the fields of :class:`Description`. The descriptions that the
+package contains are in the folder ``descriptions/``, and have the names of their files.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ class SideSize(Options):
     """Both sides of the network input are multiples of this number of pixels."""
     fit: Literal["stretch", "pad", "crop"] = "stretch"
     """Adaptation of the sides to ``multiple_of``. ``stretch`` resizes to the nearest multiples,
-    ``pad`` fills up to the next ones, and ``crop`` cuts to the previous ones. Cropped borders have
-    no prediction.
+    ``pad`` pads to the next larger multiples, and ``crop`` crops to the next smaller multiples.
+    Cropped borders have no prediction.
     """
     enlarge: bool = True
     """Enlarge small images."""
@@ -65,7 +65,7 @@ class IntrinsicsInput(Options):
 class ImageInput(Options):
     """Image tensor of the network, ``(value * scale - mean) / std`` for values in 0..255.
 
-    The tensor is rounded if it has an integer type.
+    The values are rounded if the tensor has an integer type.
     """
 
     name: str | None = None
@@ -98,17 +98,18 @@ class DepthOutput(Options):
 
     name: str
     output: Literal["depth", "disparity", "log-depth", "ray-length", "points"] = "depth"
-    """Meaning of v. With ``depth``, ``disparity`` and ``log-depth``, depth is ``v``, ``1 / v`` and
-    ``exp(v)``. With ``ray-length``, v is the distance to the camera center along the ray. With
-    ``points``, the tensor has channels x, y, z with an unknown shift of z, which is estimated from
-    the known intrinsics. Pixels with ``v <= 0`` are invalid, except for ``log-depth``.
+    """Meaning of v. If ``output`` is ``depth``, ``disparity`` or ``log-depth``, depth is ``v``, ``1
+    / v`` or ``exp(v)`` for the scaled and shifted value v. If ``output`` is ``ray-length``, the
+    value is the distance to the camera center along the ray. If ``output`` is ``points``, the
+    tensor has channels x, y, z with an unknown shift of z, which is estimated from the known
+    intrinsics. Pixels whose value is not positive are invalid, except for ``log-depth``.
     """
     channel: int = Field(0, ge=0)
     """Channel of the depth tensor. ``points`` ignores this option."""
     scale: float = 1.0
     shift: float = 0.0
-    """Scale and shift of the tensor values. They convert to meters (or 1 / meters), or make an
-    affine disparity positive.
+    """Scale and shift of the tensor values. Scale and shift convert the values to meters (or 1 /
+    meters), or make an affine disparity positive.
     """
     metric: bool
     """True if depth is in meters after the correction by ``canonical_focal``."""
@@ -118,10 +119,10 @@ class DepthOutput(Options):
     """
     assumed_focal: str | None = None
     """Name of the output with the horizontal focal length, in input pixels, that the network
-    assumed. Depth is multiplied by the known focal length divided by this value.
+    assumed. Depth is multiplied by the ratio of the known to the assumed focal length.
     """
     multiplier: str | None = None
-    """Name of the output with a factor that converts depth to meters."""
+    """Name of the output with a factor that converts predicted depth to meters."""
     valid_min: float = Field(0.0, ge=0)
     valid_max: float | None = Field(None, gt=0)
     """Range of valid depth, before the correction by ``canonical_focal``."""
@@ -143,7 +144,7 @@ class MaskOutput(Options):
 
     name: str
     minimum: float = 0.5
-    """Threshold of the tensor above which a pixel is valid."""
+    """Probability above which a pixel is valid."""
 
 
 class NormalsOutput(Options):
@@ -151,7 +152,7 @@ class NormalsOutput(Options):
 
     name: str
     axes: tuple[Sign, Sign, Sign] = (1, 1, 1)
-    """Signs that convert the network's axes to x right, y down, z forward."""
+    """Signs that convert the axes of predicted normals to x right, y down, z forward."""
 
 
 class KappaOutput(Options):
@@ -163,7 +164,7 @@ class KappaOutput(Options):
     DSINE and Metric3D. ``angle`` is the std about each axis in rad.
     """
     channel: int = Field(0, ge=0)
-    """Channel of the uncertainty in its tensor, 3 if it follows x, y, z of the normals."""
+    """Channel index of the uncertainty in its tensor, 3 if x, y, z of the normals precede it."""
 
 
 class Outputs(Options):
@@ -177,7 +178,7 @@ class Outputs(Options):
     mask: MaskOutput | None = None
 
     def names(self) -> set[str]:
-        """Return the names of the output tensors that a model must have."""
+        """Return the names of all output tensors that the ONNX file must have."""
         described = [self.depth, self.normals, self.kappa, self.mask, self.confidence]
         return {tensor.name for tensor in described if tensor} | self.numbers()
 
@@ -189,11 +190,11 @@ class Outputs(Options):
     @model_validator(mode="after")
     def _complete(self) -> Outputs:
         if self.depth is None and self.normals is None:
-            raise ValueError("a network must predict depth or normals")
+            raise ValueError("a network description must have the output depth or normals")
         if self.confidence is not None and self.depth is None:
-            raise ValueError("confidence belongs to depth, which is not described")
+            raise ValueError("the output confidence requires the output depth, which is missing")
         if self.kappa is not None and self.normals is None:
-            raise ValueError("kappa belongs to normals, which are not described")
+            raise ValueError("the output kappa requires the output normals, which is missing")
         return self
 
 
@@ -216,7 +217,7 @@ class Description(Options):
     license: str = "unknown"
     """License of the network weights."""
     weights: Weights | None = None
-    """Public ONNX file. null means that the user must give a local file."""
+    """Public ONNX file of the network. null means that the user must give a local file."""
     input: ImageInput
     outputs: Outputs
     calibration: DepthCalibration = DepthCalibration()
@@ -238,7 +239,7 @@ class Description(Options):
         if public is None:
             raise WeightsError(
                 f"the description {self.name!r} has no public weights file: "
-                f"name yours with --set depth.options.model=FILE"
+                f"give an ONNX file with --set depth.options.model=FILE"
             )
         companions = (WeightsFile(uri, license=self.license) for uri in public.companions)
         return (*companions, WeightsFile(public.uri, public.sha256, self.license, public.size))
@@ -253,8 +254,8 @@ def load_description(name: str) -> Description:
     """Load a shipped network description by its name, or a description from a YAML file.
 
     Raises:
-        ConfigError: The name is unknown, or the file is invalid. The message names the file and the
-            invalid key.
+        ConfigError: The description name is unknown, or the YAML file is invalid. The error message
+            names the file and the invalid key.
     """
     path = Path(name).expanduser()
     if path.suffix not in (".yaml", ".yml"):
@@ -262,14 +263,14 @@ def load_description(name: str) -> Description:
         if name not in shipped_descriptions():
             known = shipped_descriptions()
             raise ConfigError(
-                f"no description {name!r}{did_you_mean(name, known)}; there are "
+                f"no network description {name!r}{did_you_mean(name, known)}; there are "
                 f"{', '.join(known)}, or give a YAML file"
             )
     elif not path.is_file():
-        raise ConfigError(f"description file {path} does not exist")
+        raise ConfigError(f"network description file {path} does not exist")
     values = parse_yaml(path.read_text(encoding="utf-8"), str(path))
     if not isinstance(values, dict):
-        raise ConfigError(f"{path}: expected the fields of a description")
+        raise ConfigError(f"{path}: expected the fields of a network description")
     try:
         return parse_settings(Description, values)
     except ConfigError as error:

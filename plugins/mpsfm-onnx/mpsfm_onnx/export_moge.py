@@ -1,6 +1,7 @@
 """Export of MoGe-2 with normals to ONNX by its authors' code.
 
-This module runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+The command ``mpsfm models export`` runs this module as a program, see
+:mod:`mpsfm_core.providers.model_export`.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ def small_with_normals() -> dict[str, Any]:
 
 
 def export(job: ExportJob, model: torch.nn.Module) -> None:
-    """Export the network for images of any size and any number of tokens."""
+    """Export MoGe-2 for images of any size and any number of image tokens."""
     model.onnx_compatible_mode = True
     tokens = torch.tensor(TOKENS)
     given = [{"image": torch.rand(1, 3, *size), "num_tokens": tokens} for size in _SIDES]

@@ -1,6 +1,7 @@
 """Export of UniDepth V2 with camera input to ONNX by its authors' code.
 
-This module runs as a program, see :mod:`mpsfm_core.providers.model_export`.
+The command ``mpsfm models export`` runs this module as a program, see
+:mod:`mpsfm_core.providers.model_export`.
 """
 
 from __future__ import annotations
@@ -40,12 +41,13 @@ from unidepth.models.unidepthv2.export import UniDepthV2ONNXcam  # noqa: E402
 from unidepth.utils.camera import Pinhole  # noqa: E402
 
 SIZE = 462, 630
-"""Height and width of the network input in pixels. The exported file supports no other size."""
+"""Height and width of the network input in pixels. The exported ONNX file supports no other input
+size."""
 _MODELS = {"": "l", "small": "s", "base": "b", "large": "l"}
 
 
 def network(size: str) -> UniDepthV2ONNXcam:
-    """Create the UniDepth network as the authors' own ONNX export does."""
+    """Create the UniDepth network as in the ONNX export of UniDepth's authors."""
     name = f"config_v2_vit{_MODELS[size]}14.json"
     config = json.loads(Path("configs", name).read_text(encoding="utf-8"))
     config["training"]["export"] = True
@@ -53,7 +55,7 @@ def network(size: str) -> UniDepthV2ONNXcam:
 
 
 def export(job: ExportJob, model: UniDepthV2ONNXcam) -> None:
-    """Export the network for images of the fixed size and for the unit rays of their pixels."""
+    """Export UniDepth for inputs of images, with the fixed size, and the unit rays of pixels."""
     given = []
     for focal in (400.0, 700.0):
         matrix = torch.tensor([[focal, 0, SIZE[1] / 2], [0, focal, SIZE[0] / 2], [0, 0, 1]])

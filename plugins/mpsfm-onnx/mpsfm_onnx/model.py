@@ -46,15 +46,15 @@ class Model:
         self.outputs = tuple(tensor.name for tensor in self._session.get_outputs())
 
     def require(self, inputs: Iterable[str], outputs: Iterable[str], what: str) -> None:
-        """Check that the model has exactly these inputs, and at least these outputs.
+        """Check that the ONNX model has exactly the given inputs, and at least the given outputs.
 
         Args:
-            inputs: Names of all inputs.
-            outputs: Names of the required outputs.
+            inputs: Names of all input tensors.
+            outputs: Names of the required output tensors.
             what: Name of the network for the error message.
 
         Raises:
-            ConfigError: The inputs of the model differ, or the model lacks outputs.
+            ConfigError: The ONNX model has other inputs, or lacks required outputs.
         """
         inputs, outputs = sorted(set(inputs)), sorted(set(outputs))
         if inputs != sorted(self.inputs) or not set(outputs) <= set(self.outputs):
@@ -93,6 +93,6 @@ def _open(path: Path, context: ProviderContext) -> onnxruntime.InferenceSession:
         raise WeightsError(f"{path} cannot be opened as an ONNX model: {reason}") from error
     if not set(wanted) <= set(
         session.get_providers()
-    ):  # onnxruntime may list CUDA although CUDA's libraries are missing
+    ):  # onnxruntime may list CUDA as available although the CUDA libraries are missing
         _log.warning("%s runs on the CPU: onnxruntime cannot use the GPU here", path.name)
     return session

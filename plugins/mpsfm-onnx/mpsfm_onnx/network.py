@@ -1,4 +1,4 @@
-"""Network with a description, which runs on one view at a time."""
+"""Network in an ONNX file, whose tensors are described in YAML, for one view at a time."""
 
 from __future__ import annotations
 
@@ -31,11 +31,12 @@ class Network:
     """Network in an ONNX file, with a description of its tensors.
 
     Args:
-        weights: Path or URI of the ONNX file. None selects the file of the description.
+        weights: Path or URI of the ONNX file. None selects the ONNX file that the description
+        names.
         sha256: Expected SHA-256 hash of the file ``weights``.
 
     Raises:
-        ConfigError: The model does not have the tensors of its description.
+        ConfigError: The ONNX model lacks tensors that its description names.
         WeightsError: The ONNX file is missing or invalid.
     """
 
@@ -62,7 +63,7 @@ class Network:
         self._size = _own_size(rule, self._model.shapes[self._image])
 
     def run(self, view: View) -> NetworkOutput:
-        """Run the network on a view, and return maps that cover the view."""
+        """Run the network on a view, and return output maps that cover the view."""
         rule, outputs = self.description.input, self.description.outputs
         canvas = Canvas.plan(self._size, view.camera.size)
         feed = {self._image: canvas.paint(view.image, rule), **rule.constants}
@@ -81,7 +82,7 @@ class Network:
 
 
 def _own_size(rule: ImageInput, shape: tuple[object, ...]) -> FixedSize | SideSize:
-    """Return the input size rule of a description, replaced by a size fixed in the ONNX file."""
+    """Return the input size of a description, or the size that the ONNX file fixes."""
     height, width = shape[2:4] if rule.layout == "NCHW" else shape[1:3]
     if isinstance(rule.size, FixedSize) and isinstance(height, int) and isinstance(width, int):
         return rule.size.model_copy(update={"width": width, "height": height})

@@ -14,7 +14,8 @@ class OnnxOptions(Options):
     description: str = "fastdepth"
     """Name of a shipped network description, or path of a YAML file."""
     model: str | None = None
-    """Path or URI of the ONNX file. null selects the file of the description."""
+    """Path or URI of the ONNX file. null selects the ONNX file that the network description
+    names."""
     sha256: str | None = None
     """Expected SHA-256 hash of the file ``model``."""
 
@@ -23,6 +24,6 @@ class Moge2Options(Options):
     """Options of MoGe-2."""
 
     weights: str | None = None
-    """Path or URI of the ONNX file. null selects the small model that the authors published."""
+    """Path or URI of the ONNX file. null selects the small MoGe-2 that its authors published."""
     sha256: str | None = None
     """Expected SHA-256 hash of the file ``weights``."""

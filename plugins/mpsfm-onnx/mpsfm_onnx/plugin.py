@@ -15,7 +15,7 @@ _MOGE_ACCURACY = "not measured by us; std of depth declared as 8 %"
 
 @hookimpl
 def mpsfm_providers() -> list[ProviderSpec]:
-    """Register providers of depth, of normals, and of both from the same network."""
+    """Register ONNX providers of depth, of normals, and of both from one network."""
     return [
         _spec(
             "depth",
@@ -46,7 +46,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
 
 @hookimpl
 def mpsfm_exports() -> dict[str, ModelExport]:
-    """Register the ONNX exports that run the authors' code and checkpoints."""
+    """Register the ONNX exports of MoGe-2 and UniDepth V2 by their authors' code."""
     return {
         "moge": ModelExport(
             script="mpsfm_onnx.export_moge",
@@ -69,7 +69,7 @@ def mpsfm_exports() -> dict[str, ModelExport]:
 def mpsfm_calibration(
     kind: str, provider: str, options: BaseModel | None
 ) -> DepthCalibration | NormalCalibration | None:
-    """Return the calibration that the selected network description declares."""
+    """Return the variance calibration in the network description that the options select."""
     if isinstance(options, Moge2Options):
         description = load_description(MOGE_2)
     elif provider in ("onnx", "onnx-joint") and isinstance(options, OnnxOptions):

@@ -1,6 +1,7 @@
 """Providers of depth and normals from networks in ONNX files.
 
-Plugins derive from the ``Described...`` classes and pass a description of their network.
+Other plugins derive their providers from the classes ``Described...``, and pass a description of
+their network.
 """
 
 from __future__ import annotations
@@ -109,7 +110,7 @@ class DescribedJoint(DescribedDepth):
 
 
 class OnnxDepth(DescribedDepth):
-    """Provider of depth from the network that the options name."""
+    """Provider of depth from the network that the option ``description`` names."""
 
     def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
         description = load_description(options.description)
@@ -131,7 +132,7 @@ class Moge2Normals(DescribedNormals):
 
 
 class OnnxNormals(DescribedNormals):
-    """Provider of normals from the network that the options name."""
+    """Provider of normals from the network that the option ``description`` names."""
 
     def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
         description = load_description(options.description)
@@ -139,7 +140,7 @@ class OnnxNormals(DescribedNormals):
 
 
 class OnnxJoint(DescribedJoint):
-    """Provider of depth and normals from the network that the options name."""
+    """Provider of depth and normals from the network that the option ``description`` names."""
 
     def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
         description = load_description(options.description)
@@ -161,13 +162,13 @@ def _mask(outputs: Outputs, answer: NetworkOutput) -> Bool | None:
 
 
 def _factor(rule: DepthOutput, answer: NetworkOutput, camera: PinholeCamera) -> float:
-    """Compute the factor of depth from the focal length and the predicted metric scale."""
+    """Compute the factor that corrects depth for focal length and predicted metric scale."""
     resized, factor = camera.resized(*answer.canvas.image), 1.0
     if rule.canonical_focal is not None:
         sides = zip(answer.canvas.image, camera.size, strict=True)
         scale = max(
             resized_side / side for resized_side, side in sides
-        )  # the other side of the resized image is rounded
+        )  # rounding changes the scale of the other side
         factor *= (camera.fx + camera.fy) / 2 * scale / rule.canonical_focal
     if rule.assumed_focal is not None:
         factor *= resized.fx / answer.numbers[rule.assumed_focal]

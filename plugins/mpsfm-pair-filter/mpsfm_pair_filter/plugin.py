@@ -12,8 +12,8 @@ from mpsfm_core import hookimpl
 from mpsfm_core.data.errors import InputError
 
 SCORES_VARIABLE = "MPSFM_PAIR_SCORES"
-"""Environment variable with the path of a CSV file of image, image, score. If this variable is not
-set, no pair is removed.
+"""Environment variable with the path of a CSV file of image pairs and scores. If the environment
+variable is not set, no image pair is removed.
 """
 THRESHOLD_VARIABLE = "MPSFM_PAIR_MIN_SCORE"
 """Environment variable with the minimum score of an image pair."""

@@ -12,8 +12,8 @@ from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.data.options import Options, SettingsError, parse_settings
 
 MAX_TASKS = 50_000
-"""Maximum number of Ray tasks per extraction step. If a step has more items, several items share a
-task. [ours]"""
+"""Maximum number of Ray tasks per extraction step. If an extraction step has more images or pairs,
+several of them share a Ray task. [ours]"""
 
 
 class RayOptions(Options):
@@ -28,7 +28,7 @@ class RayOptions(Options):
 
 
 class RayExecutor:
-    """Executor that stores a step once in Ray's object store, and runs its items as tasks."""
+    """Executor that stores an extraction step in Ray's object store, and runs items as tasks."""
 
     def __init__(self, options: Mapping[str, Any]) -> None:
         """Connect to the Ray cluster, or start workers on this machine.
@@ -55,7 +55,7 @@ class RayExecutor:
             raise ConfigError(f"no Ray workers at {where}: {error}") from error
 
     def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
-        """Run a step on all items, see :meth:`mpsfm_core.providers.Executor.run`."""
+        """Run an extraction step on all images or pairs, see ``mpsfm_core.providers.Executor``."""
         size = 1 + len(items) // MAX_TASKS
         parts = [list(items[n : n + size]) for n in range(0, len(items), size)]
         shared = ray.put(step)

@@ -24,8 +24,8 @@ TIMELINE = "step"
 class RerunViewer:
     """Viewer that writes the recording ``OUTPUT/scene.rrd``.
 
-    Each scene is a step of the timeline ``step``. If ``z_is_up`` is set, the world is recorded with
-    z up. If ``z_is_up`` is False, y is down, as in the camera frame.
+    Each recorded scene is a step of rerun's timeline ``step``. If ``z_is_up`` is set, the world is
+    recorded with z up. If ``z_is_up`` is False, y is down, as in the camera frame.
     """
 
     def __init__(self, output: Path, pictures: Pictures, z_is_up: bool = False) -> None:
@@ -42,7 +42,7 @@ class RerunViewer:
 
     @hookimpl
     def mpsfm_scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """Record the current scene as a step of the timeline."""
+        """Record the current scene as a step of rerun's timeline."""
         self.show(scene())
 
     @hookimpl
@@ -56,7 +56,7 @@ class RerunViewer:
         self._recording.log("log", rerun.TextLog(f"{name}: {text}", level=rerun.TextLogLevel.WARN))
 
     def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
-        """Record the next step. Depth maps become points unless a ``cloud`` is given."""
+        """Record a scene as next step, with points from depth maps unless ``cloud`` is given."""
         self._step += 1
         self._recording.set_time(TIMELINE, sequence=self._step)
         names = {image.name for image in scene.images}

@@ -37,7 +37,7 @@ class Appearance:
         self._phases = rng.uniform(0, 2 * np.pi, options.dimensions)
 
     def describe(self, view: View) -> Float32:
-        """Compute a descriptor (dimensions + 1024,) of unit norm, or less without keypoints."""
+        """Compute a descriptor (dimensions + 1024,) of norm 1, or less than 1 without keypoints."""
         colours = np.sqrt(self._color_share) * _colours(view)
         local = np.sqrt(1 - self._color_share) * self._local(view)
         return np.concatenate([local, colours]).astype(np.float32)

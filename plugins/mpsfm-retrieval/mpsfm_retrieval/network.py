@@ -18,7 +18,8 @@ _INPUTS = {
         mean=_MEAN,
         std=_STD,
         interpolation="cubic",
-        # Classification networks see the 224 x 224 center, which shows only a part of the image.
+        # DINOv2's own preprocessing crops the 224 x 224 center, which shows only a part of the
+        # image.
         size=SideSize(mode="longest", side=336, multiple_of=14),
     ),
     "eigenplaces": ImageInput(

@@ -36,9 +36,9 @@ class AppearanceOptions(Options):
     resize: int = Field(640, ge=32)
     """Longer side of the resized image in pixels for SIFT. Images are never enlarged."""
     dimensions: int = Field(4096, ge=16)
-    """Number of random Fourier features, the length of the local part of the descriptor."""
+    """Number of random Fourier features, which represent the SIFT features in the descriptor."""
     sharpness: float = Field(15.0, gt=0)
     """Parameter of the kernel ``exp(-sharpness |x - y|^2)`` of two unit SIFT descriptors x, y."""
     color_share: float = Field(0.3, ge=0, lt=1)
-    """Weight of the color histogram in the similarity. The SIFT features have the remaining
-    weight."""
+    """Weight of the color histogram in the similarity of two images. The SIFT features have the
+    remaining weight."""

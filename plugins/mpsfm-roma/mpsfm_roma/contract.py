@@ -49,14 +49,14 @@ roma (float[b,3,h,w] im_A, float[b,3,h,w] im_B) => (
 
 
 def dense(folder: Path) -> ContractSetup:
-    """Write a symmetric replacement network, and match every position of its coarse grid."""
+    """Write RoMa's symmetric replacement network, and match all positions of its coarse warp."""
     return ContractSetup(
         options={**_stand_in(folder), "cell": 1, "min_certainty": 0.5}, truth_source="image"
     )
 
 
 def sparse(folder: Path) -> ContractSetup:
-    """Write the replacement network, with a snap distance that fits its coarse grid."""
+    """Write RoMa's replacement network, and match keypoints within 3 pixels of the warp."""
     return ContractSetup(
         options={**_stand_in(folder), "snap_px": 3.0, "min_certainty": 0.5}, truth_source="image"
     )

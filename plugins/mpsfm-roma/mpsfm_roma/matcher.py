@@ -23,7 +23,7 @@ from mpsfm_roma.options import DenseSearch, SparseSearch
 
 
 class DenseMatcher:
-    """Dense matcher that samples positions of the warp with a high certainty."""
+    """Dense matcher that samples positions of RoMa's warp with a high certainty."""
 
     network: ClassVar[Callable[..., WarpNetwork]] = OnnxWarpNetwork
 
@@ -38,7 +38,7 @@ class DenseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Return matches from a to b and, for a symmetric model, also from b to a."""
+        """Match two views by the warp from a to b and, for a symmetric model, from b to a."""
         there, back = self._network.warps(view_a, view_b)
         xy_a, xy_b, scores = self._thinned(there)
         if back is not None:
@@ -57,7 +57,7 @@ class DenseMatcher:
 
 
 class SparseMatcher:
-    """Sparse matcher of keypoints that the warp maps close to each other."""
+    """Sparse matcher of keypoints that RoMa's warp maps close to each other."""
 
     network: ClassVar[Callable[..., WarpNetwork]] = OnnxWarpNetwork
 
@@ -88,7 +88,7 @@ class SparseMatcher:
     def _snapped(self, warp: Warp, xy: Float64, others: Float64) -> tuple[Int64, Float32]:
         """Find pairs (m, 2) of a keypoint and the nearest keypoint to its warped position.
 
-        A pair is accepted if their distance is small and no other keypoint is warped closer.
+        A keypoint pair is accepted if its distance is small and no other keypoint is warped closer.
         """
         if not (len(xy) and len(others)):
             return np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.float32)

@@ -62,7 +62,7 @@ class WarpNetwork(ABC):
         """
 
     def warps(self, view_a: View, view_b: View) -> tuple[Warp, Warp | None]:
-        """Compute the warp from a to b and, for a symmetric model, from b to a."""
+        """Compute the warp from view a to b and, for a symmetric model, from view b to a."""
         warp, certainty, symmetric = self.answer(view_a, view_b)
         half = warp.shape[1] // 2 if symmetric else warp.shape[1]
         there = _warp(view_a, view_b, warp[:, :half, 2:], certainty[:, :half])

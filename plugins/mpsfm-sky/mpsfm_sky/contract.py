@@ -21,7 +21,7 @@ sky (float[b,3,h,w] image) => (float[b,1,h,w] d0)
 
 
 def network(folder: Path) -> ContractSetup:
-    """Write a network that masks the pixels of test images without depth."""
+    """Write a sky network that masks the pixels of test images that have no depth."""
     path = save_model(_PAINTED_SKY, folder / "sky.onnx")
     return ContractSetup(
         options={"model": str(path), "network": "skysegsmall"}, truth_source="painted"

@@ -26,8 +26,8 @@ _INPUTS = {
 class SkyNetwork:
     """Network with one image as input and the sky probability as first output.
 
-    The reference implementation stretches each output to 0..1, which finds sky in images without
-    sky. This provider uses the probability without stretching.
+    The reference implementation stretches the output range of each image to 0..1, which finds sky
+    in images without sky. This provider uses the probability without stretching.
     """
 
     def __init__(self, options: SkyOptions, context: ProviderContext) -> None:

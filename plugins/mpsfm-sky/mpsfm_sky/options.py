@@ -32,7 +32,7 @@ class SkyOptions(Options):
 class SimpleSkyOptions(Options):
     """Options of the rule-based sky mask, which needs no network.
 
-    All defaults were tuned on the images of the README.
+    All defaults were tuned on the images that the README lists.
     """
 
     brightness: float = Field(0.6, ge=0, le=1)
@@ -42,7 +42,7 @@ class SimpleSkyOptions(Options):
     blueness: float = Field(0.1, ge=0, le=1)
     """Minimum difference of blue minus red (0..1) of darker sky."""
     roughness: float = Field(0.02, gt=0)
-    """Maximum difference in brightness (0..1) between adjacent sky pixels, in an image of 256
-    pixels."""
+    """Maximum difference in brightness (0..1) between adjacent sky pixels, after resizing the image
+    to a longer side of 256 pixels."""
     min_share: float = Field(0.005, ge=0, le=1)
     """Minimum area of a sky region relative to the area of the image."""

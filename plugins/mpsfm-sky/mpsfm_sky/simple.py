@@ -16,7 +16,7 @@ _CLEARANCE = 3
 
 
 class SimpleSky:
-    """Mask of sky-like regions at the upper image border, which may include white walls."""
+    """Provider of a mask of sky-like regions at the upper image border, even white walls."""
 
     def __init__(self, options: SimpleSkyOptions, context: ProviderContext) -> None:
         self._options = options
@@ -33,7 +33,7 @@ class SimpleSky:
         above = np.intersect1d(large[large > 0], labels[0])
         core = np.isin(labels, above).astype(np.uint8)
         inner = cv2.dilate(core, kernel, iterations=2) & likely
-        sky = cv2.dilate(inner, kernel)  # the sky pixels next to the skyline are never smooth
+        sky = cv2.dilate(inner, kernel)  # sky pixels at the skyline exceed ``roughness``
         keep: Bool = resize_map(sky, *view.camera.size) <= 0.5
         return keep
 

@@ -62,7 +62,7 @@ def efficient_loftr(folder: Path) -> ContractSetup:
 
 
 def dino(folder: Path) -> ContractSetup:
-    """Write a DINOv2 of a few random layers, which suffice to distinguish two scenes."""
+    """Write a DINOv2 with a few random layers, which distinguish two scenes well enough."""
     return ContractSetup(
         options={"model": str(stand_in.dino(folder / "dino"))}, truth_source="none"
     )

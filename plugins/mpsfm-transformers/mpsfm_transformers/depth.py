@@ -23,14 +23,15 @@ _PROMPTED = "prompt_depth_anything"
 _FARTHEST_M = 250.0
 """Maximum depth in meters that Depth Pro predicts. [reference]"""
 _NO_SPREAD_M = 1e-6
-"""Offset of one pixel, in meters, in constant sensor depth, which the library cannot normalize."""
+"""Offset in meters that is added to one pixel of constant sensor depth, because the library
+transformers cannot normalize a constant."""
 
 _METRIC = ("glpn", "zoedepth", "tipsv2_dpt")
 """Values of ``model_type`` in ``config.json`` of models that predict meters."""
 
 
 class HubDepth:
-    """Provider of depth at the resolution of the network output."""
+    """Provider of depth from a Hub model, at the resolution of the network output."""
 
     def __init__(self, options: DepthOptions, context: ProviderContext) -> None:
         self._model = LoadedModel(AutoModelForDepthEstimation, options, context)
@@ -85,13 +86,14 @@ class PromptDepth:
             directory=options.directory,
             suffix=options.suffix,
             scale=options.scale,
-            relative_std=1.0,  # avoids warnings about unused depth maps
+            relative_std=1.0,  # avoids transformers' warnings about unused depth maps
         )
         self._sensor = DepthFiles(files, context)
         self._preparation: Preparation = preparation_for(self._model)
 
     def predict(self, view: View) -> DepthPrior:
-        """Predict metric depth. All pixels are invalid if there is no sensor depth."""
+        """Predict metric depth. All pixels of the prior are invalid if the view has no sensor
+        depth."""
         sensor = self._sensor.predict(view)
         if not sensor.valid.any():
             return sensor
@@ -104,7 +106,7 @@ class PromptDepth:
 
 
 def resolve_output(config: Any, options: DepthOptions) -> tuple[Output, bool]:
-    """Return the kind of a model's output, and True if its depth is metric.
+    """Return whether a model predicts depth or disparity, and True if its depth is metric.
 
     The options of the user have priority over the table of known models, and the table over the
     model configuration.
@@ -134,7 +136,7 @@ def _inverse(inverse: Float64, metric: bool, smallest: float = 0.0) -> DepthPrio
 
 
 def _without_holes(sensor: DepthPrior) -> Float32:
-    """Fill invalid pixels with the nearest valid depth, such that the result is not constant."""
+    """Fill invalid pixels with the nearest valid depth, and avoid a constant depth map."""
     nearest = distance_transform_edt(~sensor.valid, return_distances=False, return_indices=True)
     filled: Float32 = sensor.depth[tuple(nearest)]
     if filled.min() == filled.max():

@@ -26,8 +26,8 @@ class LoadedModel:
     one folder.
 
     Raises:
-        WeightsError: A file is missing or damaged, belongs to another architecture, or requires
-            code of its repository.
+        WeightsError: A model file is missing or damaged, belongs to another architecture, or
+            requires code of the model repository.
     """
 
     def __init__(

@@ -35,9 +35,9 @@ class _Paired(EfficientLoFTRForKeypointMatching):  # transformers is untyped
 
 
 class EfficientLoftrMatcher:
-    """Dense matcher with positions in COLMAP pixels.
+    """Dense matcher by Efficient LoFTR, with match positions in COLMAP pixels.
 
-    Both views are placed at the upper left of images of one size.
+    Both views are placed at the upper left of input images of equal size.
     """
 
     def __init__(self, options: EfficientLoftrOptions, context: ProviderContext) -> None:
@@ -54,7 +54,7 @@ class EfficientLoftrMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match two views at subpixel accuracy, with the coarse score as score."""
+        """Match two views at subpixel accuracy, with LoFTR's coarse scores as match scores."""
         views = (view_a, view_b)
         sizes = [network_size(view, self._longest, _MULTIPLE) for view in views]
         canvas = max(width for width, _ in sizes), max(height for _, height in sizes)
@@ -81,7 +81,7 @@ class EfficientLoftrMatcher:
     def _pair(
         self, views: tuple[View, View], sizes: list[tuple[int, int]], canvas: tuple[int, int]
     ) -> torch.Tensor:
-        """Stack two views in one tensor (1, 2, 3, h, w), each at the upper left."""
+        """Stack two views in one tensor (1, 2, 3, h, w), each at the upper left of its image."""
         images = torch.zeros(1, 2, 3, canvas[1], canvas[0], device=self._model.device)
         for side, (view, (width, height)) in enumerate(zip(views, sizes, strict=True)):
             images[0, side, :, :height, :width] = gray_image(

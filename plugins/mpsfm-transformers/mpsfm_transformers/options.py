@@ -18,13 +18,13 @@ FILES = (CONFIG, PROCESSOR, WEIGHTS)
 Output = Literal["depth", "disparity"]
 
 METRIC = DepthCalibration(std_scale=1.0, relative_std=0.079)
-"""Calibration of models that predict meters.
+"""Variance calibration of depth models that predict meters.
 [reference, for Depth Anything V2 of size L on Virtual KITTI]"""
 DEPTH_PRO = DepthCalibration(std_scale=1.0, relative_std=0.0875)
-"""Calibration of Depth Pro. [reference]"""
+"""Variance calibration of Depth Pro. [reference]"""
 RELATIVE = DepthCalibration(std_scale=1.0, relative_std=0.16, shift_space="disparity")
-"""Calibration of models with relative depth. The std is twice that of metric models because of the
-unknown shift.
+"""Variance calibration of models that predict depth of unknown scale and shift. The depth std is
+twice that of metric models because of the unknown shift.
 """
 
 
@@ -62,7 +62,7 @@ KNOWN = (
     KnownModel("facebook/dinov2-*", "Apache-2.0"),
     KnownModel("facebook/dinov3-*", "DINOv3 License"),
 )
-"""Table of known models. The first matching entry applies."""
+"""Table of known models. The first entry whose pattern matches the model name applies."""
 
 
 def look_up_model(model: str) -> KnownModel:
@@ -154,7 +154,7 @@ class SparseOptions(HubOptions):
     """Options that LightGlue and SuperGlue share."""
 
     min_score: float | None = Field(None, ge=0, lt=1)
-    """Minimum score of a match. null selects the threshold of the model."""
+    """Minimum score of a match. null selects the threshold in the model's ``config.json``."""
 
 
 class LightGlueOptions(SparseOptions):
@@ -194,5 +194,5 @@ class DinoOptions(HubOptions):
 
 
 def hub_files(options: HubOptions) -> tuple[WeightsFile, ...]:
-    """Return the model files that the options select, with hash and license."""
+    """Return the model files on the Hub or on disk that the options select."""
     return options.files()

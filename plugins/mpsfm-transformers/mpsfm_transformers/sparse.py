@@ -56,7 +56,7 @@ class GivenKeypointsMatcher:
         """Match the features of two views, and return mutual matches with confidence scores.
 
         Raises:
-            ProviderError: The descriptors do not have the dimension that this network requires.
+            ProviderError: The descriptors do not have the dimension that this matcher requires.
         """
         features = require_features(f"{self.name} matches features", features_a, features_b)
         for view, one in zip((view_a, view_b), features, strict=True):
@@ -73,7 +73,7 @@ class GivenKeypointsMatcher:
         size_only = torch.empty(1, device=self._model.device).expand(1, 2, 1, height, width)
         with inference():
             prediction = self._model.network(size_only)
-        # shape (1, 2, n), or (2, n) for LightGlue without early stopping
+        # The match indices have shape (1, 2, n), or (2, n) for LightGlue without early stopping.
         partners, scores = (
             tensor.reshape(2, -1)[0, : len(features[0])].cpu().numpy()
             for tensor in (prediction.matches, prediction.matching_scores)
@@ -133,10 +133,10 @@ class SuperGlueMatcher(GivenKeypointsMatcher):
 
 
 def _to_first_view_pixels(xy: Float64, view: View, first: View) -> Float64:
-    """Transform keypoints of a view for the normalization by the size of the first view.
+    """Transform keypoints so that normalization by the first view's size fits their own view.
 
-    The network normalizes the keypoints of both views by one image size, with half of the longer
-    side as unit and integer pixel centers.
+    The matching network normalizes the keypoints of both views by one image size, with half of the
+    longer side as unit and integer pixel centers.
     """
     view_size, first_size = np.array(view.camera.size), np.array(first.camera.size)
     moved: Float64 = (xy - 0.5 - view_size / 2) * (

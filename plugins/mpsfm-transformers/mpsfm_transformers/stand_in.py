@@ -268,7 +268,7 @@ def _save(
     """Save random weights of an architecture in the published file format.
 
     ``noise`` is the shape of a random input that initializes the batch normalization statistics.
-    Without ``noise``, deep random layers have a constant output.
+    Without this initialization, deep random layers have a constant output.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with torch.random.fork_rng(), quiet():
@@ -279,7 +279,7 @@ def _save(
                 torch.nn.init.xavier_uniform_(parameter, 0.1 if len(parameter) == 1 else 1.0)
             elif parameter.numel() > 1:
                 torch.nn.init.uniform_(parameter, 0.0, 0.4)
-            else:  # bias of the last layer: depth, or angle of view in degrees
+            else:  # last layer's bias (depth or angle of view in degrees)
                 torch.nn.init.constant_(parameter, _ANGLE_DEG if "fov" in name else 1.0)
         _see(model, noise)
         model.save_pretrained(folder)

@@ -19,8 +19,8 @@ from mpsfm_core.geometry import camera_center
 from mpsfm_core.report.viewing import ColoredPoints, Pictures, unproject_depth_map
 
 PORT_VARIABLE = "MPSFM_VIEWER_PORT"
-"""Environment variable with the port of the page. If the port is taken, the next free one is
-used."""
+"""Environment variable with the port of the page. If the port is taken, the viewer uses the next
+free port."""
 HOST_VARIABLE = "MPSFM_VIEWER_HOST"
 """Environment variable with the host address. 0.0.0.0 allows access from other machines."""
 _LEAST_SECONDS = 1.0
@@ -81,7 +81,7 @@ class ViserViewer:
             self._state.content = f"{stage}: {done} of {total}"
 
     def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
-        """Replace the shown scene. A dense ``cloud`` replaces the points of the depth maps."""
+        """Show a new scene, with the points of ``cloud`` or else of the depth maps."""
         with self._lock, self.server.atomic():
             self._unit = _unit(scene)
             while self.clouds:

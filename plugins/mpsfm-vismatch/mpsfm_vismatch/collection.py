@@ -33,7 +33,7 @@ def load(name: str, context: ProviderContext, max_keypoints: int = 2048) -> Any:
 
 
 def provide_imports(matcher: Any) -> AbstractContextManager[Any]:
-    """Return a context manager with the import path that the code of a matcher expects."""
+    """Return a context manager that sets the import path for the code of a vismatch matcher."""
     home = type(matcher).__module__
     if not home.startswith("vismatch."):
         return nullcontext()
@@ -44,7 +44,7 @@ def provide_imports(matcher: Any) -> AbstractContextManager[Any]:
 
 
 def get_inner_network(matcher: Any, name: str, *attributes: str) -> Any:
-    """Return the inner network of a matcher, from the first of ``attributes`` that exists."""
+    """Return the network inside a vismatch matcher, the first of ``attributes`` that exists."""
     for attribute in attributes:
         if hasattr(matcher, attribute):
             return getattr(matcher, attribute)

@@ -21,7 +21,7 @@ def vismatch(folder: Path) -> ContractSetup:
 
 
 def vismatch_sparse(folder: Path) -> ContractSetup:
-    """Return the matcher ``sift-nn``, or a patch matcher, for given keypoints."""
+    """Return options that match given keypoints by ``sift-nn``, or by a patch matcher."""
     options = {"network": _REAL} if find_spec("vismatch") else _SMALL
     return ContractSetup(options={**options, "snap_px": 3.0}, truth_source="image")
 
@@ -33,7 +33,7 @@ def vismatch_roma(folder: Path) -> ContractSetup:
 
 
 def vismatch_roma_sparse(folder: Path) -> ContractSetup:
-    """Return a patch matcher with RoMa's warp for given keypoints and a large snap distance."""
+    """Return a patch matcher with RoMa's warp that accepts keypoints within 3 pixels of it."""
     options = {"network": f"{_STAND_IN}:Warping", "snap_px": 3.0, "min_certainty": 0.5}
     return ContractSetup(options=options, truth_source="image")
 

@@ -25,12 +25,12 @@ _STD_DETECTED_PX, _STD_DENSE_PX = 1.0, 0.5
 """Std of keypoints in pixels of the resized image, for detectors and for dense networks."""
 _OF_CORNERS = ("roma", "redimatch", "gim-dkm", "loftr", "xoftr", "aspanformer", "matchformer")
 _OF_CORNERS += ("topicfm", "edm", "matchanything", "dedode", "steerers", "loma")
-"""Parts of the names of networks whose positions are relative to the image size, as COLMAP's
-pixels. The pixels of all other networks have the center of the first pixel at (0, 0).
+"""Substrings of the names of networks with COLMAP's pixel convention, the center of the first pixel
+at (0.5, 0.5). All other networks have the center of the first pixel at (0, 0).
 """
 _OF_OPENCV = ("sift", "doghardnet-lightglue")
-"""Parts of the names of matchers with OpenCV's SIFT. OpenCV doubles the image for SIFT, so
-positions are a quarter pixel too small.
+"""Substrings of the names of matchers with OpenCV's SIFT. OpenCV doubles the image for SIFT, so
+keypoint positions are a quarter pixel too small.
 """
 
 
@@ -39,7 +39,7 @@ class DenseMatcher:
 
     def __init__(self, options: CollectionOptions, context: ProviderContext) -> None:
         self._matcher = load(options.network, context, options.max_keypoints)
-        self._matcher.skip_ransac = True  # without this setting, vismatch fits a homography
+        self._matcher.skip_ransac = True  # vismatch's RANSAC fits a homography
         self._resize, self._seed = options.resize, context.seed
         self._first = _first_pixel(options.network)
 
@@ -50,7 +50,7 @@ class DenseMatcher:
         features_a: Features | None = None,
         features_b: Features | None = None,
     ) -> PairMatches:
-        """Match two views, without given keypoints."""
+        """Match two views by a vismatch network, ignoring any given features."""
         return PairMatches(dense=self._matched(view_a, view_b))
 
     def _matched(self, *views: View) -> DenseMatches:

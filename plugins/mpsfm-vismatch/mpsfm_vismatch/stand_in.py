@@ -17,13 +17,13 @@ positions in half-size images.
 _GRID = (42, 56)
 """Rows and columns of the warp that :class:`Warping` returns."""
 _FLAT = 0.05
-"""Contrast at which a patch counts half as noise and half as texture."""
+"""Contrast of a patch at which its descriptor has half of the unit length."""
 
 
 def _described(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Compute patch descriptors (h * w, d) and contrast (h * w,) of an image (1, 3, h, w).
 
-    Descriptors are unit vectors, and shorter in flat regions.
+    Patch descriptors have nearly unit length, and less in flat regions.
     """
     around = unfold(image, _SIDE, dilation=_REACH, padding=_SIDE // 2 * _REACH)[0].T
     around = around - around.mean(dim=1, keepdim=True)
@@ -32,7 +32,7 @@ def _described(image: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 class Warping:
-    """Replacement of vismatch's RoMa matcher, which is also its own inner network."""
+    """Replacement of vismatch's RoMa matcher and of the RoMa network inside this matcher."""
 
     symmetric = True
 
@@ -40,7 +40,7 @@ class Warping:
         self.roma_model = self
 
     def match(self, path_a: str, path_b: str, device: str) -> tuple[torch.Tensor, torch.Tensor]:
-        """Compute the warp and its certainty on a coarse grid in both directions."""
+        """Compute warps in both directions and their certainty, on a coarse grid of both images."""
         height, width = _GRID
         a, b = (_described(_opened(path, (width, height)))[0] for path in (path_a, path_b))
         similarity = a @ b.T
@@ -56,14 +56,15 @@ class Warping:
 
 
 class Pointing:
-    """Replacement of vismatch's MASt3R matcher. Its points are colors in front of the camera."""
+    """Replacement of vismatch's MASt3R matcher. The predicted 3D points are pixel colors, shifted
+    in front of the camera."""
 
     def __init__(self, device: str = "cpu", max_num_keypoints: int = 2048) -> None:
         self.model = torch.nn.Module()
         self.model.forward = self.forward  # type: ignore[method-assign]
 
     def forward(self, *views: dict[str, Any]) -> list[dict[str, torch.Tensor]]:
-        """Compute points, descriptors and confidences of both views."""
+        """Compute MASt3R's outputs for both views: points, descriptors and confidences."""
         answers = []
         for view, name in zip(views, ("pts3d", "pts3d_in_other_view"), strict=True):
             image = view["img"]
