@@ -1,15 +1,15 @@
 """Detection of misregistered images: more matches contradict their pose than support it.
 
-A match is explained if both keypoints observe the same 3D point. If hardly any match of a pair of
-registered images is explained, the matches are wrong or one image is misregistered. Three cases
-count as evidence for misregistration:
+A match is explained if both of its keypoints observe the same 3D point. If hardly any match of a
+pair of registered images is explained, the matches are wrong or one image is misregistered.
+Misregistered images are detected in three ways.
 
-1. A pair has more unexplained matches than the explained matches that connect its images along all
-   paths. This is a minimum cut of the match graph (max-flow min-cut). The images on the smaller
-   side of the cut may be misregistered.
-2. The same for two images that both match a third image which cannot be registered: at most one of
-   the two can be correct.
-3. The unexplained matches of all pairs of one image clearly outnumber its explained matches.
+1. An image pair has more unexplained matches than the maximum flow of explained matches between its
+   images. The images on the smaller side of the minimum cut may be misregistered.
+2. Two images match a third image which cannot be registered, so at most one of the two has a
+   correct pose. Their matches with the third image count as unexplained matches between them.
+3. The unexplained matches of one image clearly outnumber its explained matches, summed over all
+   pairs.
 """
 
 from __future__ import annotations
@@ -29,38 +29,39 @@ from mpsfm_core.data import Bool, Int64
 from mpsfm_core.mapping.scene.scene import Scene
 
 MAX_EXPLAINED_RATIO = 0.25
-"""Share of explained matches up to which a pair contradicts the poses of its images. For correct
-poses the share is well above 0.5. [ours]"""
+"""Share of the matches of a pair whose keypoints observe the same 3D point, up to which the matches
+contradict the poses of both images. Correct poses have a share well above 0.5. [ours]"""
 MIN_SIGNIFICANCE = 0.5
-"""Excess of contradicting matches of one image, in standard deviations of the sum if each pair
-supported or contradicted its pose at random. [tuned: benchmarks.symmetry]"""
+"""Minimum excess of the matches that contradict the pose of an image over those that support it, in
+standard deviations of the excess for random pairs. [tuned: benchmarks.symmetry]"""
 
 
 class Misregistration(NamedTuple):
     """Images that may be misregistered together."""
 
     images: tuple[int, ...]
-    """The images, which are the smaller side of a cut."""
+    """Indices of the misregistered images, which are the smaller side of a cut of the match
+    graph."""
     supporting_pairs: Int64
-    """(k, 2) pairs of one of them and another image whose matches support the present poses."""
+    """(k, 2) pairs of a misregistered and another image whose matches support the present poses."""
     margin: int
-    """Number of contradicting matches minus number of supporting matches."""
+    """Number of matches that contradict the poses, minus number of matches that support them."""
     splits: bool = False
-    """True if one pair connects the images to the model and several contradict it. The images then
-    leave the model if they cannot be registered in another pose."""
+    """True if one pair connects the images to the model and several pairs contradict this
+    connection. The images are then deregistered if no other poses are found for them."""
 
 
 class ContradictedCut(NamedTuple):
-    """Cut of the model whose matches mostly contradict the poses."""
+    """Cut of the match graph into two parts whose common matches mostly contradict the poses."""
 
     inside: Bool
-    """(n,) bool, images of the smaller part."""
+    """(n,) bool mask of the images in the smaller part of the cut match graph."""
     margin: int
-    """Number of contradicting matches minus number of explained matches across the cut."""
+    """Number of contradicting matches across the cut, minus number of explained matches."""
     num_supporting_pairs: int
-    """Pairs across the cut with explained matches."""
+    """Number of image pairs across the cut with explained matches."""
     num_contradicting_pairs: int
-    """Pairs across the cut whose matches contradict the poses."""
+    """Number of image pairs across the cut whose matches contradict the poses."""
 
 
 def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistration]:
@@ -71,7 +72,8 @@ def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistrat
         min_matches: Smallest number of matches of a pair that can contradict poses.
 
     Returns:
-        The groups, the largest margin first.
+        Sets of images that may be misregistered together, the largest excess of contradicting
+        matches first.
     """
     matches, explained = count_pair_matches(scene)
     is_explained = explained > MAX_EXPLAINED_RATIO * matches
@@ -113,7 +115,7 @@ def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistrat
 
 
 def count_pair_matches(scene: Scene) -> tuple[Int64, Int64]:
-    """Count the matches and the explained matches of each two images, both (n, n)."""
+    """Count the matches (n, n) and the explained matches (n, n) of each two images."""
     graph, n = scene.graph, scene.num_images
     a, b = graph.image_of[graph.source], graph.image_of[graph.target]
     pairs = a * n + b
@@ -127,13 +129,14 @@ def count_pair_matches(scene: Scene) -> tuple[Int64, Int64]:
 def compute_widest_paths(capacities: Int64) -> Int64:
     """Compute the capacity of the widest path between each two nodes (Kruskal's algorithm).
 
-    The capacity of a path is that of its narrowest edge. It is a lower bound of the maximum flow.
+    The capacity of a path is the smallest capacity of its edges, and a lower bound of the maximum
+    flow.
 
     Args:
         capacities: (n, n) symmetric capacities of the edges, 0 without an edge.
 
     Returns:
-        (n, n) symmetric, 0 for nodes that are not connected.
+        (n, n) symmetric path capacities, 0 for nodes that are not connected.
     """
     widest = np.zeros_like(capacities)
     component = [np.array([node]) for node in range(len(capacities))]
@@ -162,7 +165,7 @@ def _find_contradicted_images(
         explained: (n, n) explained matches.
 
     Returns:
-        The images, each with its excess of contradicting matches.
+        Images, each with its excess of contradicting matches.
     """
     contradicting = np.where(registered[:, None] & registered, contradicting, 0)
     margin = (contradicting - explained).sum(axis=1)
@@ -174,10 +177,11 @@ def _find_contradicted_images(
 def find_contradicted_cuts(
     registered: Bool, contradicting: Int64, explained: Int64
 ) -> list[ContradictedCut]:
-    """Find parts of the model that the matches across their cut mostly contradict.
+    """Find cuts of the match graph whose matches mostly contradict the poses of the images.
 
-    Candidates are the cuts at the edges of the maximum spanning tree of explained matches. A part
-    that one pair connects to the model is among them. All pairs across a cut count.
+    Candidates are the cuts at the edges of the maximum spanning tree of explained matches. These
+    cuts include every part of the model that a single pair connects to the rest. The matches of all
+    image pairs across a cut are counted.
 
     Args:
         registered: (n,) bool.
@@ -210,10 +214,10 @@ def find_contradicted_cuts(
 
 
 def _count_separating_matches(registered: Bool, contradicting: Int64) -> Int64:
-    """Count for each two registered images (n, n) the matches that contradict their poses.
+    """Count the matches (n, n) of each two registered images that contradict their poses.
 
-    They are the unexplained matches of the pair. If both images match an unregistered image, they
-    are the smaller one of both numbers of matches with that image.
+    The contradicting matches of a pair are its unexplained matches. If both images match an
+    unregistered image, the smaller number of matches with the unregistered image also counts.
     """
     both_registered = registered[:, None] & registered
     separating = np.where(both_registered, contradicting, 0)

@@ -1,17 +1,18 @@
 """Depth consistency of verified pairs before registration (paper section 3.4).
 
-Look-alike places give hundreds of matches that one relative pose explains. The surroundings differ,
-so the wrong pose puts surfaces where the other image sees empty space.
+Look-alike places give hundreds of matches that one relative pose explains. The surroundings of
+look-alike places differ, so a wrong relative pose puts surfaces where the other image sees empty
+space.
 
-1. The verified pose of each pair is checked for depth consistency. If it fails, the pose hypotheses
-   of its matches are checked in the order of their support.
-2. The matches of a pair are weighted by the support of the best consistent pose relative to the
-   best pose.
+1. The relative pose of each verified pair is checked for depth consistency. If this pose is
+   inconsistent, other pose hypotheses are checked in the order of their support.
+2. The matches of a pair are weighted by the support of the best depth-consistent pose, relative to
+   the best supported pose.
 3. A pair without a consistent pose may still be correct, if few or bad matches make its pose
-   inaccurate. It is removed if consistent pairs connect its images by more matches (maximum flow)
-   and imply another relative rotation.
+   inaccurate. The pair is removed if consistent pairs connect its images by more matches (maximum
+   flow) and imply another relative rotation.
 
-Pairs with fewer matches than a registration needs are not checked.
+Image pairs with fewer matches than a registration needs are not checked.
 """
 
 from __future__ import annotations
@@ -43,22 +44,24 @@ from mpsfm_core.mapping.registration.correspondences import find_correspondences
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 
 MAX_ROTATION_ERROR_DEG = 30.0
-"""Maximum angle between the rotation of a pair and the rotation that consistent pairs imply. This
-maximum allows for errors of some degrees along a chain of pairs. [ours]"""
+"""Maximum angle between the relative rotation of a pair and the relative rotation that
+depth-consistent pairs imply. The value allows for errors of some degrees along a chain of pairs.
+[ours]"""
 
 
 class PairConsistency(NamedTuple):
     """Result of the depth consistency check of one image pair."""
 
     rotation: Float64
-    """(3, 3) rotation ``b_from_a`` of the best consistent pose, or of the best pose if no pose is
-    consistent."""
+    """(3, 3) rotation ``b_from_a`` of the best depth-consistent relative pose, or of the best
+    supported pose if no pose is consistent."""
     support_ratio: float
-    """Support of the best consistent pose relative to the best pose, 0 if no pose is consistent."""
+    """Support of the best depth-consistent pose relative to the best supported pose, 0 if no pose
+    is consistent."""
 
 
 class PairConsistencyCheck:
-    """Consistency check of the pairs of a scene without registered images."""
+    """Depth consistency check of the verified pairs of a scene without registered images."""
 
     def __init__(self, pose_estimator: AbsolutePoseEstimator, options: MapperOptions) -> None:
         self._pose_estimator, self._scene = pose_estimator, pose_estimator.scene
@@ -68,11 +71,12 @@ class PairConsistencyCheck:
         )
 
     def reweight_pairs(self, problem: MappingProblem, candidates: Bool) -> MappingProblem:
-        """Return the problem with reweighted match scores and without inconsistent pairs.
+        """Return the mapping problem with reweighted match scores and without inconsistent pairs.
 
         Args:
             problem: The problem.
-            candidates: (n,) bool, images whose pairs are checked. All other pairs stay unchanged.
+            candidates: (n,) bool mask of the images whose pairs are checked. All other image pairs
+                stay unchanged.
         """
         min_matches = self._options.registration.min_inliers
         results = {
@@ -100,7 +104,7 @@ class PairConsistencyCheck:
         return replace(problem, pairs=tuple(pairs))
 
     def check_pair(self, pair: VerifiedPair) -> PairConsistency:
-        """Check a pair, whose verified pose counts as consistent if there is no pose hypothesis."""
+        """Check the depth consistency of an image pair, which passes without a pose hypothesis."""
         verified = scale_verified_pair(self._scene, pair, self._options.initialization)
         if verified is not None and self._is_consistent(verified):
             return PairConsistency(pair.rotation, 1.0)
@@ -123,7 +127,7 @@ class PairConsistencyCheck:
         return PairConsistency(_b_from_a(pair, consistent), support_ratio)
 
     def _find_best_consistent(self, hypotheses: Sequence[InitialPair]) -> InitialPair | None:
-        """Return the best supported pose that passes the depth consistency check, or None."""
+        """Return the best supported relative pose that passes the depth check, or None."""
         ranked = sorted(hypotheses, key=_get_support, reverse=True)
         return next((initial for initial in ranked if self._is_consistent(initial)), None)
 
@@ -142,7 +146,7 @@ class PairConsistencyCheck:
         return ratio <= limit
 
     def _estimate_scale(self, initial: InitialPair) -> float:
-        """Estimate the scale of the other image's depth prior from the depth of matched points."""
+        """Estimate the depth scale of the second image of a pair from matched keypoints."""
         scene, pose = self._scene, initial.pose
         correspondences = find_correspondences(
             scene, initial.image, [initial.reference], self._options.registration
@@ -158,7 +162,7 @@ class PairConsistencyCheck:
 def _average_consistent_pairs(
     rotation_of: Mapping[VerifiedPair, Float64], num_images: int
 ) -> tuple[csr_array, Float64]:
-    """Build the match graph of consistent pairs, and average their relative rotations.
+    """Build the match graph of depth-consistent pairs, and average their relative rotations.
 
     Args:
         rotation_of: Relative rotation ``b_from_a`` (3, 3) of each consistent pair.
@@ -195,5 +199,5 @@ def _b_from_a(pair: VerifiedPair, initial: InitialPair) -> Float64:
 
 
 def _scale_scores(pair: VerifiedPair, factor: float) -> VerifiedPair:
-    """Return the pair with its match scores multiplied by a factor."""
+    """Return the image pair with its match scores multiplied by a factor."""
     return pair if factor == 1.0 else replace(pair, scores=pair.scores * np.float32(factor))

@@ -1,10 +1,12 @@
 """Initialization of a component.
 
-A component starts in one of three ways, tried in this order:
+A component is initialized by the first of three methods that succeeds.
 
-1. From known poses, or from the poses of an earlier reconstruction (``seed_poses``).
-2. From the poses of all well-connected images (``global_initialization``): rotation averaging, then
-   linear scales and positions from relative poses whose lengths come from depth.
-3. From an image pair (``initial_pair``, paper section 3.1): its relative pose is estimated from
-   depth-lifted points, refined, and rejected if the depth maps contradict each other.
+1. Images with known poses are registered, also with those of an earlier reconstruction
+   (``seed_poses``).
+2. All well-connected images are registered by rotation averaging, and linear least squares for
+   depth scales and positions, from relative poses with baselines measured by depth
+   (``global_initialization``).
+3. An image pair is registered by a relative pose that is estimated from depth-lifted points, and
+   accepted if the depth maps agree (``initial_pair``, paper section 3.1).
 """

@@ -1,16 +1,17 @@
 """Global initialization: poses of all well-connected images from relative poses and depth.
 
-1. Measure for each verified pair its relative pose and, from depth, the length of its baseline.
-   Pairs whose points do not fit the depth prior get a low weight: planar scenes have a second
-   relative pose, which implies other depth.
-2. Keep the largest component of the view graph whose edges are on cycles. A bridge cannot be
-   verified by other pairs.
-3. Average rotations (IRLS with a Cauchy loss).
-4. Solve for the scales of the depth priors, then for the camera centers. Both are linear in the
-   measurements and solved by the same robust least squares.
-5. Remove the pairs that disagree with the result, and return the component that remains.
+1. Measure the baseline length of each verified pair from depth. Pairs whose triangulated points do
+   not fit the depth prior get a low weight, because planar scenes have a second, wrong relative
+   pose.
+2. Keep the largest component of the view graph whose edges are on cycles. An edge of the view graph
+   on no cycle cannot be verified by other pairs.
+3. Average the relative rotations by IRLS with a Cauchy loss.
+4. Solve for the scales of the depth priors, then for the camera centers. Both steps are linear
+   least-squares problems, solved by IRLS with a Cauchy loss.
+5. Remove the image pairs that disagree with the estimated poses, and return the poses of the
+   largest component that remains.
 
-The other images are left to incremental registration.
+Images without a global pose are registered incrementally.
 """
 
 from __future__ import annotations
@@ -34,23 +35,26 @@ from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import triangulate_midpoints
 
 MIN_ANGLE_DEG = 1.5
-"""Smallest triangulation angle of a match that measures a baseline. [COLMAP min_angle]"""
+"""Smallest triangulation angle of a match that measures the baseline of a pair. [COLMAP
+min_angle]"""
 MIN_MATCHES = 10
-"""Minimum number of matches of a pair with a triangulation angle above MIN_ANGLE_DEG. [ours]"""
+"""Minimum number of matches with a triangulation angle above MIN_ANGLE_DEG of a pair that global
+initialization uses. [ours]"""
 MAX_ROTATION_ERROR_DEG = 5.0
-"""Maximum angle between a measured and an estimated relative rotation. [ours]"""
+"""Maximum angle between the measured and the estimated relative rotation of an image pair.
+[ours]"""
 MAX_CENTER_ERROR = 0.3
-"""Maximum distance between a measured and an estimated relative camera center, relative to the
-baseline. It corresponds to direction errors of several degrees. [ours]
+"""Maximum distance between the measured and the estimated relative camera center of a pair,
+relative to its baseline. The value allows direction errors of several degrees. [ours]
 """
 PLANAR_WEIGHT = 0.1
-"""Weight of a match if a homography also explains the pair, because a planar scene has two possible
-relative poses. [tuned: benchmarks.accuracy on rendered_kitchen]
+"""Weight of each match of a pair that a homography also explains, because a planar scene has two
+possible relative poses. [tuned: benchmarks.accuracy on rendered_kitchen]
 """
 NUM_ITERATIONS = 20
-"""Number of IRLS iterations. [ours]"""
+"""Number of IRLS iterations of rotation averaging and of the linear solvers. [ours]"""
 DAMPING = 1e-9
-"""Damping of the graph Laplacian relative to its largest diagonal entry, which fixes the gauge."""
+"""Damping that fixes the gauge of the view graph's Laplacian, relative to its largest entry."""
 
 
 class GlobalPoses(NamedTuple):
@@ -85,20 +89,20 @@ class _RelativePoses(NamedTuple):
     """
 
     def select(self, rows: Bool) -> _RelativePoses:
-        """Return the relative poses of the pairs that ``rows`` (m,) selects."""
+        """Return the relative poses of the image pairs that ``rows`` (m,) selects."""
         fields: list[Any] = [values[rows] for values in self]
         return _RelativePoses(*fields)
 
 
 def estimate_global_poses(scene: Scene, candidates: Bool) -> GlobalPoses | None:
-    """Estimate the poses of the largest component of consistent pairs.
+    """Estimate the poses of the largest component of consistent image pairs.
 
     Args:
-        scene: The scene with its verified pairs, which is not changed.
-        candidates: (n,) bool, images that may be registered.
+        scene: The scene with its verified pairs, which stays unchanged.
+        candidates: (n,) bool mask of the images that may be registered.
 
     Returns:
-        The poses, or None if no pairs are consistent along cycles of the view graph.
+        Image poses, or None if no pairs are consistent along cycles of the view graph.
     """
     pairs = [p for p in scene.problem.pairs if candidates[p.image_a] and candidates[p.image_b]]
     num_images = scene.num_images
@@ -108,7 +112,7 @@ def estimate_global_poses(scene: Scene, candidates: Bool) -> GlobalPoses | None:
         return None
     rotations = average_rotations(edges.a, edges.b, edges.rotation, edges.weight, num_images)
     log_ratios = edges.log_length[:, 0] - edges.log_length[:, 1]
-    group = scene.depth_group_of  # depth priors of one group share a scale
+    group = scene.depth_group_of  # depth priors of one depth group share a scale
     group_log_scales = average_differences(
         group[edges.a], group[edges.b], log_ratios, edges.weight, num_images
     )
@@ -135,9 +139,9 @@ def average_rotations(
 ) -> Float64:
     """Average relative rotations: IRLS in the tangent space with a Cauchy loss.
 
-    The method is that of Chatterjee and Govindu, Efficient and Robust Large-Scale Rotation
-    Averaging, ICCV 2013, with a Cauchy loss. The maximum spanning tree gives the initial rotations.
-    The edges must form one connected component.
+    The rotations are averaged by IRLS as in Chatterjee and Govindu, Efficient and Robust
+    Large-Scale Rotation Averaging, ICCV 2013, but with a Cauchy loss. The maximum spanning tree
+    gives the initial rotations. The edges of the view graph must form one connected component.
 
     Args:
         a: (m,) index of the first image of each edge.
@@ -172,7 +176,7 @@ def average_differences(
         num_nodes: Number of nodes.
 
     Returns:
-        (num_nodes, ...) values with mean 0. Nodes without edges share one value.
+        (num_nodes, ...) node values with mean 0. Nodes without edges share one value.
     """
     measured = differences.reshape(len(differences), -1)
     robust_weights = np.ones(len(a))
@@ -187,7 +191,7 @@ def average_differences(
 def _solve_differences(
     a: Int64, b: Int64, differences: Float64, weights: Float64, num_nodes: int
 ) -> Float64:
-    """Solve for values (n, d) with least-squares differences, by the normal equations."""
+    """Solve for node values (n, d) by weighted linear least squares on their differences."""
     ends = np.concatenate([a, b])
     degree = np.bincount(ends, np.concatenate([weights, weights]), minlength=num_nodes)
     diagonal = degree + DAMPING * degree.max()
@@ -203,7 +207,7 @@ def _solve_differences(
 
 
 def _cauchy_weights(errors: Float64) -> Float64:
-    """Return the IRLS weights of a Cauchy loss, whose scale is the robust std of the errors."""
+    """Return IRLS weights of a Cauchy loss with the robust standard deviation as its scale."""
     scale = max(MAD_TO_STD * float(np.median(errors)), 1e-12)
     weights: Float64 = 1 / (1 + (errors / scale) ** 2)
     return weights
@@ -229,10 +233,10 @@ def _chain_rotations(
 
 
 def _measure_relative_poses(scene: Scene, pairs: list[VerifiedPair]) -> _RelativePoses:
-    """Measure the baseline of each pair by the depth priors of both images.
+    """Measure the baseline of each image pair by the depth priors of both images.
 
-    The log length is the median over the matches of ``log(depth prior / triangulated depth)``. The
-    median absolute deviation from the log length gives the Cauchy weight of the pair.
+    The log baseline is the median over the matches of ``log(depth prior / triangulated depth)``.
+    The median absolute deviation from the log baseline gives the Cauchy weight of the pair.
     """
     empty = np.zeros(0, np.int64)
     a = np.array([pair.image_a for pair in pairs], dtype=np.int64)
@@ -271,9 +275,9 @@ def _measure_relative_poses(scene: Scene, pairs: list[VerifiedPair]) -> _Relativ
 
 
 def _select_largest_cyclic_component(edges: _RelativePoses, num_images: int) -> Bool:
-    """Return (m,) True for the edges on cycles in the largest component of such edges.
+    """Return a mask (m,) of the edges on cycles in the largest component of such edges.
 
-    An edge that is on no cycle always agrees with the result, so other edges cannot verify it.
+    An edge of the view graph that is on no cycle cannot be verified by other edges.
     """
     selected = find_cycle_edges(edges.a, edges.b, num_images)
     if selected.any():
@@ -285,10 +289,10 @@ def _select_largest_cyclic_component(edges: _RelativePoses, num_images: int) -> 
 
 
 def find_cycle_edges(a: Int64, b: Int64, num_nodes: int) -> Bool:
-    """Find the edges that are not bridges, by random labels on the cycle space.
+    """Find the edges of a graph that are not bridges, by random labels on the cycle space.
 
     Each edge outside of a spanning forest has a random label, which is added by XOR along the cycle
-    that the edge closes. An edge of the forest is a bridge if its accumulated label is 0.
+    that the edge closes. A forest edge is a bridge if its accumulated label is 0.
 
     Args:
         a: (m,) index of the first node of each edge.
@@ -298,7 +302,7 @@ def find_cycle_edges(a: Int64, b: Int64, num_nodes: int) -> Bool:
     Returns:
         (m,) bool, True for edges on a cycle.
     """
-    root = num_nodes  # joins the trees of all components
+    root = num_nodes  # an extra root node joins the spanning trees of all components
     component_nodes = np.unique(label_components(a, b, num_nodes), return_index=True)[1]
     first = np.concatenate([a, component_nodes])
     second = np.concatenate([b, np.full(len(component_nodes), root)])

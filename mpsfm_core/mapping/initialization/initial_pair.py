@@ -1,8 +1,8 @@
 """Selection and relative pose of the initial image pair (paper section 3.1).
 
-If points are lifted from depth, the second image is registered like any next image, in a scene with
-one registered image. Without lifted points, the relative pose is that of the verified pair, scaled
-by depth.
+If points are lifted from depth, the second image is registered by the points of the first image.
+Without lifted points, the relative pose is that of the verified pair, and the baseline length is
+measured by depth.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from mpsfm_core.mapping.triangulation import triangulate_midpoints
 class InitialPair(NamedTuple):
     """Two images with their relative pose, from which a component is initialized.
 
-    The camera frame of the reference image is the world frame, and the unit is that of its depth
-    prior.
+    The camera frame of the reference image is the world frame, and its depth prior defines the unit
+    of length.
     """
 
     reference: int
     """Index of the image whose camera frame is the world frame."""
     image: int
-    """Index of the other image of the pair."""
+    """Index of the second image of the pair."""
     pose: ScoredPose
-    """Pose ``cam_from_world`` of the other image, with its support."""
+    """Pose ``cam_from_world`` of the second image of the pair, with its support."""
 
 
 class InitialPairSelector:
-    """Ranking of initial image pairs, which estimates the relative pose of each pair once."""
+    """Selector of initial image pairs, which estimates the relative pose of each pair once."""
 
     def __init__(self, options: MapperOptions) -> None:
         self._options = options
@@ -53,12 +53,12 @@ class InitialPairSelector:
     ) -> list[VerifiedPair]:
         """Rank the image pairs for initialization (COLMAP's ``FindInitialImagePair``).
 
-        Pairs are ranked by their number of matches. The first ``num_compared`` pairs are ranked
-        again by the support of their relative poses.
+        Image pairs are ranked by their number of matches. The first pairs are ranked again by the
+        support of their relative poses (option ``num_compared``).
 
         Args:
             pose_estimator: Pose estimator on a scene without registered images.
-            candidates: (n,) bool, images that may be part of the initial pair.
+            candidates: (n,) bool mask of the images that may be part of the initial pair.
         """
         options = self._options.initialization
         pairs = [
@@ -79,7 +79,7 @@ class InitialPairSelector:
     def estimate_pair(
         self, pose_estimator: AbsolutePoseEstimator, pair: VerifiedPair
     ) -> InitialPair | Reason:
-        """Return the best supported relative pose of a pair, or the reason of its rejection."""
+        """Return the best supported relative pose of an image pair, or its rejection reason."""
         if pair not in self._results:
             scene, options = pose_estimator.scene, self._options
             if options.registration.lifting:
@@ -93,18 +93,18 @@ class InitialPairSelector:
         return self._results[pair]
 
     def reject_pair(self, pair: VerifiedPair, reason: Reason) -> None:
-        """Record the reason why a pair cannot initialize a component."""
+        """Record the reason why an image pair cannot initialize a component."""
         self._results[pair] = reason
 
 
 def register_first_image(scene: Scene, image: int) -> None:
-    """Register an image at the origin of the world, with the unit of its depth prior."""
+    """Register an image at the world origin, so that its depth prior defines the unit."""
     scene.register(image, np.eye(3), np.zeros(3))
     scene.maps[image].set_scale(1.0)
 
 
 def rank_initial_pairs(scene: Scene) -> list[VerifiedPair]:
-    """Rank verified pairs: calibrated two-view geometries first, then by number of matches."""
+    """Rank verified pairs by calibrated two-view geometry, then by number of matches."""
     return sorted(scene.problem.pairs, key=lambda pair: (not pair.calibrated, -len(pair)))
 
 
@@ -115,13 +115,13 @@ def estimate_initial_pairs(
     *,
     refine: bool = True,
 ) -> list[InitialPair]:
-    """Estimate relative poses of a pair from depth-lifted points, for each reference image.
+    """Estimate relative poses of an image pair from depth-lifted points of either image.
 
     Args:
         pose_estimator: Pose estimator on a scene without registered images.
         pair: The verified pair.
         options: Options of the collection of 2D-3D correspondences.
-        refine: Also refine the poses by bundle adjustment.
+        refine: Also refine the relative poses by bundle adjustment.
     """
     estimate = pose_estimator.estimate_poses if refine else pose_estimator.estimate_unrefined_poses
     return [
@@ -139,7 +139,7 @@ def refine_initial_pairs(
     initial_pairs: Sequence[InitialPair],
     options: RegistrationOptions,
 ) -> list[InitialPair]:
-    """Refine relative poses of a pair by bundle adjustment, except poses that lose support."""
+    """Refine relative poses by bundle adjustment, except poses that lose support."""
     return [
         InitialPair(reference, image, pose)
         for reference, image, correspondences in _register_each_reference(
@@ -156,7 +156,7 @@ def refine_initial_pairs(
 def _register_each_reference(
     scene: Scene, pair: VerifiedPair, options: RegistrationOptions
 ) -> Iterator[tuple[int, int, PoseCorrespondences]]:
-    """Yield reference, other image and correspondences, with only the reference registered."""
+    """Yield reference image, second image and 2D-3D correspondences for either reference."""
     empty = scene.snapshot()
     for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
         register_first_image(scene, reference)
@@ -167,13 +167,13 @@ def _register_each_reference(
 def scale_verified_pair(
     scene: Scene, pair: VerifiedPair, options: InitializationOptions
 ) -> InitialPair | None:
-    """Scale the pose of a verified pair such that triangulated depth agrees with the prior.
+    """Scale the pose of a verified pair so that triangulated depth agrees with the prior.
 
-    The scale is the median over the points whose triangulation angle is at least
+    The scale is the median ratio over the points whose triangulation angle is at least
     ``high_parallax_deg``.
 
     Returns:
-        The scaled pose, or None if the pair has no translation or no such point with known depth.
+        The scaled pose, or None without a translation or a well triangulated point of known depth.
     """
     length = np.linalg.norm(pair.translation)
     if length < 1e-12:
@@ -202,6 +202,6 @@ def scale_verified_pair(
         "verified pair",
         support=float(num_points),
         num_inliers=num_points,
-        inlier_ratio=1.0,  # geometric verification has removed the outliers
+        inlier_ratio=1.0,  # geometric verification has removed outlier matches
     )
     return InitialPair(pair.image_a, pair.image_b, pose)

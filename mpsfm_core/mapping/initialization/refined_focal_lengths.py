@@ -1,4 +1,4 @@
-"""Refined focal lengths: a run that corrects guesses by much initializes the next run."""
+"""Transfer of refined focal lengths from one mapper run to the next."""
 
 from __future__ import annotations
 
@@ -12,30 +12,32 @@ from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 
 MIN_FOCAL_CHANGE = 1.1
-"""Ratio of refined and initial focal length from which the initial one has bent the relative poses
-of pairs, and the model that was built from them. [ours]"""
+"""Ratio of refined and initial focal length from which the initial focal length has distorted the
+relative poses of pairs, so that the mapper runs again. [ours]"""
 MAX_ERROR_PX = 4.0
 """Largest Sampson error of an inlier of the essential matrix. [COLMAP two-view max_error]"""
 MIN_INLIER_RATIO = 0.25
-"""Inlier ratio from which RANSAC computes its number of trials. [COLMAP two-view min_inlier_ratio]
+"""Assumed inlier ratio from which RANSAC computes its number of trials. [COLMAP two-view
+min_inlier_ratio]
 """
 
 
 def apply_refined_focal_lengths(
     problem: MappingProblem, model: Reconstruction, seed: int
 ) -> MappingProblem | None:
-    """Return the problem with the refined focal lengths of a model, and new relative poses.
+    """Return the problem with refined focal lengths of a model and new relative poses.
 
-    The priors of the focal lengths keep their means. Each pair of an image whose focal length
-    changes gets the relative pose of an essential matrix of all its matches.
+    The priors on focal lengths keep their original means. Each pair of an image whose focal length
+    changes gets a new relative pose from the essential matrix of its matches.
 
     Args:
-        problem: The problem that was reconstructed.
+        problem: The mapping problem that was reconstructed.
         model: Its largest component.
         seed: Seed of RANSAC.
 
     Returns:
-        None if no focal length changed by ``MIN_FOCAL_CHANGE`` or more.
+        The updated mapping problem, or None if no focal length changed by ``MIN_FOCAL_CHANGE`` or
+        more.
     """
     cameras = {
         problem.images[image.index].camera: image.camera
@@ -65,7 +67,7 @@ def apply_refined_focal_lengths(
 
 
 def _estimate_relative_pose(problem: MappingProblem, pair: VerifiedPair, seed: int) -> VerifiedPair:
-    """Return a pair with the relative pose of an essential matrix; unchanged if RANSAC fails."""
+    """Return a pair with the relative pose of an essential matrix if RANSAC finds one."""
     image_a, image_b = problem.images[pair.image_a], problem.images[pair.image_b]
     result = pycolmap.estimate_essential_matrix(
         image_a.keypoints[pair.matches[:, 0]],

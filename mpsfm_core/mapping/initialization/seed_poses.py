@@ -1,4 +1,4 @@
-"""Seed poses: an earlier reconstruction initializes another one with more matches."""
+"""Seed poses from an earlier reconstruction of the same images with other matches."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ def select_seed_images(mapping: MappingResult, min_points: int) -> list[Register
 
     Args:
         mapping: The earlier result.
-        min_points: Points, each observed by at least three images, that an image must observe.
+        min_points: Number of points with at least three observations that a selected image must
+            observe.
     """
     return [
         image
@@ -31,7 +32,8 @@ def apply_seed_poses(
 ) -> MappingProblem:
     """Return the problem with the poses of the seed images as known poses.
 
-    Known poses of other images stay. All images of a seed image's camera take its focal length.
+    Known poses of images without a seed pose stay unchanged. All images that share the camera of a
+    seed image take the focal length of the seed image.
     """
     cameras = {problem.images[seed.index].camera: seed.camera for seed in seed_images}
     poses = {seed.index: (seed.rotation, seed.translation) for seed in seed_images}
