@@ -1,4 +1,4 @@
-"""Conversion of a reconstruction to a COLMAP model, and its files."""
+"""Convert a reconstruction to a COLMAP model and write the model files."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from mpsfm_core.inputs.colmap_files import check_binary_model
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 
 MIN_TRACK_LENGTH = 2
-"""Minimum track length of exported points: points lifted from one image are not triangulated."""
+"""Minimum track length of exported points; points lifted from one depth map are not exported."""
 
 _BLOCK = 1 << 20
-"""Bytes that are written together to test the free space."""
+"""Number of bytes per write in the test of the free disk space."""
 
 Keypoints = Sequence[Float64]
-"""Keypoints (n, 2) float64 of each registered image, pixels of its camera in the model."""
+"""Keypoints (n, 2) float64 of each registered image in pixels of the exported camera."""
 
 
 def build_model(
@@ -33,17 +33,17 @@ def build_model(
 ) -> pycolmap.Reconstruction:
     """Build a COLMAP model of the registered images.
 
-    The model has all keypoints, and all points with at least :data:`MIN_TRACK_LENGTH`
-    observations. Image ids are indices in the mapping problem plus one.
+    The COLMAP model has all keypoints, and the 3D points with at least :data:`MIN_TRACK_LENGTH`
+    observations. COLMAP's image id is the image index in the mapping problem plus one.
 
     Args:
-        reconstruction: poses, points and tracks.
-        cameras: camera of each registered image; equal cameras are shared in the model.
+        reconstruction: poses, 3D points and tracks to convert.
+        cameras: camera of each registered image; images with equal cameras share one in the model.
         keypoints: keypoints of each registered image in pixels of ``cameras``.
-        colors: (p, 3) RGB of the points.
+        colors: (p, 3) RGB colors of the 3D points.
 
     Returns:
-        The model; point errors are reprojection errors in pixels of ``cameras``.
+        The COLMAP model, with reprojection errors in pixels of ``cameras``.
     """
     model = pycolmap.Reconstruction()
     ids: dict[str, int] = {}
@@ -68,13 +68,13 @@ def build_model(
 
 
 def write_model(folder: Path, model: pycolmap.Reconstruction, *, text: bool = False) -> None:
-    """Write a model as binary or text files.
+    """Write a COLMAP model as binary or text files.
 
-    COLMAP's writer does not report a full disk. The free space is therefore tested before, and the
-    sizes of the files are checked after writing.
+    COLMAP's writer does not report a full disk. The free disk space is therefore tested before
+    writing, and the file sizes are checked after writing.
 
     Raises:
-        OSError: the disk is full or fails.
+        OSError: the disk is full or writing fails.
     """
     folder.mkdir(parents=True, exist_ok=True)
     keypoints = sum(image.num_points2D() for image in model.images.values())
@@ -97,12 +97,12 @@ def average_point_colors(
     """Average the image colors of each point over its observations.
 
     Args:
-        reconstruction: points and observations.
-        keypoints: keypoints of each registered image in pixels of its view.
-        view_of: returns the undistorted view of an image name.
+        reconstruction: 3D points and their observations.
+        keypoints: keypoints of each registered image in pixels of the undistorted view.
+        view_of: function that returns the undistorted view of an image name.
 
     Returns:
-        (p, 3) uint8 RGB; points without an observation are black.
+        (p, 3) uint8 RGB colors; 3D points without an observation are black.
     """
     total = np.zeros((len(reconstruction.points), 3))
     count = np.zeros(len(reconstruction.points))
@@ -155,7 +155,7 @@ def _with_id(camera: pycolmap.Camera, camera_id: int) -> pycolmap.Camera:
 
 
 def _tracks(reconstruction: Reconstruction) -> list[list[tuple[int, int]]]:
-    """Return the observations of each point: (image id in the model, keypoint row)."""
+    """Return the observations of each 3D point as pairs of image id and keypoint index."""
     tracks: list[list[tuple[int, int]]] = [[] for _ in reconstruction.points]
     for image in reconstruction.images:
         for keypoint in np.flatnonzero(image.point_ids >= 0):

@@ -1,4 +1,4 @@
-"""Files of refined depth maps."""
+"""Write and read the files of refined depth maps."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from mpsfm_core.support.npz import read_npz, write_npz
 from mpsfm_core.support.threads import parallel_map
 
 FORMAT = 1
-"""Version of the files."""
+"""Format version of the depth map files."""
 
 
 def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
     """Write ``folder/NAME.npz`` for each registered image (NAME includes its extension).
 
-    Arrays: ``depth`` (h, w) float32, z in the units of the model; ``variance`` (h, w) float32,
-    those units squared; ``valid`` (h, w) bool; ``camera`` (4,) float64, fx, fy, cx, cy on this
-    grid (COLMAP pixels, undistorted); ``cam_from_world`` (3, 4) float64; ``format_version``.
+    The arrays are ``depth`` (h, w) float32, the z-depth in units of the model, ``variance`` (h, w)
+    float32 of the depth, the mask ``valid`` (h, w) bool, ``camera`` (4,) float64, the fx, fy, cx,
+    cy of the undistorted depth grid in COLMAP pixels, the pose ``cam_from_world`` (3, 4) float64,
+    and ``format_version``.
     """
 
     def write(image: RegisteredImage) -> None:
         height, width = image.depth.shape
-        assert image.depth.variance is not None  # refined maps have a variance
+        assert image.depth.variance is not None  # refined depth maps have a variance
         arrays: dict[str, Any] = {
             VERSION: np.array(FORMAT),
             "depth": image.depth.depth,
@@ -47,14 +48,14 @@ def read_depth_map(path: Path, scale: float = 1.0) -> tuple[PinholeCamera, Depth
     """Read a depth map that :func:`write_depth_maps` wrote.
 
     Args:
-        path: file to read.
-        scale: factor of the depth.
+        path: depth map file to read.
+        scale: factor that multiplies the depth.
 
     Returns:
-        The camera of the depth grid, and the scaled depth.
+        The camera of the depth grid, and the scaled depth map.
 
     Raises:
-        InputError: the file is damaged, of a newer version or not a depth map.
+        InputError: the file is damaged, has a newer format version or is not a depth map.
     """
     arrays = load_depth_map(path)
     try:
@@ -68,10 +69,10 @@ def read_depth_map(path: Path, scale: float = 1.0) -> tuple[PinholeCamera, Depth
 
 
 def load_depth_map(path: Path) -> dict[str, NDArray[Any]]:
-    """Read the arrays of a depth map without checking their content.
+    """Read the arrays of a depth map file without checking their content.
 
     Raises:
-        InputError: the file is damaged or of a newer version.
+        InputError: the file is damaged or has a newer format version.
     """
     try:
         arrays = read_npz(path)

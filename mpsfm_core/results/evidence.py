@@ -1,6 +1,6 @@
 """Measure the evidence for a reconstruction: explained matches, parallax and connectivity.
 
-The measures go into ``summary.json``. :mod:`mpsfm_core.report.verdict` judges them.
+The evidence is written into ``summary.json`` and judged by :mod:`mpsfm_core.report.verdict`.
 """
 
 from __future__ import annotations
@@ -16,20 +16,20 @@ from mpsfm_core.geometry import camera_center
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 MIN_SHARED_POINTS = 3
-"""Images with fewer common points are not connected [minimal sample of PnP]."""
+"""Minimum number of common 3D points of connected images [minimal sample of PnP]."""
 
 
 def count_explained_matches(
     reconstruction: Reconstruction, problem: MappingProblem
 ) -> dict[tuple[str, str], int]:
-    """Count for each pair of registered images the matches whose keypoints see one point.
+    """Count the matches of each registered image pair whose keypoints share a 3D point.
 
     Args:
         reconstruction: Reconstruction of some images of the problem.
         problem: Images and verified pairs.
 
     Returns:
-        Names of both images -> number of explained matches.
+        Number of explained matches by pair of image names.
     """
     point_ids = {image.index: image.point_ids for image in reconstruction.confirmed_images}
     counts = {}
@@ -50,10 +50,10 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
         problem: Images and verified pairs.
 
     Returns:
-        ``parts``: names of the images in each part that shares points, largest part first.
-        ``median_angle_deg``: median over the points of the largest angle between two rays.
-        ``images``: per image the number of points, of points in at least three images, and the
-        share of its matches that the model explains.
+        Plain data with the following keys. ``parts``: image names of each connected part of the
+        covisibility graph, largest part first. ``median_angle_deg``: median over the 3D points of
+        the maximum triangulation angle in degrees. ``images``: number of 3D points, number of 3D
+        points with at least three images, and share of explained matches, by image name.
     """
     images = reconstruction.confirmed_images
     explained = count_explained_matches(reconstruction, problem)
@@ -83,7 +83,7 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
 
 
 def _count_per_image(counts: dict[tuple[str, str], int], pairs: Any) -> dict[str, int]:
-    """Sum the counts of the given pairs over each of their images."""
+    """Sum the counts of image pairs over the pairs of each image."""
     sums: dict[str, int] = {}
     for names in pairs:
         for name in names:
@@ -92,18 +92,18 @@ def _count_per_image(counts: dict[tuple[str, str], int], pairs: Any) -> dict[str
 
 
 def _rows(image: RegisteredImage) -> Int64:
-    """Return the distinct points that an image sees."""
+    """Return the ids of the 3D points that an image observes."""
     return np.unique(image.point_ids[image.point_ids >= 0])
 
 
 def _track_lengths(images: tuple[RegisteredImage, ...], num_points: int) -> Int64:
-    """Count the images of each point."""
+    """Count the images that observe each 3D point."""
     rows = [_rows(image) for image in images]
     return np.bincount(np.concatenate([*rows, np.zeros(0, np.int64)]), minlength=num_points)
 
 
 def _connected_parts(images: tuple[RegisteredImage, ...], num_points: int) -> list[list[str]]:
-    """Group the images that share points, directly or through others; largest part first."""
+    """Return the connected components of the covisibility graph, largest component first."""
     if not images:
         return []
     rows = [_rows(image) for image in images]
@@ -124,7 +124,7 @@ def _connected_parts(images: tuple[RegisteredImage, ...], num_points: int) -> li
 
 
 def _median_angle_deg(images: tuple[RegisteredImage, ...], points: Float64) -> float | None:
-    """Return the median over the points of the largest angle between two of their rays."""
+    """Return the median over the 3D points of the maximum triangulation angle in degrees."""
     if not len(points) or not images:
         return None
     mean_rays = np.zeros_like(points)

@@ -1,6 +1,7 @@
 """Export to Bundler's ``bundle.out`` (version 0.3) and ``list.txt`` with undistorted images.
 
-Bundler's cameras look along -z with y up; keypoints are relative to the principal point, y up.
+Bundler's cameras look along -z with y up. Bundler's keypoints are relative to the principal point,
+y up.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the folder; the focal length is the mean of fx and fy.
+    """Write a folder in Bundler's format; the focal length is the mean of fx and fy.
 
     Raises:
         InputError: the image files are missing, or a name has a space.

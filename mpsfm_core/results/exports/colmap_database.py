@@ -1,4 +1,4 @@
-"""Export to COLMAP's database: cameras, images, keypoints, matches and two-view geometry."""
+"""Export cameras, images, keypoints, matches and two-view geometries to a COLMAP database."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ ENTRIES = ("database.db",)
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write a database of the registered images with matches from the tracks as verified."""
+    """Write a database of the registered images, with verified matches derived from tracks."""
     folder.mkdir(parents=True, exist_ok=True)
     model = source.model
     with pycolmap.Database.open(str(folder / "database.db")) as database:
@@ -33,7 +33,7 @@ def write(source: ExportSource, folder: Path) -> None:
 
 
 def write_images(database: pycolmap.Database, model: pycolmap.Reconstruction) -> None:
-    """Write cameras, rigs, frames, and images with keypoints, with the ids of the model."""
+    """Write cameras, rigs, frames, images and keypoints with the ids of the COLMAP model."""
     for camera in model.cameras.values():
         known = pycolmap.Camera({**camera.todict(), "has_prior_focal_length": True})
         database.write_camera(known, use_camera_id=True)
@@ -48,7 +48,7 @@ def write_images(database: pycolmap.Database, model: pycolmap.Reconstruction) ->
 
 
 def _matches(model: pycolmap.Reconstruction) -> dict[tuple[int, int], list[tuple[int, int]]]:
-    """Return (smaller, larger image id) -> pairs of keypoint rows that observe the same point."""
+    """Return matches by pair of image ids, from keypoints that observe the same 3D point."""
     matches: dict[tuple[int, int], list[tuple[int, int]]] = defaultdict(list)
     for _, point in sorted(model.points3D.items()):
         views = sorted((e.image_id, e.point2D_idx) for e in point.track.elements)

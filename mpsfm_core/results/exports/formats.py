@@ -1,4 +1,4 @@
-"""Export formats of the core and of plugins, and the export function."""
+"""Export a reconstruction to a format of the core or of a plugin."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ from mpsfm_core.support.files import replace_entries
 from mpsfm_core.support.format_versions import VERSION
 
 DESCRIPTION = "export.json"
-"""File in every export: number of images and points, unit, orientation, transform."""
+"""File in every export folder with the number of images and points, unit, orientation and
+transform."""
 
 DESCRIPTION_FORMAT = 1
 """Version of :data:`DESCRIPTION`."""
@@ -64,11 +65,11 @@ FORMATS = (
     ExportFormat("bundler", "bundle.out of Bundler, undistorted", bundler.ENTRIES, bundler.write),
     ExportFormat("nvm", "N-View Match of VisualSFM, undistorted", nvm.ENTRIES, nvm.write),
 )
-"""Formats of the core."""
+"""Export formats that the core package provides."""
 
 
 def known_formats(registry: Registry | None = None) -> dict[str, ExportFormat]:
-    """Return all formats of the core and of plugins by name.
+    """Return all export formats of the core and of plugins by name.
 
     Args:
         registry: plugins; by default all installed plugins.
@@ -94,18 +95,19 @@ def export(
 
     Args:
         folder: result folder or COLMAP model.
-        format_name: name of the format, see :func:`known_formats`.
-        output: folder to write, by default ``exports/FORMAT`` below ``folder``.
-        photos: folder of the images, if it has moved since the run.
-        turn: True to rotate gravity to -z and move the origin to the median point; None for the
-            default of the format.
+        format_name: name of the export format, see :func:`known_formats`.
+        output: export folder to write, by default ``exports/FORMAT`` below ``folder``.
+        photos: folder of the original images, if it has moved since the run.
+        turn: true to rotate gravity to -z and move the origin to the median point, None for the
+            default of the export format.
         registry: plugins; by default all installed plugins.
 
     Returns:
-        The content of :data:`DESCRIPTION`, and ``output``.
+        The content of the file :data:`DESCRIPTION`, and the path of the export folder as
+        ``output``.
 
     Raises:
-        InputError: the format is unknown, or the input is damaged or incomplete.
+        InputError: the export format is unknown, or the reconstruction is damaged or incomplete.
     """
     known = known_formats(registry)
     if format_name not in known:

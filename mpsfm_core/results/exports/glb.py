@@ -1,6 +1,6 @@
-"""Export to binary glTF 2.0: points, and a camera with its frustum for each image.
+"""Export 3D points, cameras and camera frustums to binary glTF 2.0.
 
-glTF has y up and meters; its cameras look along -z with y up and have no principal point.
+In glTF, y is up, units are meters, and cameras look along -z with y up and have no principal point.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from mpsfm_core.results.gltf import FLIP, LINES, POINTS, Y_UP_FROM_Z, GltfScene
 
 ENTRIES = ("scene.glb",)
 _OUTLINE = 0.05
-"""Length of a camera frustum over the spread of points and cameras."""
+"""Length of a camera frustum over the spread of 3D points and camera centers."""
 _EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 
 
@@ -46,13 +46,13 @@ def write(source: ExportSource, folder: Path) -> None:
 
 
 def _spread(points: Float64) -> float:
-    """Return the median distance from the median point, at least 1e-6."""
+    """Return the median distance of points from the median point, at least 1e-6."""
     distance = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     return max(float(np.median(distance)), 1e-6)
 
 
 def _outline(half: Float64) -> Float64:
-    """Return the edges of a frustum from the camera center to z = -1, (16, 3), two ends each."""
+    """Return the end points (16, 3) of the 8 edges of a camera frustum that ends at z = -1."""
     corners = np.array([[0, 0, 0], [-1, -1, -1], [1, -1, -1], [1, 1, -1], [-1, 1, -1]], np.float64)
     corners[:, :2] *= half
     edges: Float64 = corners[np.array(_EDGES).ravel()]

@@ -1,4 +1,4 @@
-"""Export for Gaussian splatting, as read by gsplat, Inria's code and splatfacto.
+"""Export for Gaussian splatting with gsplat, Inria's code and splatfacto.
 
 ::
 
@@ -22,17 +22,17 @@ from mpsfm_core.support.npz import write_npz
 
 ENTRIES = ("images", "sparse", "gaussians.ply", "maps")
 _NEIGHBOURS = 3
-"""Number of neighbors whose root mean square distance is the size (Kerbl et al. 2023)."""
+"""Number of nearest neighbors whose RMS distance sets the Gaussian scale (Kerbl et al. 2023)."""
 _OPACITY = 0.1
 """Initial opacity of a Gaussian (Kerbl et al. 2023)."""
 _MAX_GAUSSIANS = 500_000
-"""Maximum number of Gaussians; above it, random points are used."""
+"""Maximum number of Gaussians; of more 3D points, a random subset is used."""
 _SH_0 = 0.28209479177387814
-"""Spherical harmonic of degree 0, ``1 / (2 sqrt(pi))``."""
+"""Constant spherical harmonic of degree 0, ``1 / (2 sqrt(pi))``."""
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the folder; raise ``InputError`` if the image files are missing."""
+    """Write a Gaussian splatting folder; raise ``InputError`` if image files are missing."""
     source.write_photos(folder / "images")
     write_model(folder / "sparse" / "0", source.undistorted())
     write_maps(source, folder / "maps")
@@ -47,10 +47,11 @@ def write(source: ExportSource, folder: Path) -> None:
 def write_maps(source: ExportSource, folder: Path) -> None:
     """Write ``folder/NAME.npz`` for each image that has refined depth.
 
-    Arrays: ``depth`` and ``depth_std`` (h, w) float32, z in units of the world; ``normals``
-    (h, w, 3) float32, unit, camera frame (x right, y down, z forward), and ``normals_std`` (h, w)
-    float32, radians, along each tangent; ``depth_valid``, ``normals_valid`` (h, w) bool;
-    ``camera`` (4,) float64, fx, fy, cx, cy on this grid, which covers the undistorted photo.
+    The arrays are z-depth ``depth`` and its standard deviation ``depth_std`` (h, w) float32 in
+    world units, unit normals ``normals`` (h, w, 3) float32 in the camera frame (x right, y down, z
+    forward), their angular standard deviation ``normals_std`` (h, w) float32 in radians along each
+    tangent, the masks ``depth_valid`` and ``normals_valid`` (h, w) bool, and ``camera`` (4,)
+    float64, the fx, fy, cx, cy of this grid over the undistorted image.
     """
     for name in source.names:
         maps = source.maps(name)
@@ -70,12 +71,12 @@ def write_maps(source: ExportSource, folder: Path) -> None:
 
 
 def write_gaussians(path: Path, points: Float64, colors: UInt8) -> None:
-    """Write isotropic Gaussians in the PLY layout of Kerbl et al. (2023).
+    """Write isotropic Gaussians in the PLY layout of Kerbl et al. (2023). (2023).
 
     Args:
-        path: file to write.
-        points: (n, 3) centers, more than three.
-        colors: (n, 3) uint8 RGB.
+        path: PLY file to write.
+        points: (n, 3) centers of the Gaussians, more than three.
+        colors: (n, 3) uint8 RGB colors of the Gaussians.
     """
     distance = cKDTree(points).query(points, k=_NEIGHBOURS + 1)[0][:, 1:]
     size = np.sqrt((distance**2).mean(axis=1))

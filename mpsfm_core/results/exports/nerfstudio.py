@@ -25,11 +25,11 @@ from mpsfm_core.results.transforms_json import write_transforms
 
 ENTRIES = ("transforms.json", "images", "depths", "maps", "sparse_pc.ply")
 _STORED_UNITS = 1000
-"""Stored depth per unit: nerfstudio multiplies by ``depth_unit_scale_factor``, default 0.001."""
+"""Integer depth per world unit, the inverse of nerfstudio's default ``depth_unit_scale_factor``."""
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the folder; raise ``InputError`` if the image files are missing."""
+    """Write a nerfstudio folder; raise ``InputError`` if the image files are missing."""
     source.write_photos(folder / "images")
     write_maps(source, folder / "maps")
     write_ply(folder / "sparse_pc.ply", *source.points())
@@ -48,7 +48,7 @@ def write(source: ExportSource, folder: Path) -> None:
 
 
 def _write_depths(source: ExportSource, folder: Path) -> dict[str, str]:
-    """Write depth files; return image file -> depth file, empty unless all images have depth."""
+    """Write depth images; return their paths by image path, empty unless all images have depth."""
     maps_of = {name: source.maps(name) for name in source.names}
     written = {}
     for name, maps in maps_of.items():

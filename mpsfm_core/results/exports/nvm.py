@@ -1,6 +1,6 @@
-"""VisualSFM's N-View Match file, with undistorted photos.
+"""Export to VisualSFM's N-View Match (NVM) file with undistorted images.
 
-Its keypoints are relative to the principal point, x right and y down.
+Keypoints in an NVM file are relative to the principal point, x right and y down.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ ENTRIES = ("reconstruction.nvm", "images")
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the folder; the focal length is the mean of fx and fy.
+    """Write a folder with an NVM file; the focal length is the mean of fx and fy.
 
     Raises:
         InputError: the image files are missing, or a name has a space, which NVM does not allow.
@@ -32,7 +32,7 @@ def write(source: ExportSource, folder: Path) -> None:
         "NVM_V3 ",
         " ",
         str(len(images)),
-    ]  # VisualSFM writes the spaces, and MeshLab requires them
+    ]  # VisualSFM writes spaces at line ends, and MeshLab requires them
     for image in images:
         x, y, z, w = image.cam_from_world().rotation.quat
         focal = model.cameras[image.camera_id].mean_focal_length()

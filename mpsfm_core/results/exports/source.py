@@ -1,4 +1,4 @@
-"""Reader of the reconstruction to export: a result folder or a COLMAP model."""
+"""Read the reconstruction to export from a result folder or a COLMAP model."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.summary import read_summary
 
 _NORMALS_AN_IMAGE = 2000
-"""Maximum number of normals of an image in the estimate of gravity."""
+"""Maximum number of surface normals per image in the estimation of gravity."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,11 +36,11 @@ class ExportMaps:
     """Refined depth and normals of an image on one grid."""
 
     camera: PinholeCamera
-    """Camera of the grid."""
+    """Pinhole camera of the grid of the depth map."""
     depth: DepthPrior
-    """Depth in units of the exported world."""
+    """Refined z-depth in units of the exported world."""
     normals: NormalPrior
-    """Normals of the depth."""
+    """Surface normals computed from the refined depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,28 +50,28 @@ class ExportSource:
     folder: Path
     """Result folder or folder of a COLMAP model."""
     model: pycolmap.Reconstruction
-    """Model of the original images, without images that are registered tentatively."""
+    """COLMAP model of the original images, without tentatively registered images."""
     photos: Path | None
     """Folder of the original images, None if unknown."""
     summary: Mapping[str, Any]
-    """Summary of the run, empty for a COLMAP model."""
+    """Content of the run's ``summary.json``, empty for a COLMAP model."""
     left_out: tuple[str, ...] = ()
-    """Names of images that are registered tentatively."""
+    """Names of the tentatively registered images, which are not exported."""
     world_from_model: pycolmap.Sim3d = field(default_factory=pycolmap.Sim3d)
-    """Transform that was applied to the model in the folder."""
+    """Similarity from the model in the folder to the exported world."""
     gravity: Gravity | None = None
-    """Gravity that was rotated to -z, None if the world was not rotated."""
+    """Gravity direction that was rotated to -z, None if the world was not rotated."""
 
     @classmethod
     def read(cls, folder: Path, photos: Path | None = None) -> ExportSource:
-        """Read a result folder or COLMAP model.
+        """Read a reconstruction from a result folder or COLMAP model.
 
         Args:
-            folder: folder to read.
+            folder: result folder or COLMAP model to read.
             photos: folder of the original images, if it has moved since the run.
 
         Raises:
-            InputError: there is no model, or it is damaged.
+            InputError: the folder has no model, or the model is damaged.
         """
         summary = _read_summary(folder / SUMMARY)
         if photos is None:
@@ -104,7 +104,7 @@ class ExportSource:
 
     @property
     def scale_spread(self) -> float | None:
-        """Relative standard deviation of the scale over its estimates, None if unknown."""
+        """Relative standard deviation of the metric scale, None if unknown."""
         return None if self._metric is None else float(self._metric["spread"])
 
     @property
@@ -123,7 +123,7 @@ class ExportSource:
         """Original images of the registered images in the order of :attr:`names`.
 
         Raises:
-            InputError: the image files are missing.
+            InputError: the original image files are missing.
         """
         if self.photos is None:
             recorded = self.summary.get("photos", "")
@@ -151,7 +151,7 @@ class ExportSource:
 
     @property
     def is_georeferenced(self) -> bool:
-        """True if the world is east, north, up in meters."""
+        """True if the exported world is georeferenced to east, north, up in meters."""
         return "origin" in (self.summary.get("georeference") or {})
 
     @property
@@ -162,7 +162,8 @@ class ExportSource:
     def turned(self) -> ExportSource:
         """Return the reconstruction with gravity along -z, in meters if the scale is known.
 
-        The origin is the median point, or the median camera center without points.
+        The new origin is the median 3D point, or the median camera center of a model without
+        points.
         """
         gravity = estimate_gravity(self._rotations(), self._world_normals())
         first = self._rotations()[0]
@@ -181,14 +182,14 @@ class ExportSource:
         return [by_name[name] for name in self.names]
 
     def points(self) -> tuple[Float64, UInt8]:
-        """Return positions (n, 3) and RGB colors (n, 3) of the points, sorted by id."""
+        """Return positions (n, 3) and RGB colors (n, 3) of the 3D points, sorted by id."""
         ids = sorted(self.model.points3D)
         points = [self.model.points3D[i] for i in ids]
         xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
         return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
     def dense_points(self) -> tuple[Float64, UInt8]:
-        """Return the fused depth maps as :meth:`points`, else the points of the model."""
+        """Return positions and colors of the fused depth maps, else of the 3D points."""
         path = self.folder / DENSE
         if not path.is_file():
             return self.points()
@@ -197,10 +198,10 @@ class ExportSource:
         return moved, colors
 
     def maps(self, name: str) -> ExportMaps | None:
-        """Read depth and normals of an image, None if the folder has none.
+        """Read depth and normals of an image, None if the folder has no depth map.
 
         Raises:
-            InputError: the file is damaged.
+            InputError: the depth map file is damaged.
         """
         path = self.folder / DEPTH / f"{name}.npz"
         if not path.is_file():
@@ -211,7 +212,7 @@ class ExportSource:
     def undistorted(self) -> pycolmap.Reconstruction:
         """Build the model of the undistorted images that :meth:`write_photos` writes.
 
-        Image and point ids are those of the model; keypoints without a point are omitted.
+        Image and point ids are unchanged; keypoints without a 3D point are omitted.
         """
         model = pycolmap.Reconstruction()
         cameras: dict[str, int] = {}
@@ -249,7 +250,7 @@ class ExportSource:
         return model
 
     def write_photos(self, folder: Path) -> None:
-        """Write all images upright, undistorted, and in a common format."""
+        """Write all registered images upright, undistorted, and in a common image format."""
         for index, name in enumerate(self.names):
             export_view(self.images, index, folder / exported_image_name(name))
 
@@ -262,7 +263,7 @@ class ExportSource:
         return np.stack([image.cam_from_world().rotation.matrix() for image in self.registered()])
 
     def _world_normals(self) -> Float64:
-        """Return surface normals (n, 3) in the world, from all images with depth."""
+        """Return surface normals (n, 3) in the world frame, from all images with depth."""
         normals_of_images = [np.zeros((0, 3))]
         for image in self.registered():
             maps = self.maps(str(image.name))

@@ -1,4 +1,4 @@
-"""Points and tracks as text, shared by the exports to text formats."""
+"""Format 3D points and tracks as text for the Bundler and NVM exports."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mpsfm_core.data.errors import InputError
 
 
 def check_names_without_spaces(names: Iterable[str], format_name: str) -> None:
-    """Raise :class:`InputError` for a name with a space, which separates fields in the format."""
+    """Raise an :class:`InputError` if an image name has a space, the field separator."""
     for name in names:
         if len(name.split()) != 1:
             raise InputError(
@@ -21,19 +21,19 @@ def check_names_without_spaces(names: Iterable[str], format_name: str) -> None:
 
 
 def sort_images_by_name(model: pycolmap.Reconstruction) -> list[pycolmap.Image]:
-    """Return the images sorted by name; the formats refer to images by this index."""
+    """Return the images of a model sorted by name, the image order of the text formats."""
     return sorted(model.images.values(), key=lambda image: str(image.name))
 
 
 def describe_points(model: pycolmap.Reconstruction, y_sign: int) -> list[tuple[str, str, str]]:
-    """Format position, color and track of each point.
+    """Format position, color and track of each 3D point as text.
 
-    A track is its length, then image index, keypoint index, x and y of each observation. x and y
-    are in pixels relative to the principal point.
+    A track is written as its length, then image index, keypoint index, x and y of each observation,
+    where x and y are pixels relative to the principal point.
 
     Args:
-        model: model of pinhole cameras.
-        y_sign: 1 for y down, -1 for y up.
+        model: COLMAP model with pinhole cameras.
+        y_sign: sign of the image y axis, 1 for y down and -1 for y up.
     """
     rows = {image.image_id: row for row, image in enumerate(sort_images_by_name(model))}
     described = []
