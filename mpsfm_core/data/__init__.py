@@ -11,7 +11,7 @@ Conventions:
 * Normals are unit vectors in the camera frame that face the camera (``n . ray < 0``).
 * Pixels follow COLMAP: the center of the first pixel is (0.5, 0.5).
 * Transforms are ``b_from_a``; the pose of an image is ``cam_from_world``.
-* Uncertainty is a variance unless the name contains ``std``.
+* Uncertainty is a variance unless the name contains ``std`` (standard deviation).
 """
 
 from mpsfm_core.data.arrays import Bool, Float32, Float64, Int64, Pose, UInt8

@@ -26,7 +26,7 @@ def require_array(owner: object, name: str, dtype: Any, shape: tuple[int | None,
         owner: Data class instance.
         name: Name of the array attribute.
         dtype: Required dtype.
-        shape: Required shape; None accepts any size along the axis.
+        shape: Required shape, where None accepts any size along its axis.
 
     Raises:
         DataError: The attribute is not a numpy array, or its dtype or shape is wrong.

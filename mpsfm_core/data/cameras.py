@@ -55,14 +55,14 @@ class PinholeCamera:
         return self.width, self.height
 
     def resized(self, width: int, height: int) -> PinholeCamera:
-        """Return the camera of a grid with another size over the whole view."""
+        """Scale the intrinsics to a resized view of another width and height in pixels."""
         sx, sy = width / self.width, height / self.height
         return PinholeCamera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """Undistorted image, the input of a provider."""
+    """Undistorted image, the input of networks that predict depth, normals or features."""
 
     name: str
     """Path of the original image below the images folder, with forward slashes."""
@@ -84,7 +84,7 @@ class View:
 def dot_with_rays(camera: PinholeCamera, normals: NDArray[Any]) -> Float64:
     """Compute dot products of normals with the unit rays through their pixels.
 
-    A negative dot product means that the normal faces the camera.
+    A normal faces the camera if its dot product with the ray is negative.
 
     Args:
         camera: Intrinsics of the view.

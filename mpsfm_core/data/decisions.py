@@ -1,8 +1,8 @@
-"""Typed reasons of the decisions that a run makes about images, pairs and providers.
+"""Machine-readable reasons for decisions about images, image pairs and priors.
 
-A reason has a code and the fields that the code declares. ``summary.json`` stores a reason as
-``{"code": ..., field: ...}``. Only :mod:`mpsfm_core.report.reasons` renders a reason into words and
-a remedy.
+A reason consists of a code, such as ``too-few-inliers``, and the values of its fields.
+``summary.json`` stores a reason as ``{"code": ..., field: ...}``. Only
+:mod:`mpsfm_core.report.reasons` renders a reason into words and a remedy.
 """
 
 from __future__ import annotations
@@ -19,63 +19,63 @@ Code = TypeVar("Code", bound="ReasonCode")
 
 
 class ReasonCode(Enum):
-    """Base class of reason codes; a member has a text code and the names of its fields."""
+    """Base class of enumerations of reason codes, such as :class:`ImageReason`."""
 
     fields: tuple[str, ...]
 
     def __new__(cls, code: str, *fields: str) -> ReasonCode:
-        """Create a reason code from its text code and the names of its fields."""
+        """Create a reason code from its text in `summary.json` and the names of its fields."""
         member = object.__new__(cls)
         member._value_ = code
         member.fields = fields
         return member
 
     def because(self, **values: Value) -> Reason:
-        """Build a reason from the code and ``values`` for exactly the fields of the code."""
+        """Build a :class:`Reason` from this code and a value for each of its fields."""
         return Reason(self, values)
 
 
 class ImageReason(ReasonCode):
-    """Reasons why an image is not registered, or why a pair cannot initialize a component."""
+    """Reasons why an image is not registered, or why a pair cannot be the initial pair."""
 
     NO_VERIFIED_MATCHES = ("no-verified-matches",)
     NO_REGISTERED_NEIGHBOR = ("no-registered-neighbor",)
     NO_VALID_DEPTH = ("no-valid-depth",)
     TOO_FEW_POINTS = ("too-few-points", "num_matches", "min_matches")
-    """Too few matches of the image have a 3D point to estimate a pose from."""
+    """Too few keypoints of the image match a keypoint with a 3D point to estimate a pose."""
     NO_POSE = ("no-pose",)
-    """No pose estimator returns a pose for the image."""
+    """Pose estimation fails for the image."""
     TOO_FEW_INLIERS = ("too-few-inliers", "num_inliers", "min_inliers")
     LOW_INLIER_RATIO = ("low-inlier-ratio", "inlier_ratio", "min_inlier_ratio")
     TOO_FEW_POINTS_AFTER_REFINEMENT = ("too-few-points-after-refinement",)
     LOST_POINTS = ("lost-points", "step")
-    """The image lost its 3D points in ``step``: local-refinement, global-refinement,
-    re-registration or component-split."""
+    """The image lost its 3D points in the step ``local-refinement``, ``global-refinement``,
+    ``re-registration`` or ``component-split`` of the mapper."""
     CONTRADICTS_IMAGE = ("contradicts-image", "violation_ratio", "other_image")
-    """The depth of another image contradicts the pose at the ratio ``violation_ratio`` of
-    pixels."""
+    """The depth map of another image contradicts the pose of the image. The ratio
+    ``violation_ratio`` of the compared pixels is inconsistent."""
     CONTRADICTS_DEPTH = ("contradicts-depth", "violation_ratio", "step")
-    """The ratio ``violation_ratio`` of pixels contradicts the depth of other images in a global
-    check.
+    """The depth maps of other images contradict the pose of the image in a check of all images.
 
-    The value of ``step`` is global-initialization or final-check.
+    The ratio ``violation_ratio`` of the compared pixels is inconsistent. The check belongs to the
+    step ``global-initialization`` or ``final-check`` of the mapper.
     """
     CONTRADICTED_BY_IMAGES = ("contradicted-by-images", "num_images")
     MISREGISTERED = ("misregistered", "num_matches")
-    """By ``num_matches``, more matches contradict the pose than support the pose."""
+    """The matches that contradict the pose outnumber those that support it by ``num_matches``."""
     SPLIT_OFF = ("split-off", "num_matches")
-    """One pair connects the image to the model, and ``num_matches`` more matches contradict the
-    connection."""
+    """Only one image pair connects the image to the model, and the matches that contradict the pair
+    outnumber its inliers by ``num_matches``."""
     DISCONNECTED = ("disconnected", "step")
-    """After ``step``, no chain of common points connects the image to the largest part of the
-    model."""
+    """No chain of shared 3D points connects the image to the largest part of the model after
+    ``step``."""
     CONNECTED_BY_DROPPED_IMAGE = ("connected-by-dropped-image", "step")
     COMPONENT_TOO_SMALL = ("component-too-small", "num_images", "min_images")
     COMPONENT_LIMIT = ("component-limit", "max_components")
     OTHER_COMPONENT = ("other-component", "component")
-    """The image is registered in another component, in the folder components/<component>."""
+    """The image is registered in another component (model), in folder components/<component>."""
     NO_KNOWN_POSE = ("no-known-pose",)
-    """The run fixes known poses, and the image has no known pose."""
+    """The user gives fixed camera poses, and this image has none."""
     NOT_RECORDED = ("not-recorded",)
 
 
@@ -92,17 +92,17 @@ class PairReason(ReasonCode):
 
 
 class ProviderReason(ReasonCode):
-    """Reasons why the configuration uses a fallback instead of a preferred provider."""
+    """Reasons why a fallback network replaces the preferred network for a kind of prior."""
 
     UNAVAILABLE = ("unavailable", "detail")
-    """The plugin is missing or broken, or rejects the options."""
+    """The plugin of the network is missing or broken, or rejects the configured options."""
     INCOMPATIBLE = ("incompatible", "detail")
-    """The provider cannot be combined with the other chosen providers."""
+    """The network cannot be combined with the other configured networks."""
     NO_WEIGHTS = ("no-weights", "detail")
 
 
 class ChoiceReason(ReasonCode):
-    """Reasons why a block of the configuration uses its provider."""
+    """Reasons why the configuration selects a network for a kind of prior."""
 
     CONFIGURED = ("configured",)
     FIRST_CHOICE = ("first-choice",)
@@ -113,16 +113,17 @@ class CameraReason(ReasonCode):
     """Reasons why bundle adjustment does not refine the focal length of a camera."""
 
     KNOWN = ("known",)
-    """The focal length is given."""
+    """The focal length is known from the user's input."""
     NOT_ESTIMATED = ("not-estimated",)
-    """Refinement is switched off, or the image was registered tentatively."""
+    """Refinement of focal lengths is disabled, or the image was registered tentatively."""
     TOO_FEW_IMAGES = ("too-few-images", "num_images", "min_images")
-    """Only ``num_images`` images are registered in the model."""
+    """Only ``num_images`` images are registered, which is fewer than ``min_images``."""
     NOT_OBSERVABLE = ("not-observable", "focal_length_std_ratio")
     """The images do not constrain the focal length, whose relative std is
     ``focal_length_std_ratio``."""
     OUT_OF_RANGE = ("out-of-range", "equivalent_mm")
-    """No lens has the refined focal length, whose 35 mm equivalent is ``equivalent_mm``."""
+    """The refined focal length is implausible for any lens; its 35 mm equivalent is
+    ``equivalent_mm``."""
 
 
 class GpsReason(ReasonCode):
@@ -139,16 +140,17 @@ class DoubtReason(ReasonCode):
     """Reasons to doubt a reconstruction although its images are registered."""
 
     UNEXPLAINED_PAIRS = ("unexplained-pairs", "num_pairs", "image_a", "image_b", "num_matches")
-    """Verified pairs whose images share hardly any point in the model."""
+    """Some image pairs have many verified matches but share hardly any 3D point in the model."""
     DISCONNECTED = ("disconnected", "num_parts", "num_images")
-    """Parts of the model share no points, and ``num_images`` images are outside the largest
-    part."""
+    """The model falls into parts that share no 3D points, and ``num_images`` images are outside the
+    largest part."""
     LOW_PARALLAX = ("low-parallax", "angle_deg")
-    """The rays of most points are nearly parallel, so the depth priors alone give the depth."""
+    """The viewing rays of most 3D points are nearly parallel, so only the depth priors determine
+    the depth of these points."""
     FEW_POINTS = ("few-points", "num_images", "min_points")
     """``num_images`` images observe fewer than ``min_points`` 3D points."""
     FEW_EXPLAINED_MATCHES = ("few-explained-matches", "num_images", "min_ratio")
-    """``num_images`` images have mostly matches that contradict the model."""
+    """In ``num_images`` images, most matches contradict the model."""
     GPS_MISFIT = ("gps-misfit", "num_inliers", "num_positions")
     UNKNOWN_FOCAL_LENGTH = ("unknown-focal-length", "num_images")
     """``num_images`` images have a guessed focal length that bundle adjustment did not refine."""
@@ -156,13 +158,13 @@ class DoubtReason(ReasonCode):
 
 @dataclass(frozen=True)
 class Reason:
-    """Reason of a decision: a code and the values of the code's fields."""
+    """Reason for a decision, consisting of a code and the values of its fields."""
 
     code: ReasonCode
     values: Mapping[str, Value] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        """Check that the values have exactly the fields of the code."""
+        """Check that the reason has a value for each field of its code, and no other values."""
         if set(self.values) != set(self.code.fields):
             wanted = ", ".join(self.code.fields) or "no field"
             raise DataError(self.code.value, f"needs {wanted}, got {', '.join(self.values)}")
@@ -176,11 +178,11 @@ def reason_from_json(codes: type[Code], stored: Mapping[str, Any]) -> Reason:
     """Restore a reason from the output of :meth:`Reason.to_json`.
 
     Args:
-        codes: Enumeration that contains the reason code.
-        stored: Dictionary with the code and the values of its fields.
+        codes: Enumeration of reason codes that contains the code, such as :class:`ImageReason`.
+        stored: Dictionary with the reason code and the values of its fields.
 
     Raises:
-        DataError: The code is unknown, or its fields are incomplete.
+        DataError: The reason code is unknown, or a field of the reason is missing.
     """
     values = {name: value for name, value in stored.items() if name != "code"}
     try:

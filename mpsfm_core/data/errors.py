@@ -21,14 +21,14 @@ from typing import Any
 
 
 class MpsfmError(Exception):
-    """Base class of all errors that the package raises on purpose."""
+    """Base class of all exceptions that MP-SfM raises on purpose."""
 
     exit_code = 1
     """Exit code of the command line for this error class."""
 
     def __reduce__(self) -> tuple[Any, ...]:
-        # Default pickling fails, because the constructors have other parameters than `args`. Worker
-        # processes return pickled errors.
+        # Worker processes return pickled exceptions. Default pickling fails for exceptions whose
+        # constructor has other parameters than `args`.
         return _restore_error, (type(self), self.args, self.__dict__)
 
 
@@ -44,7 +44,7 @@ class ConfigError(InputError):
 
 
 class ProviderError(InputError):
-    """Error for a provider that cannot be found, imported or constructed."""
+    """Error for a plugin's network (provider) that cannot be found, imported or constructed."""
 
 
 class WeightsError(InputError):
@@ -66,11 +66,11 @@ class DataError(MpsfmError, ValueError):
 
 
 class ProviderOutputError(MpsfmError):
-    """Error for provider output that violates the provider contract.
+    """Error for the output of a network (provider) that has a wrong shape, dtype or value.
 
     Attributes:
         provider: Name of the provider.
-        image: Name of the image that the provider processed.
+        image: Name of the image that the network processed.
         field: Name of the invalid field.
         rule: The violated rule.
     """
@@ -84,21 +84,21 @@ class ProviderOutputError(MpsfmError):
 
 
 class ProviderRunError(MpsfmError):
-    """Exception of a provider on an image, chained to the original exception."""
+    """Error for an exception of a network (provider) that processes an image."""
 
 
 class OutputError(MpsfmError):
-    """Error for results that cannot be written because the disk is full or fails.
+    """Error for results that cannot be written, for example because the disk is full.
 
     The results of earlier runs are unchanged.
     """
 
 
 class ReconstructionError(MpsfmError):
-    """Error if valid input cannot be reconstructed.
+    """Error for valid input images from which no reconstruction can be computed.
 
     Attributes:
-        summary: Content of `summary.json`, with the reasons for each image and pair.
+        summary: Content of `summary.json`, with the reason why each image and image pair failed.
     """
 
     exit_code = 3
@@ -112,14 +112,14 @@ class ReconstructionError(MpsfmError):
 def _restore_error(
     kind: type[MpsfmError], args: tuple[Any, ...], state: dict[str, Any]
 ) -> MpsfmError:
-    """Recreate a pickled error without its constructor."""
+    """Recreate a pickled exception without a call of its constructor."""
     error = kind.__new__(kind, *args)
     error.__dict__.update(state)
     return error
 
 
 def did_you_mean(name: str, candidates: Iterable[str]) -> str:
-    """Return a suffix for "unknown NAME" messages: the closest candidate, or all candidates."""
+    """Return a message suffix that suggests the closest valid name, or lists all valid names."""
     known = sorted(set(candidates))
     closest = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     if closest:

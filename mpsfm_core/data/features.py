@@ -25,13 +25,13 @@ class Features:
     """Sparse local features of one view."""
 
     keypoints: Float64
-    """(n, 2) float64 positions of the keypoints, COLMAP pixels of the view."""
+    """(n, 2) float64 positions of the keypoints in COLMAP pixels of the undistorted image."""
     descriptors: Float32
-    """(n, d) float32."""
+    """(n, d) float32 descriptors of the keypoints."""
     scores: Float32 | None = None
-    """(n,) float32 detection scores, higher is better; None if unknown."""
+    """(n,) float32 detection scores of the keypoints, higher is better (None if unknown)."""
     scales: Float32 | None = None
-    """(n,) float32 keypoint scales in pixels; None if unknown."""
+    """(n,) float32 scales of the keypoints in pixels (None if unknown)."""
     std_px: float = 1.0
     """Std of the localization noise of a keypoint in pixels."""
 
@@ -54,13 +54,13 @@ class Features:
 
 @dataclass(frozen=True, eq=False)
 class SparseMatches:
-    """Matches between the features of two views."""
+    """Matches between the keypoints of two images, as pairs of indices."""
 
     indices: Int64
-    """(m, 2) int64 indices of the matched features of both views; each feature occurs at most
+    """(m, 2) int64 indices of the matched keypoints in both images. Each keypoint occurs at most
     once."""
     scores: Float32
-    """(m,) float32 confidence of each match in [0, 1]; the mapper weights matches by the score."""
+    """(m,) float32 confidence of each match in [0, 1], with which the mapper weights the match."""
 
     def __post_init__(self) -> None:
         require_array(self, "indices", np.int64, (None, 2))
@@ -74,10 +74,10 @@ class SparseMatches:
 
     @classmethod
     def from_arrays(cls, indices: NDArray[Any], scores: NDArray[Any]) -> SparseMatches:
-        """Build matches from raw arrays.
+        """Build matches from index and score arrays of any number type.
 
         Args:
-            indices: (m, 2) indices of the matched features of both views, any number type.
+            indices: (m, 2) indices of the matched keypoints in both images.
             scores: (m,) scores of the matches, clipped to [0, 1].
         """
         clipped = np.clip(scores, 0, 1).astype(np.float32)
@@ -85,10 +85,11 @@ class SparseMatches:
 
     @classmethod
     def from_best_scores(cls, indices: NDArray[Any], scores: NDArray[Any]) -> SparseMatches:
-        """Build one-to-one matches from raw arrays; the match with the best score wins.
+        """Build one-to-one matches, where the best-scored match of each keypoint is kept.
 
         Args:
-            indices: (m, 2) indices of the matched features of both views; features may repeat.
+            indices: (m, 2) indices of the matched keypoints in both images; a keypoint may occur
+                repeatedly.
             scores: (m,) scores of the matches, clipped to [0, 1].
         """
         order = np.argsort(-scores, kind="stable")
@@ -102,12 +103,12 @@ class SparseMatches:
 
 @dataclass(frozen=True, eq=False)
 class DenseMatches:
-    """Matches between positions of two views, without keypoints."""
+    """Dense matches between positions of two images, without detected keypoints."""
 
     points_a: Float64
-    """(m, 2) float64 positions of the matches in COLMAP pixels of the first view."""
+    """(m, 2) float64 positions of the matches in COLMAP pixels of the first image."""
     points_b: Float64
-    """(m, 2) float64 positions of the matches in COLMAP pixels of the second view."""
+    """(m, 2) float64 positions of the matches in COLMAP pixels of the second image."""
     scores: Float32
     """(m,) float32 confidence of each match in [0, 1]."""
     std_px: float = 1.0
@@ -127,14 +128,14 @@ class DenseMatches:
 
 @dataclass(frozen=True, eq=False)
 class PairMatches:
-    """Output of a matcher for two views: sparse or dense matches, or both."""
+    """Output of a matcher for two images, with sparse or dense matches or both."""
 
     sparse: SparseMatches | None = None
-    """Matches between features."""
+    """Matches between detected keypoints."""
     dense: DenseMatches | None = None
-    """Matches between positions."""
+    """Matches between image positions without keypoints."""
     depth: PairDepth | None = None
-    """Depth of both views, if the matcher predicts depth."""
+    """Depth maps of both images, if the matcher predicts depth."""
 
     def __post_init__(self) -> None:
         if self.sparse is None and self.dense is None:

@@ -1,4 +1,4 @@
-"""Input of the mapper, and the scene state for viewers."""
+"""Input of the incremental mapper, and intermediate reconstructions for live viewers."""
 
 from __future__ import annotations
 
@@ -22,38 +22,39 @@ from mpsfm_core.data.priors import DepthPrior, NormalPrior
 
 @dataclass(frozen=True, eq=False)
 class MappingImage:
-    """Image with keypoints and priors, the input of the mapper."""
+    """Image with keypoints, depth prior and normal prior, as input of the mapper."""
 
     name: str
     """Path of the image below the images folder, with forward slashes."""
     camera: PinholeCamera
     """Intrinsics of the undistorted view."""
     keypoints: Float64
-    """(n, 2) float64, COLMAP pixels of the undistorted view; sparse keypoints, then dense ones."""
+    """(n, 2) float64 keypoints in COLMAP pixels of the undistorted view. Sparse keypoints come
+    first, then dense keypoints."""
     depth: DepthPrior
-    """Depth prior with variance, on the grid of the normals."""
+    """Depth prior with variance, at the resolution of the normal prior."""
     normals: NormalPrior
-    """Normal prior with variance, on the grid of the depth."""
+    """Normal prior with variance, at the resolution of the depth prior."""
     keypoint_std_px: float = 1.0
-    """Std of the detector's localization noise in pixels; scales the inlier thresholds."""
+    """Std of the keypoint detector's localization noise in pixels, which scales inlier
+    thresholds."""
     keypoint_std_factor: Float64 | None = None
-    """(n,) float64 > 0, std of each keypoint after adjustment relative to ``keypoint_std_px``.
-
-    None: 1 for all."""
+    """(n,) float64 > 0, std of each adjusted keypoint relative to ``keypoint_std_px`` (None: 1)."""
     focal_known: bool = True
     """False if the focal length is a guess for bundle adjustment to refine.
 
-    Images with equal intrinsics then share the focal length."""
+    Images with equal intrinsics share a guessed focal length."""
     focal_log_std: float = 0.7
     """Prior std of the logarithm of a guessed focal length."""
     focal_guess_px: float | None = None
-    """Prior mean of ``fx`` in pixels of the undistorted view; None: ``camera.fx``."""
+    """Prior mean of ``fx`` in pixels of the undistorted view (None means ``camera.fx``)."""
     known_pose: Pose | None = None
-    """``cam_from_world`` of the user."""
+    """Known camera pose ``cam_from_world`` that the user provides, or None."""
     depth_group: int | None = None
-    """Images of equal group have depth in one unit and share its scale; None: a scale per image."""
+    """Group number of the image; images of a group share one unknown depth scale. With None, the
+    depth map of the image has its own scale."""
     proposed_pose: Pose | None = None
-    """``cam_from_group`` of a multi-view network, lengths in the unit of the group's depth."""
+    """Pose ``cam_from_group`` that a multi-view network predicts, in the unit of its depth maps."""
 
     def __post_init__(self) -> None:
         require_array(self, "keypoints", np.float64, (None, 2))
@@ -78,7 +79,7 @@ class MappingImage:
 
 @dataclass(frozen=True, eq=False)
 class PosedImage:
-    """Registered image, for viewers."""
+    """Registered image with pose and depth map, for live viewers."""
 
     name: str
     """Path of the image below the images folder, with forward slashes."""
@@ -89,12 +90,12 @@ class PosedImage:
     translation: Float64
     """(3,) float64 translation of ``cam_from_world``, world units."""
     depth: DepthPrior | None = None
-    """Depth map in world units on a grid of any size over the whole view; None without depth."""
+    """Depth map in world units at any resolution of the whole view (None without depth)."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneState:
-    """Intermediate reconstruction, for viewers."""
+    """Intermediate reconstruction with registered images and 3D points, for live viewers."""
 
     images: tuple[PosedImage, ...]
     """Registered images."""
@@ -107,19 +108,19 @@ class VerifiedPair:
     """Geometrically verified matches of two images."""
 
     image_a: int
-    """Index in :attr:`MappingProblem.images`, below ``image_b``."""
+    """Index of the first image in :attr:`MappingProblem.images`, smaller than ``image_b``."""
     image_b: int
-    """Index in :attr:`MappingProblem.images`."""
+    """Index of the second image in :attr:`MappingProblem.images`."""
     matches: Int64
-    """(m, 2) int64 keypoint rows, inliers only."""
+    """(m, 2) int64 keypoint indices of the inlier matches in both images."""
     scores: Float32
-    """(m,) float32 confidence in [0, 1]."""
+    """(m,) float32 confidence of each match in [0, 1]."""
     rotation: Float64
     """(3, 3) float64 rotation of ``cam_b_from_cam_a``, from the essential matrix or homography."""
     translation: Float64
     """(3,) float64 translation of ``cam_b_from_cam_a``, up to scale."""
     calibrated: bool = True
-    """True for COLMAP's CALIBRATED configuration; False if planar, panoramic or uncalibrated."""
+    """True if COLMAP classifies the two-view geometry as CALIBRATED, with an essential matrix."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.image_a < self.image_b:
@@ -136,7 +137,7 @@ class VerifiedPair:
 
 @dataclass(frozen=True, eq=False)
 class MappingProblem:
-    """Complete input of the mapper."""
+    """Complete input of the incremental mapper, with images and verified image pairs."""
 
     images: tuple[MappingImage, ...]
     """Images with keypoints and priors."""
@@ -157,7 +158,7 @@ class MappingProblem:
         return len(self.images[image].keypoints)
 
     def subset(self, names: list[str]) -> MappingProblem:
-        """Return the problem restricted to the named images, in unchanged order."""
+        """Return the mapping problem restricted to the named images and their pairs."""
         indices = [i for i, image in enumerate(self.images) if image.name in set(names)]
         position = {old: new for new, old in enumerate(indices)}
         pairs = tuple(
@@ -168,6 +169,6 @@ class MappingProblem:
         return MappingProblem(tuple(self.images[i] for i in indices), pairs)
 
     def with_poses(self, poses: Mapping[str, Pose]) -> MappingProblem:
-        """Return the problem with known poses by image name; the other images have none."""
+        """Return the mapping problem with the given ``cam_from_world`` poses, by image name."""
         images = (replace(image, known_pose=poses.get(image.name)) for image in self.images)
         return replace(self, images=tuple(images))

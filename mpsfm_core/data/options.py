@@ -24,7 +24,7 @@ class Options(BaseModel):
 
 
 def expert(default: Any, **constraints: Any) -> Any:
-    """Declare an option that users are not expected to set; help and templates may hide it.
+    """Declare an expert option, which help texts and configuration templates may hide.
 
     Args:
         default: Default value of the option.
@@ -39,7 +39,7 @@ SettingPath = tuple[str | int, ...]
 
 @dataclass(frozen=True)
 class SettingProblem:
-    """Problem of a wrong or missing setting."""
+    """Description of a wrong or missing setting."""
 
     path: SettingPath
     """Path of the setting, such as ``("depth", "options", "scale")``."""
@@ -75,15 +75,16 @@ def parse_settings(
     Args:
         model: Options class.
         values: Settings by key.
-        path: Path of the settings in the configuration, for error messages.
+        path: Path of the validated settings in the configuration, for error messages.
 
     Raises:
-        SettingsError: Some settings are wrong. The message has the path and problem of each
-            setting, and the closest valid key for an unknown key.
+        SettingsError: Some settings are wrong. The error message gives the path and problem of each
+            wrong setting, and the closest valid key for each unknown key.
     """
     try:
         return model.model_validate(dict(values))
-    except SettingsError as error:  # A provider in another Python environment raised the error.
+    except SettingsError as error:
+        # A plugin in another Python environment validates its options and raises SettingsError.
         raise SettingsError(
             tuple(replace(problem, path=(*path, *problem.path)) for problem in error.problems)
         ) from error
@@ -108,7 +109,7 @@ def _keys(details: ErrorDetails) -> SettingPath:
 
 
 def _explain(model: type[BaseModel], details: ErrorDetails) -> str:
-    """Describe a pydantic error for users."""
+    """Describe a pydantic validation error of a setting in words for users."""
     if details["type"] == "missing":
         return "is required"
     if details["type"] == "extra_forbidden":

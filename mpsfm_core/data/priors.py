@@ -25,18 +25,18 @@ UNIT_NORMAL_TOLERANCE = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class DepthPrior:
-    """Depth map with variance, on a grid of any size over the whole view.
+    """Depth map with variance, at any resolution of the whole undistorted image.
 
     Depth and variance at invalid pixels are finite and undefined.
     """
 
     depth: Float32
-    """(h, w) float32 z-depth, > 0 where valid; meters if ``metric``, else an unknown unit."""
+    """(h, w) float32 z-depth, > 0 at valid pixels, in meters if ``metric``, else in any unit."""
     variance: Float32 | None
     """(h, w) float32 variance of depth in squared depth units, > 0 where valid.
 
-    If the network predicts no variance, the value is None and a calibration declares the
-    variance."""
+    If the network predicts no variance, the attribute is None and a calibration provides the
+    variance later."""
     valid: Bool
     """(h, w) bool, True where depth is valid."""
     metric: bool = True
@@ -82,16 +82,16 @@ class DepthPrior:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Number of (rows, columns) of the map."""
+        """Number of (rows, columns) of the depth or normal map."""
         return self.depth.shape[0], self.depth.shape[1]
 
 
 @dataclass(frozen=True, eq=False)
 class NormalPrior:
-    """Surface normal map with variance, on a grid of any size over the whole view.
+    """Surface normal map with variance, at any resolution of the whole undistorted image.
 
-    Normals face the camera: the dot product with the ray through the pixel is negative. The
-    component ``n_z`` of a normal may be positive off the optical axis, for example on a floor.
+    Normals face the camera, so the dot product of a normal with the ray of its pixel is negative.
+    The component ``n_z`` of a normal may be positive off the optical axis, for example on a floor.
     :mod:`mpsfm_core.providers.validation` checks that normals face the camera, because the
     constructor has no camera.
     """
@@ -101,7 +101,7 @@ class NormalPrior:
     variance: Float32 | None
     """(h, w) float32 angular variance in rad^2 along each tangent direction, > 0 where valid.
 
-    The variance is None if the network predicts no variance."""
+    The attribute is None if the network predicts no variance of normals."""
     valid: Bool
     """(h, w) bool, True where the normal is valid."""
 
@@ -136,7 +136,8 @@ class NormalPrior:
             normals: (h, w, 3) normals in the camera frame, any number type and length.
             variance: (h, w) angular variance in rad^2, or None.
             valid: (h, w) mask of valid pixels, or None for all True.
-            camera: Intrinsics of the view, to check that normals face the camera.
+            camera: Intrinsics of the view, for the test whether normals face the camera (None omits
+                the test).
         """
         raw = np.asarray(normals, dtype=np.float32)
         finite = np.where(np.isfinite(raw).all(axis=-1, keepdims=True), raw, np.float32(0))
@@ -155,7 +156,7 @@ class NormalPrior:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Number of (rows, columns) of the map."""
+        """Number of (rows, columns) of the depth or normal map."""
         return self.normals.shape[0], self.normals.shape[1]
 
 
@@ -171,15 +172,16 @@ class PairDepth:
 
 @dataclass(frozen=True, eq=False)
 class MultiViewPrior:
-    """Output of a multi-view network for a group of n views, in one frame and one unit.
+    """Output of a multi-view network for a group of n views, in a common frame and unit.
 
-    Predicted poses and intrinsics are hypotheses, which the mapper tests with verified matches.
+    The mapper tests the predicted poses and intrinsics with verified matches before use.
     """
 
     depth: tuple[DepthPrior, ...]
-    """One depth prior for each of the n views, all in the same unit; meters if ``metric``."""
+    """One depth prior for each of the n views, all in the same unit, which is meters if
+    ``metric``."""
     poses: Float64 | None = None
-    """(n, 3, 4) float64 poses ``cam_from_group`` in the unit of depth, or None."""
+    """(n, 3, 4) float64 poses ``cam_from_group`` in the unit of the depth priors, or None."""
     intrinsics: Float64 | None = None
     """(n, 4) float64 intrinsics fx, fy, cx, cy of each view in COLMAP pixels, or None."""
 

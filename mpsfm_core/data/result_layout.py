@@ -1,7 +1,7 @@
 """Names of the files and folders that a run writes into its output folder.
 
-Readers of image folders skip folders that contain :data:`SUMMARY`. The package ``results`` writes
-the files, and the package ``report`` reads the files.
+Folders that contain a ``summary.json`` are results, so the search for input images skips them. The
+package ``results`` writes the files, and the package ``report`` reads the files.
 """
 
 SUMMARY = "summary.json"
@@ -13,7 +13,7 @@ SPARSE_TEXT = "sparse_text"
 COMPONENTS = "components"
 """COLMAP models of the components after the largest, numbered from 1 by decreasing size."""
 UNDISTORTED = "undistorted"
-"""Undistorted images, and their COLMAP model with pinhole cameras."""
+"""Folder of the undistorted images and their COLMAP model with pinhole cameras."""
 POINTS = "points.ply"
 """Triangulated points of the largest component."""
 DENSE = "dense.ply"

@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 
 DIAGONAL_35MM = math.hypot(36.0, 24.0)
-"""Diagonal in mm of the film that equivalent focal lengths refer to. [CIPA DCG-001]"""
+"""Diagonal in mm of 35 mm film, the reference of equivalent focal lengths. [CIPA DCG-001]"""
 MIN_EQUIVALENT_MM = 8.0
-"""Shortest equivalent focal length in mm of existing lenses. [ours]"""
+"""Shortest 35 mm equivalent focal length of existing lenses, in mm. [ours]"""
 MAX_EQUIVALENT_MM = 800.0
-"""Longest equivalent focal length in mm of existing lenses. [ours]"""
+"""Longest 35 mm equivalent focal length of existing lenses, in mm. [ours]"""
 
 
 def compute_equivalent_mm(focal_px: float, width: int, height: int) -> float:
@@ -18,5 +18,5 @@ def compute_equivalent_mm(focal_px: float, width: int, height: int) -> float:
 
 
 def is_plausible_equivalent(equivalent_mm: float) -> bool:
-    """Return whether a lens of this 35 mm equivalent exists."""
+    """Return True if a 35 mm equivalent focal length in mm is that of an existing lens."""
     return MIN_EQUIVALENT_MM <= equivalent_mm <= MAX_EQUIVALENT_MM

@@ -2,8 +2,8 @@
 
 The algorithm is from Baker and Matthews, "Lucas-Kanade 20 Years On" (IJCV 2004). Image gradients
 and the Hessian are computed once, from the template patch. A Gaussian window weights the pixels of
-the patch. The residual is invariant to brightness and gain. The warp model is a translation first,
-then affine.
+the patch. The residual is invariant to changes of brightness and contrast. The warp model is a
+translation in the first iterations and an affine map afterwards.
 """
 
 # mypy: allow-untyped-decorators
@@ -27,13 +27,13 @@ _CONVERGENCE_PX = 0.1, 0.01
 _DAMPING = 0.01
 """Levenberg damping of the affine parameters, relative to the diagonal of the Hessian [ours]."""
 _REGULARIZATION = 1e-9
-"""Constant added to the diagonal of the Hessian, so that the inverse exists."""
+"""Constant added to the diagonal of the Hessian, which makes the Hessian invertible."""
 _NUM_TRANSLATION = 2
 """Number of parameters of a translation."""
 _NUM_AFFINE = 6
 """Number of parameters of an affine warp."""
 _DERIVATIVES = 2
-"""First column of derivatives in the basis of a template patch."""
+"""Index of the first derivative among the 8 columns of a template patch's basis."""
 _MIN_CONTRAST = 1e-3
 """Minimum std of gray values in a patch with enough texture."""
 
@@ -42,13 +42,13 @@ class PatchAlignment(NamedTuple):
     """Result of the alignment of n patches."""
 
     shift: Float64
-    """(n, 2) aligned minus initial position in pixels of the searched image."""
+    """(n, 2) shifts from initial to aligned positions in pixels of the searched image."""
     warp: Float64
     """(n, 2, 2) linear part of the affine warp from the template to the searched image."""
     correlation: Float64
     """(n,) normalized cross-correlation (NCC) of the aligned patches, -1 if alignment failed."""
     covariance: Float64
-    """(n, 2, 2) covariance of the shift from image noise, pixels^2."""
+    """(n, 2, 2) covariance of each shift due to image noise, in pixels^2."""
 
 
 def align_patches(
@@ -72,7 +72,7 @@ def align_patches(
         correlation_length: Correlation length of image noise in pixels of the template.
     """
     offsets, window = _sample_patch(radius)
-    # Effective number of independent pixels in a patch; each sample represents two pixels.
+    # Effective number of independent noise samples in a patch; each sample represents two pixels.
     num_independent = 1.0 / ((window**2).sum() / 2 * correlation_length**2)
     return PatchAlignment(
         *_align(
@@ -90,7 +90,7 @@ def align_patches(
 
 
 def _sample_patch(radius: int) -> tuple[Float64, Float64]:
-    """Return offsets (q, 2) and weights (q,) of the samples of a round patch.
+    """Return pixel offsets (q, 2) and Gaussian weights (q,) of the samples of a round patch.
 
     The samples are every second pixel in a checkerboard pattern, because images are smooth.
     """
@@ -164,7 +164,7 @@ def _align(
 
 @helper()
 def _bilinear(image: Float32, x: float, y: float) -> float:
-    """Interpolate an image bilinearly at an array position."""
+    """Interpolate an image bilinearly at array coordinates (x, y)."""
     column, row = int(x), int(y)
     right, down = x - column, y - row
     above = image[row, column] * (1.0 - right) + image[row, column + 1] * right
@@ -175,7 +175,7 @@ def _bilinear(image: Float32, x: float, y: float) -> float:
 
 @helper()
 def _inside(image: Float32, x: float, y: float, reach_x: float, reach_y: float) -> bool:
-    """Return True if a box around (x, y) can be interpolated; False for NaN."""
+    """Return True if bilinear interpolation is possible in a box around (x, y); False for NaN."""
     fits_x = x - reach_x >= 0.0 and x + reach_x < image.shape[1] - 1
     return fits_x and y - reach_y >= 0.0 and y + reach_y < image.shape[0] - 1
 
@@ -192,13 +192,14 @@ def _derive(
 ) -> bool:
     """Compute the basis and the Hessian of a template patch.
 
-    The basis has 8 columns: the window weights, the weighted normalized template, and the weighted
-    derivatives by 2 translation and 4 affine parameters. The unit of affine offsets is the radius.
-    The derivatives are orthogonal to changes of mean and contrast.
+    The 8 columns of the basis are the window weights, the weighted normalized template, and the
+    weighted derivatives by 2 translation and 4 affine parameters. Pixel offsets in the affine
+    derivatives are divided by the radius of the patch. The derivatives are orthogonal to changes of
+    brightness and contrast.
 
     Args:
         image: (h, w) gray values of the template image.
-        at: (2,) center of the patch as array position.
+        at: (2,) center of the patch in array coordinates (x, y).
         radius: Radius of the template patch in pixels.
         offsets: (q, 2) samples.
         window: (q,) weights.
@@ -206,7 +207,7 @@ def _derive(
         hessian: (6, 6), written.
 
     Returns:
-        False if the patch exceeds the image or has no contrast.
+        False if the template patch exceeds the image or has no contrast.
     """
     if not _inside(image, at[0], at[1], radius + 1.0, radius + 1.0):
         return False
@@ -265,15 +266,15 @@ def _compare(
 
     Args:
         image: (h, w) gray values of the searched image.
-        at: (2,) center of the patch as array position.
+        at: (2,) center of the patch in array coordinates (x, y).
         warp: (2, 2) linear part of the affine warp from the template to the searched image.
         radius: Radius of the template patch in pixels.
         offsets: (q, 2) samples.
-        basis: (q, 8) basis of the template, see :func:`_derive`.
+        basis: (q, 8) basis of the template patch from :func:`_derive`.
         gradient: (6,) output, products of the template's derivatives with the searched patch.
 
     Returns:
-        The NCC, or -1 if the patch exceeds the image or has no contrast.
+        The NCC, or -1 if the warped patch exceeds the image or has no contrast.
     """
     reach_x = radius * math.hypot(warp[0, 0], warp[0, 1])
     reach_y = radius * math.hypot(warp[1, 0], warp[1, 1])

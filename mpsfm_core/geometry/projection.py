@@ -1,8 +1,8 @@
 """Projection and unprojection of a pinhole camera, and sampling of maps.
 
-All projection functions are vectorized over leading axes. Pixels follow COLMAP: the center of the
-first pixel is (0.5, 0.5), so ``map[row, col]`` is the value at ``(col + 0.5, row + 0.5)``. Resizing
-a W x H view to w x h maps ``x`` to ``x * w / W`` exactly.
+All projection functions accept arrays with any number of leading axes. Pixels follow COLMAP: the
+center of the first pixel is (0.5, 0.5), so ``map[row, col]`` is the value at ``(col + 0.5, row +
+0.5)``. Resizing a W x H view to w x h maps ``x`` to ``x * w / W`` exactly.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera
 
 
 def pixel_centers(width: int, height: int) -> Float64:
-    """Return the centers of all pixels of a grid, (height, width, 2) float64, COLMAP pixels."""
+    """Return the centers (height, width, 2) of all pixels of a map in COLMAP pixels."""
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
     return np.stack([u, v], axis=-1)
 
 
 def rays(camera: PinholeCamera, xy: Float64) -> Float64:
-    """Return the rays with z = 1 through pixels (..., 2), (..., 3) float64, camera frame."""
+    """Return the rays (..., 3) with z = 1 through pixels (..., 2) in the camera frame."""
     x = (xy[..., 0] - camera.cx) / camera.fx
     y = (xy[..., 1] - camera.cy) / camera.fy
     return np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -45,7 +45,7 @@ def project(camera: PinholeCamera, points: Float64) -> Float64:
 
 
 def scale_pixels(xy: Float64, from_size: tuple[int, int], to_size: tuple[int, int]) -> Float64:
-    """Scale pixels (..., 2) of a view of size (W, H) to a grid of size (w, h)."""
+    """Convert pixels (..., 2) of a view of size (W, H) to pixels of a map of size (w, h)."""
     return xy * (np.array(to_size, dtype=np.float64) / np.array(from_size, dtype=np.float64))
 
 
@@ -58,7 +58,7 @@ def inside(xy: Float64, size: tuple[int, int]) -> Bool:
 
 
 def sample_nearest(values: NDArray[Any], xy: Float64) -> NDArray[Any]:
-    """Sample the nearest values (n, ...) of a map at its pixels (n, 2), clamped to the map."""
+    """Sample a map at the nearest pixels of positions (n, 2), clamped to the border."""
     col = np.clip(np.floor(xy[:, 0]).astype(np.int64), 0, values.shape[1] - 1)
     row = np.clip(np.floor(xy[:, 1]).astype(np.int64), 0, values.shape[0] - 1)
     return values[row, col]
@@ -96,7 +96,7 @@ def sample_bilinear(values: NDArray[Any], valid: Bool, xy: Float64) -> tuple[Flo
 
 
 def resize_map(values: NDArray[Any], width: int, height: int, *, linear: bool = True) -> Float32:
-    """Resize a map to a grid.
+    """Resize a map to another number of rows and columns.
 
     Args:
         values: (h, w) or (h, w, c) map.
@@ -108,7 +108,7 @@ def resize_map(values: NDArray[Any], width: int, height: int, *, linear: bool = 
     Returns:
         (height, width) or (height, width, c) float32.
     """
-    import cv2  # A local import of OpenCV keeps the start of plugins and of the command line fast.
+    import cv2  # The import is local, because OpenCV slows down the start of the command line.
 
     values = np.ascontiguousarray(values, dtype=np.float32)
     if values.shape[:2] == (height, width):

@@ -29,5 +29,5 @@ def pinhole_from_colmap(camera: pycolmap.Camera) -> PinholeCamera:
 
 
 def camera_key(camera: pycolmap.Camera) -> str:
-    """Return a text key that identifies model, size and parameters of a camera."""
+    """Return a text key that is equal for cameras of equal model, size and parameters."""
     return f"{camera.model_name} {camera.width} {camera.height} {camera.params.tolist()}"

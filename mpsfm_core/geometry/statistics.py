@@ -21,11 +21,11 @@ def weighted_quantile(values: Float64, weights: Float64, ratio: float) -> float:
 
 
 def group_medians(values: Float64, groups: Int64, count: int) -> Float64:
-    """Compute the median of each group.
+    """Compute the median of the values in each group.
 
     Args:
         values: (m,) values.
-        groups: (m,) index of each value's group, in [0, count).
+        groups: (m,) index of the group that contains each value, in [0, count).
         count: Number of groups.
 
     Returns:

@@ -41,7 +41,7 @@ def triangulation_angle_deg(center_a: Float64, center_b: Float64, points: Float6
     parallel rays.
 
     Returns:
-        (...) triangulation angles in [0, 90] degrees.
+        Triangulation angles (...) in degrees, in [0, 90].
     """
     angle = angle_between_deg(points - center_a, points - center_b)
     folded: Float64 = np.minimum(angle, 180.0 - angle)

@@ -1,15 +1,16 @@
 """Bundle adjustment with depth regularization (paper 3.3, ``C_BA + C_reg``).
 
-Minimizes over camera poses, 3D points and, if variable, focal lengths and log scales ``s`` of depth
-maps::
+The variables are camera poses, 3D points and, optionally, focal lengths and log scales ``s`` of
+depth maps. Bundle adjustment minimizes::
 
     1/2 sum rho_r(|project(R X + t) - xy|^2 / std_px^2)
     + 1/2 sum rho_d((log z - log d - s)^2 / std^2) + 1/2 sum (s - expected)^2 / std_s^2
     + 1/2 sum (log f - log f_prior)^2 / std_f^2
 
-by Levenberg-Marquardt (Triggs et al., Bundle Adjustment: A Modern Synthesis, 2000). The Schur
-complement eliminates the points, the reduced camera system is solved, and back-substitution gives
-the points. Afterwards each point takes steps of its own with fixed cameras.
+The optimizer is Levenberg-Marquardt (Triggs et al., "Bundle Adjustment -- A Modern Synthesis",
+2000). Each step eliminates the 3D points with the Schur complement, solves the reduced camera
+system, and recovers the points by back-substitution. After each joint step, the points are
+optimized individually with fixed cameras.
 """
 
 from __future__ import annotations
@@ -36,11 +37,11 @@ from mpsfm_core.optimize.options import BundleOptions
 __all__ = ["BundleProblem", "BundleResult", "adjust_bundle"]
 
 INITIAL_DAMPING = 1e-4
-"""Inverse of Ceres' initial trust-region radius. [Ceres initial_trust_region_radius]"""
+"""Levenberg-Marquardt damping of the first step. [Ceres 1 / initial_trust_region_radius]"""
 MIN_DAMPING = 1e-10
-"""Smallest damping; it keeps unobserved parameters, as the depth of a single-view point. [ours]"""
+"""Minimum Levenberg-Marquardt damping, which keeps unobserved parameters constant. [ours]"""
 MAX_DAMPING = 1e16
-"""Damping above which the solver gives up. [ours]"""
+"""Levenberg-Marquardt damping above which bundle adjustment stops. [ours]"""
 MAX_FOCAL_STEP = 1.0
 """Largest change of a log focal length per step. [ours]"""
 CG_TOLERANCE = 1e-3
@@ -54,7 +55,7 @@ MIN_GAIN = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class BundleResult:
-    """Adjusted parameters in the order of the problem, and the summary of the solver."""
+    """Adjusted poses, points, focal lengths and depth scales, with a solver summary."""
 
     rotations: Float64
     translations: Float64
@@ -63,34 +64,37 @@ class BundleResult:
     points: Float64
     std_log_focals: Float64
     """(k,) posterior standard deviation of each variable log focal length, from the inverse of the
-    reduced camera system at the solution. NaN if constant, infinite if undetermined."""
+    reduced camera system at the solution. The value is NaN for a constant focal length and infinite
+    for an undetermined one."""
     initial_cost: float
     final_cost: float
     iterations: int
-    """Number of steps, accepted or rejected."""
+    """Number of accepted and rejected Levenberg-Marquardt steps."""
     converged: bool
-    """False if the iteration limit was reached or no step decreases the cost."""
+    """False if bundle adjustment reached the iteration limit or found no step that decreases the
+    cost."""
     message: str
-    """Reason of the termination."""
+    """Reason why the Levenberg-Marquardt solver stopped."""
 
 
 def adjust_bundle(problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:
     """Adjust poses, points, focal lengths and depth scales; the cost never increases.
 
-    An observation whose point is behind its camera, or more than 89.9999 degrees off its axis, has
-    residual 0, as in COLMAP. A step that makes an observation invisible is charged its former cost.
-    The result does not depend on the number of threads, bit for bit.
+    As in COLMAP, an observation whose point is behind the camera, or more than 89.9999 degrees off
+    its axis, has residual 0. If a step makes an observation invisible in this way, the observation
+    keeps its previous cost. The adjusted parameters do not depend on the number of threads, bit for
+    bit.
 
     Args:
-        problem: Parameters and observations; they are copied.
-        options: Losses and solver options.
+        problem: Parameters and observations of bundle adjustment, which are copied.
+        options: Robust losses and solver options of bundle adjustment.
 
     Returns:
         The adjusted parameters.
 
     Raises:
-        DataError: An array has a wrong shape, an index is out of range, a value is not finite, or a
-            standard deviation is not positive.
+        DataError: An array of ``problem`` has a wrong shape, an index out of range, a value that is
+            not finite, or a standard deviation that is not positive.
     """
     options = options or BundleOptions()
     prepared = prepare_bundle(problem, options)
@@ -103,7 +107,8 @@ def adjust_bundle(problem: BundleProblem, options: BundleOptions | None = None) 
 
 @cache
 def _blas() -> ThreadpoolController:
-    # nested BLAS threads are slow; the controller is cached because its creation takes milliseconds
+    # BLAS threads within worker threads are slow. Creating the thread controller takes
+    # milliseconds, so the controller is cached.
     return ThreadpoolController()
 
 
@@ -140,7 +145,7 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
 
 
 class SchurComplementSolver:
-    """Normal equations of one adjustment, solved by the Schur complement; reuses its buffers."""
+    """Normal equations of a bundle adjustment, which the Schur complement solves."""
 
     def __init__(self, p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> None:
         layout = p.bundle.layout
@@ -161,7 +166,7 @@ class SchurComplementSolver:
         self.tolerance = options.function_tolerance
 
     def linearize(self, state: kernels.BundleParameters, damping: float) -> float:
-        """Linearize at ``state``, eliminate the points, and return the cost."""
+        """Linearize the residuals at ``state``, eliminate the 3D points, and return the cost."""
 
         def reduce(n: int, first: int, last: int) -> float:
             for array in self.parts[n]:
@@ -190,7 +195,7 @@ class SchurComplementSolver:
         return cost + self.p.scale_prior.cost(state) + self.p.focal_prior.cost(state)
 
     def _add_scale_prior(self, state: kernels.BundleParameters) -> None:
-        """Add the prior of the log scales to the reduced camera system."""
+        """Add the prior of the depth maps' log scales to the reduced camera system."""
         prior, layout = self.p.scale_prior, self.p.bundle.layout
         rows = kernels.NUM_IMAGE_PARAMS * prior.slot + kernels.LOG_SCALE_IDX
         block = layout.pair[prior.slot, prior.slot]
@@ -210,13 +215,15 @@ class SchurComplementSolver:
     def compute_focal_stds(self, state: kernels.BundleParameters) -> Float64:
         """Compute the posterior standard deviation of each log focal length.
 
-        Its square is an entry of the diagonal of the inverse reduced camera system.
+        The variance of a log focal length is a diagonal entry of the inverse reduced camera system.
 
         Args:
-            state: Parameters at which the problem is linearized.
+            state: Poses, points, focal lengths and depth scales at which the residuals are
+                linearized.
 
         Returns:
-            (k,) NaN for constant focal lengths, infinite for undetermined ones.
+            (k,) standard deviations of log focal lengths, NaN if constant and infinite if
+            undetermined.
         """
         slots = self.p.bundle.layout.focal_slot
         stds = np.full(len(slots), np.nan)
@@ -239,7 +246,7 @@ class SchurComplementSolver:
         return stds
 
     def _fix_constants(self) -> None:
-        """Remove the constant parameters of images with a slot from the system."""
+        """Remove constant parameters of images from the reduced camera system."""
         held, pairs, blocks = self.p.held, self.p.pairs, self.total.blocks
         has_constant = np.asarray(held.any(axis=1))
         for side, axis in ((0, 2), (1, 1)):
@@ -257,11 +264,12 @@ class SchurComplementSolver:
         damping: float,
         cost: float,
     ) -> tuple[float, float, float]:
-        """Write the next parameters to ``trial``.
+        """Compute a Levenberg-Marquardt step from ``state`` and write the result to ``trial``.
 
         Returns:
-            Cost of the visible observations, decrease (observations that become invisible count as
-            unchanged) and predicted decrease; infinite if the system has no finite solution.
+            Cost of the visible observations, actual decrease of the cost, and predicted decrease of
+            the cost. The actual decrease counts observations that become invisible as unchanged. If
+            the system has no finite solution, the cost is infinite.
         """
         diagonal = self.total.diagonal
         boost = np.where(diagonal > 0, damping * diagonal, 1.0)
@@ -300,12 +308,12 @@ class SchurComplementSolver:
             return boost
         matrix = np.zeros((len(boost), len(boost)))
         kernels.assemble_reduced_matrix(self.total, boost, self.p.bundle.layout.pair, matrix)
-        # the transpose is in Fortran's order, so that nothing is copied
+        # LAPACK does not copy the transposed matrix, because it has Fortran's memory order.
         _, solution, info = lapack.dposv(matrix.T, rhs, lower=0, overwrite_a=1)
         return solution if info == 0 else np.full_like(boost, np.nan)
 
     def _solve_sparse(self, boost: Float64, rhs: Float64) -> Float64:
-        """Solve by conjugate gradients with a block-Jacobi preconditioner."""
+        """Solve the reduced camera system by block-Jacobi preconditioned conjugate gradients."""
         total = self.total
         poses = total.border.shape[1]
         diagonal = np.triu(total.blocks[self.p.pairs[:, 0] == self.p.pairs[:, 1]])
@@ -332,7 +340,7 @@ def _conjugate_gradients(
     precondition: Callable[[Float64], Float64],
     rhs: Float64,
 ) -> Float64:
-    """Solve from 0 to a relative residual of ``CG_TOLERANCE`` in the norm of the preconditioner."""
+    """Solve a linear system by conjugate gradients to the relative residual ``CG_TOLERANCE``."""
     solution, residual = np.zeros_like(rhs), rhs.copy()
     direction = precondition(residual)
     energy = float(residual @ direction)

@@ -1,14 +1,16 @@
 """Compiled kernels of bundle adjustment: linearization, Schur complement, back-substitution.
 
-A kernel works on a range of points and writes only to the data of that range. Ranges of points
-therefore run in threads without the GIL, and results do not depend on the number of threads.
-Kernels allocate no memory: the caller passes buffers, and numba's reference counting is off
-(``_nrt=False``), which is 1.7 times faster.
+Each kernel processes a range of 3D points and writes only to the data of that range. Threads
+process the ranges of points without the GIL, and results do not depend on the number of threads.
+Kernels allocate no memory, so numba's reference counting is disabled (``_nrt=False``), which is 1.7
+times faster.
 
-Observations are sorted by point, then by image. Each variable image and focal length has a slot.
-Camera-side vectors hold 7 parameters per image slot (rotation, translation, log scale of the depth
-map), then one per focal slot. The updates are ``R <- exp(w) R``, ``t <- t + dt``, ``s <- s + ds``
-and ``f <- f exp(a)``.
+Observations are sorted by point, then by image. Each image with a variable pose or depth scale has
+a pose slot, an index into the camera parameters. Each variable focal length has a focal slot.
+A vector of camera parameters contains 7 parameters per pose slot (rotation, translation, log scale
+of the depth map), followed by one parameter per focal slot. A step updates rotation, translation,
+log scale and focal length by ``R <- exp(w) R``, ``t <- t + dt``, ``s <- s + ds`` and ``f <- f
+exp(a)``.
 """
 
 from __future__ import annotations
@@ -30,44 +32,44 @@ MAX_SLOPE = 1e6
 """Maximum slope of a ray of a point that projects into an image, which keeps all derivatives
 finite. [ours]"""
 MIN_DEPTH_RATIO = 0.1
-"""Minimum ratio of the depths of a point after and before a step. Without this minimum, the
-linearized log depth would move distant points behind the camera. [ours]"""
+"""Minimum ratio of a point's depths after and before a step. The linearized log depth would
+otherwise move distant points behind the camera. [ours]"""
 STEP_REDUCTION = 0.25
-"""Factor on the step of a point that violates MIN_DEPTH_RATIO. [ours]"""
+"""Factor that shortens the step of a point whose depth decreases too much. [ours]"""
 MIN_STEP_LENGTH = 0.01
-"""Relative step length below which a point is not moved. [ours]"""
+"""Ratio of shortened to full step length below which a point is not moved. [ours]"""
 MAX_POINT_STEPS = 10
-"""Number of steps of each point with fixed cameras after a joint step of points and cameras. Points
-with outliers converge slowly under robust losses, and the additional steps halve the run time.
-[tuned: benchmarks.bundle_adjustment]"""
+"""Maximum number of steps of each point with fixed cameras after a joint step of points and
+cameras. Points with outliers converge slowly under robust losses, and the additional steps halve
+the run time. [tuned: benchmarks.bundle_adjustment]"""
 POINT_STEP_DAMPING = 1e-6
-"""Damping of the steps of single points with fixed cameras. [ours]"""
+"""Levenberg-Marquardt damping of the steps of single points with fixed cameras. [ours]"""
 NUM_IMAGE_PARAMS, NUM_FOCAL_PARAMS = np.int64(7), np.int64(1)
 """Number of parameters of an image (pose and log scale of its depth map) and of a focal length."""
 LOG_SCALE_IDX = 6
-"""Index of the log scale among the parameters of an image."""
+"""Index of the depth map's log scale among the 7 parameters of an image."""
 _ONLY = np.int64(0)
-"""Index of a block buffer with one row."""
+"""Row index for arrays of normal equations that have a single row."""
 
 
 class BundleObservations(NamedTuple):
     """Observations of all points, sorted by point, then by image."""
 
     start: Int64
-    """(p + 1,) the observations of point p are ``start[p]:start[p + 1]``."""
+    """(p + 1,) index of the first observation of each point, and the number of observations."""
     image: Int32
     xy: Float64
     weight: Float64
     """Inverse standard deviation of the keypoint of each observation, in 1 / pixels."""
     log_depth: Float64
     depth_weight: Float64
-    """Inverse standard deviation of the log depth of each observation, 0 without depth."""
+    """Inverse standard deviation of the log depth of each observation, 0 if depth is invalid."""
 
 
 class ParameterLayout(NamedTuple):
-    """Slots of the variable parameters, where slot -1 means constant.
+    """Indices (slots) of the variable parameters in the linear system, -1 for constant parameters.
 
-    An image has a pose slot if its pose, its log scale or both are variable.
+    An image has a pose slot if its pose or the log scale of its depth map is variable.
     """
 
     camera_of_image: Int32
@@ -76,11 +78,11 @@ class ParameterLayout(NamedTuple):
     variable_point: Bool
     variable_scale: Bool
     pair: Int32
-    """(s, s) row of the pose slots ``i <= j`` in :attr:`ReducedCameraSystem.blocks`, or -1."""
+    """(s, s) index of the 7 x 7 block of two poses in the reduced camera system, or -1."""
 
 
 class RobustLosses(NamedTuple):
-    """Codes and scales of the robust losses, for whitened residuals."""
+    """Types and scales of the robust losses of reprojection and log-depth residuals."""
 
     reprojection_loss: int
     reprojection_scale: float
@@ -89,7 +91,7 @@ class RobustLosses(NamedTuple):
 
 
 class BundleData(NamedTuple):
-    """Data that is constant during a bundle adjustment."""
+    """Observations, parameter layout and losses, which are constant during bundle adjustment."""
 
     obs: BundleObservations
     layout: ParameterLayout
@@ -97,7 +99,7 @@ class BundleData(NamedTuple):
 
 
 class BundleParameters(NamedTuple):
-    """Variables of bundle adjustment."""
+    """Values of the poses, depth scales, intrinsics and points in bundle adjustment."""
 
     rotations: Float64
     """(n, 3, 3) rotations of ``cam_from_world``."""
@@ -112,48 +114,50 @@ class BundleParameters(NamedTuple):
 
 
 class ReducedCameraSystem(NamedTuple):
-    """Reduced camera system of a range of points, or the sum over all ranges."""
+    """Reduced camera system (Schur complement) of a range of points or of all points."""
 
     blocks: Float64
-    """(pairs, 7, 7) blocks of image pairs. Diagonal blocks only have their upper triangle."""
+    """(pairs, 7, 7) blocks of the Schur complement for pairs of images with common points. Blocks
+    on the diagonal store only their upper triangle."""
     border: Float64
-    """(focals, 7 poses) coupling between focal lengths and images."""
+    """(focals, 7 poses) block between focal lengths and image parameters."""
     corner: Float64
-    """(focals, focals) block of the focal lengths."""
+    """(focals, focals) block of the Schur complement for the focal lengths."""
     gradient: Float64
-    """(d,) gradient before the elimination of points."""
+    """(d,) gradient of the cost by the camera parameters, before the elimination of points."""
     diagonal: Float64
     """(d,) diagonal of the Gauss-Newton matrix before the elimination of points."""
     rhs: Float64
-    """(d,) change of the gradient by the elimination of points."""
+    """(d,) change of the camera parameters' gradient by the elimination of points."""
 
 
 class EliminationBuffers(NamedTuple):
-    """Working memory of one range of points, for tracks of up to ``longest`` observations."""
+    """Buffers for one range of points, whose tracks have up to ``longest`` observations."""
 
     slots: Int64
-    """(longest,) pose slots of the current point."""
+    """(longest,) pose slots of the images that observe the current point."""
     focals: Int64
-    """(longest,) focal slots of the current point."""
+    """(longest,) focal slots of the cameras that observe the current point."""
     y: Float64
-    """(longest, 3, 7) coupling of the point with its pose slots."""
+    """(longest, 3, 7) blocks of the normal equations between the point and image parameters."""
     yf: Float64
-    """(longest, 3, 1) coupling of the point with its focal slots."""
+    """(longest, 3, 1) blocks of the normal equations between the point and focal lengths."""
     columns: Float64
     before: Float64
-    """(longest, 2) cost and depth of each observation before a step."""
+    """(longest, 2) cost and point depth of each observation before a step."""
     block: Float64
-    """(1, 10) normal equations of one point, laid out as a row of ``eliminated``."""
+    """(1, 10) normal equations of one point, with the same columns as ``eliminated``."""
     vector: Float64
 
 
 class LinearizedObservation(NamedTuple):
-    """Linearization of one observation in the camera frame.
+    """Cost, gradient and Gauss-Newton matrix of one observation in the camera frame.
 
-    ``q`` is the rotated point and ``x, y, z`` the camera point. ``g`` is the gradient of the cost
-    with respect to the camera point, and ``h`` the Gauss-Newton matrix (``hxy`` is 0). Pose, point
-    and focal length displace the camera point by ``w x q + dt``, ``R dX`` and ``(x, y, 0) da``.
-    ``gs``, ``hss`` and ``hzs`` belong to the log scale of the depth map.
+    The point in the camera frame is ``(x, y, z) = q + t`` with the rotated point ``q = R X``. The
+    vector ``g`` is the gradient of the cost by the camera-frame point, and ``h`` is the
+    Gauss-Newton matrix, whose entry ``hxy`` is 0. Steps of pose, 3D point and focal length displace
+    the camera-frame point by ``w x q + dt``, ``R dX`` and ``(x, y, 0) da``. The fields ``gs``,
+    ``hss`` and ``hzs`` are the derivatives by the log scale of the depth map.
     """
 
     visible: bool
@@ -178,7 +182,7 @@ class LinearizedObservation(NamedTuple):
 
 
 def allocate_buffers(longest: int) -> EliminationBuffers:
-    """Allocate working memory for tracks of up to ``longest`` observations."""
+    """Allocate the buffers of one range of points with up to ``longest`` observations each."""
     longest = max(longest, 1)
     return EliminationBuffers(
         slots=np.empty(longest, np.int64),
@@ -198,13 +202,13 @@ _kernel, _helper = jit.kernel(**_OPTIONS), jit.helper(**_OPTIONS)
 
 @_kernel
 def counting_sort(keys: Int32, previous: Int64, start: Int64, order: Int64) -> None:
-    """Sort the rows ``previous`` by ``keys[row]`` (stable counting sort).
+    """Sort row indices by integer keys with a stable counting sort.
 
     Args:
-        keys: Sort key of each row.
-        previous: Rows in their previous order.
-        start: (keys + 2,) zeros, which receive the first position of each key.
-        order: Array that receives the sorted rows.
+        keys: Integer sort key of each row.
+        previous: Row indices in their order before sorting.
+        start: (number of keys + 2,) zeros, which receive the first sorted position of each key.
+        order: Array that receives the sorted row indices.
     """
     for row in previous:
         start[keys[row] + 2] += 1
@@ -219,13 +223,13 @@ def counting_sort(keys: Int32, previous: Int64, start: Int64, order: Int64) -> N
 def number_covisible_poses(
     obs: BundleObservations, pose_slot: Int32, variable: Bool, pair: Int32
 ) -> int:
-    """Number the pairs of pose slots that share a variable point.
+    """Number the blocks of the reduced camera system, one per image pair with a shared point.
 
     Args:
         obs: Observations.
         pose_slot: (n,) pose slot of each image.
         variable: (p,) bool.
-        pair: (s, s) array of -1, which receives the numbers on and above the diagonal.
+        pair: (s, s) array of -1, which receives the block numbers on and above the diagonal.
 
     Returns:
         Number of pairs.
@@ -252,7 +256,7 @@ def number_covisible_poses(
 def linearize_observation(
     k: int, p: int, bundle: BundleData, state: BundleParameters
 ) -> LinearizedObservation:
-    """Linearize observation ``k`` of point ``p``, with cost and derivatives 0 if invisible."""
+    """Linearize one observation; cost and derivatives are 0 if the point is not visible."""
     obs, robust = bundle.obs, bundle.robust
     image = obs.image[k]
     rotation, points = state.rotations, state.points
@@ -303,7 +307,7 @@ def linearize_observation(
 
 @_helper
 def _fill_pose_columns(s: LinearizedObservation, columns: Float64) -> None:
-    """Compute ``columns (3, 7) <- h [dx/dw | dx/dt | scale]``."""
+    """Multiply an observation's Gauss-Newton matrix by the Jacobian of image parameters."""
     columns[0, 0] = s.hxz * s.qy
     columns[0, 1] = s.hxx * s.qz - s.hxz * s.qx
     columns[0, 2] = -s.hxx * s.qy
@@ -327,7 +331,7 @@ def _fill_pose_columns(s: LinearizedObservation, columns: Float64) -> None:
 def _add_pose(
     s: LinearizedObservation, columns: Float64, slot: int, row: int, system: ReducedCameraSystem
 ) -> None:
-    """Add gradient, diagonal and the upper triangle of the diagonal block of a pose."""
+    """Add the gradient and diagonal block of an observation's pose to the camera system."""
     blocks, gradient, diagonal = system.blocks, system.gradient, system.diagonal
     n = NUM_IMAGE_PARAMS * slot
     gradient[n] += s.qy * s.gz - s.qz * s.gy
@@ -369,7 +373,7 @@ def _add_focal(
     poses: int,
     system: ReducedCameraSystem,
 ) -> None:
-    """Add gradient, diagonal, corner entry and pose coupling of a focal length."""
+    """Add the gradient and blocks of an observation's focal length to the camera system."""
     own = s.x * s.x * s.hxx + s.y * s.y * s.hyy
     system.gradient[NUM_IMAGE_PARAMS * poses + focal] += s.x * s.gx + s.y * s.gy
     system.diagonal[NUM_IMAGE_PARAMS * poses + focal] += own
@@ -385,7 +389,7 @@ def _add_focal(
 def _add_point(
     s: LinearizedObservation, rotation: Float64, image: int, block: Float64, p: int
 ) -> None:
-    """Add the packed lower triangle of ``R^T h R`` to ``block[p, :6]``, ``R^T g`` to ``[6:9]``."""
+    """Add the Gauss-Newton matrix and gradient of an observation to those of its point."""
     r = rotation
     for a in range(3):
         r0, r1, r2 = r[image, 0, a], r[image, 1, a], r[image, 2, a]
@@ -403,7 +407,7 @@ def _add_point(
 def _add_coupling(
     columns: Float64, width: int, rotation: Float64, image: int, y: Float64, n: int, fresh: bool
 ) -> None:
-    """Set (if ``fresh``) or add ``y[n] (3, width)`` to ``R^T columns``."""
+    """Write (if ``fresh``) or add an observation's block between point and camera parameters."""
     for c in range(3):
         r0, r1, r2 = rotation[image, 0, c], rotation[image, 1, c], rotation[image, 2, c]
         for a in range(width):
@@ -413,14 +417,15 @@ def _add_coupling(
 
 @_helper
 def _invert_factor(block: Float64, p: int, damping: float) -> bool:
-    """Replace the packed V in ``block[p, :6]`` by ``L^-1``, with ``V + damping m I = L L^T``.
+    """Invert the Cholesky factor ``L`` of a point's damped block ``V + damping m I = L L^T``.
 
-    ``m`` is the mean of the diagonal of V and is written to ``block[p, 9]``. Isotropic damping lets
-    a single-view point move only sideways; damping by the diagonal would let it slide along its
-    ray.
+    The damping is relative to ``m``, the mean of the diagonal of V. The inverse replaces V in
+    ``block[p, :6]``, and ``m`` is written to ``block[p, 9]``. A point in a single view has no
+    constraint along its ray. Isotropic damping prevents motion along the ray, unlike damping by the
+    diagonal of V.
 
     Returns:
-        False, and no change of V, if the damped block is not positive definite.
+        False if the damped block is not positive definite; V is then unchanged.
     """
     block[p, 9] = (block[p, 0] + block[p, 2] + block[p, 5]) / 3.0
     boost = damping * block[p, 9]
@@ -447,7 +452,7 @@ def _invert_factor(block: Float64, p: int, damping: float) -> bool:
 
 @_helper
 def _whiten(block: Float64, p: int, y: Float64, n: int, width: int) -> None:
-    """Compute ``y[n] (3, width) <- L^-1 y[n]``."""
+    """Multiply a (3, width) block of the normal equations by ``L^-1`` of its point."""
     i00, i10, i11 = block[p, 0], block[p, 1], block[p, 2]
     i20, i21, i22 = block[p, 3], block[p, 4], block[p, 5]
     for a in range(width):
@@ -459,7 +464,7 @@ def _whiten(block: Float64, p: int, y: Float64, n: int, width: int) -> None:
 
 @_helper
 def _point_step(block: Float64, p: int, g0: float, g1: float, g2: float, step: Float64) -> float:
-    """Compute ``step (3,) <- -V^-1 g``; returns the predicted decrease of the cost."""
+    """Compute the step ``-V^-1 g`` of a point, and return the predicted decrease of the cost."""
     i00, i10, i11 = block[p, 0], block[p, 1], block[p, 2]
     i20, i21, i22 = block[p, 3], block[p, 4], block[p, 5]
     z0 = i00 * g0
@@ -482,7 +487,7 @@ def _eliminate_from_poses(
     system: ReducedCameraSystem,
     scratch: EliminationBuffers,
 ) -> None:
-    """Subtract the Schur complement of a point: ``S_ij -= Y_i^T Y_j``, ``rhs_i -= Y_i^T z``."""
+    """Subtract a point's Schur complement ``Y_i^T Y_j`` from the blocks of its images."""
     blocks, rhs, slots, y = system.blocks, system.rhs, scratch.slots, scratch.y
     for a in range(count):
         own = pair[slots[a], slots[a]]
@@ -510,7 +515,7 @@ def _eliminate_from_focals(
     system: ReducedCameraSystem,
     scratch: EliminationBuffers,
 ) -> None:
-    """Subtract the Schur complement of a point from the blocks of its focal lengths."""
+    """Subtract a point's Schur complement from the blocks of its focal lengths."""
     focals, yf, slots, y = scratch.focals, scratch.yf, scratch.slots, scratch.y
     for f in range(num_focals):
         y0, y1, y2 = yf[f, 0, 0], yf[f, 1, 0], yf[f, 2, 0]
@@ -546,21 +551,22 @@ def eliminate_points(
     eliminated: Float64,
     scratch: EliminationBuffers,
 ) -> float:
-    """Linearize and eliminate the points ``first:last``.
+    """Linearize the observations of the points ``first:last`` and eliminate these points.
 
     Args:
-        first: First point.
-        last: End of the range.
-        damping: Damping of the point blocks; the camera side stays undamped.
-        bundle: Constant data.
-        state: Parameters.
-        system: Reduced camera system that is added to.
-        eliminated: (p, 10); receives the packed ``L^-1`` of the damped 3 x 3 block V, its gradient,
-            and the mean of the diagonal of V. The row of a constant or unobserved point is 0.
-        scratch: Buffers.
+        first: Index of the first point.
+        last: Index after the last point.
+        damping: Levenberg-Marquardt damping of the points; the camera blocks remain undamped.
+        bundle: Observations, parameter layout and robust losses.
+        state: Poses, points, focal lengths and depth scales.
+        system: Reduced camera system to which the points of the range are added.
+        eliminated: (p, 10) output with a row per point: 6 entries of ``L^-1`` with the damped block
+            ``V = L L^T``, the gradient, and the mean of the diagonal of V. Rows of constant or
+            unobserved points are 0.
+        scratch: Buffers of this range of points.
 
     Returns:
-        Cost of the points.
+        Cost of the observations of these points.
     """
     obs, layout = bundle.obs, bundle.layout
     slots, focals, columns = scratch.slots, scratch.focals, scratch.columns
@@ -587,7 +593,8 @@ def eliminate_points(
                 continue
             _add_point(s, state.rotations, image, eliminated, p)
             if slot >= 0:
-                # a track may contain an image twice; sorted by image, only the last slot can repeat
+                # A track may contain an image twice. Observations are sorted by image, so equal
+                # slots are adjacent.
                 fresh = count == 0 or slots[count - 1] != slot
                 if fresh:
                     slots[count] = slot
@@ -632,9 +639,10 @@ def _joint_step(
     eliminated: Float64,
     scratch: EliminationBuffers,
 ) -> float:
-    """Back-substitute: ``scratch.vector <- -V^-1 (g + W^T delta)``, the step of the point.
+    """Compute the step ``-V^-1 (g + W^T delta)`` of a point by back-substitution.
 
-    Fills ``scratch.before`` with cost (-1 if invisible) and depth of each observation.
+    The step is written to ``scratch.vector``. The array ``scratch.before`` receives the cost (-1 if
+    invisible) and depth of each observation.
 
     Returns:
         Predicted decrease of the cost.
@@ -675,11 +683,11 @@ def _joint_step(
 def _look(
     p: int, bundle: BundleData, trial: BundleParameters, scratch: EliminationBuffers
 ) -> tuple[float, float, bool]:
-    """Evaluate a point after a step; fills ``scratch.block`` with its normal equations.
+    """Evaluate the cost of a point after a step, and write the point's normal equations.
 
     Returns:
-        Cost after the step, cost before the step of observations that became invisible, and whether
-        all depths satisfy ``MIN_DEPTH_RATIO``.
+        Cost of the point after the step, previous cost of the observations that became invisible,
+        and True if no depth of the point decreased below ``MIN_DEPTH_RATIO``.
     """
     obs, before, block = bundle.obs, scratch.before, scratch.block
     cost = lost = 0.0
@@ -711,14 +719,14 @@ def update_points(
     eliminated: Float64,
     scratch: EliminationBuffers,
 ) -> tuple[float, float, float]:
-    """Update the points ``first:last`` of ``trial`` after a camera step, then each point alone.
+    """Update the points ``first:last`` after a camera step, and then optimize each point alone.
 
-    A point takes steps of its own while the predicted relative decrease exceeds ``tolerance``.
+    Optimization of a single point stops if the predicted relative decrease of its cost is below
+    ``tolerance``.
 
     Returns:
-        ``(cost, lost, predicted)``. ``cost`` is the cost of the visible observations after the
-        step, ``lost`` the former cost of observations that became invisible. ``predicted`` is the
-        predicted decrease by the joint step of the points.
+        Cost of the visible observations after the update, previous cost of the observations that
+        became invisible, and decrease of the cost predicted for the joint step.
     """
     points, step = trial.points, scratch.vector
     total = total_lost = predicted = 0.0
@@ -755,7 +763,7 @@ def update_points(
 
 @_kernel
 def rotation_from_vector(x: float, y: float, z: float) -> Any:
-    """Convert a rotation vector to rows of a matrix by Rodrigues' formula, by a series near 0."""
+    """Convert a rotation vector to a rotation matrix by Rodrigues' formula."""
     squared = x * x + y * y + z * z
     angle = np.sqrt(squared)
     if angle < 1e-4:
@@ -775,7 +783,7 @@ def rotation_from_vector(x: float, y: float, z: float) -> Any:
 def update_cameras(
     delta: Float64, layout: ParameterLayout, state: BundleParameters, trial: BundleParameters
 ) -> None:
-    """Update the cameras of ``trial``, a copy of those of ``state``, by ``delta``."""
+    """Apply a camera step ``delta`` to the poses, depth scales and focal lengths of ``trial``."""
     for image in range(len(layout.pose_slot)):
         slot = layout.pose_slot[image]
         if slot < 0:
@@ -802,7 +810,7 @@ def update_cameras(
 def assemble_reduced_matrix(
     system: ReducedCameraSystem, boost: Float64, pair: Int32, out: Float64
 ) -> None:
-    """Write the lower triangle of the reduced camera matrix, with ``boost`` on the diagonal."""
+    """Assemble the lower triangle of the reduced camera matrix with damping ``boost``."""
     poses = len(pair)
     for i in range(poses):
         for j in range(i, poses):
@@ -825,7 +833,7 @@ def assemble_reduced_matrix(
 def multiply_reduced_matrix(
     system: ReducedCameraSystem, boost: Float64, pairs: Int64, x: Float64, out: Float64
 ) -> None:
-    """Compute ``out (d,) <- (reduced matrix + diag(boost)) x`` with the slots ``pairs`` (n, 2)."""
+    """Multiply the reduced camera matrix with damping ``boost`` by a vector ``x`` (d,)."""
     for a in range(len(x)):
         out[a] = boost[a] * x[a]
     for n in range(len(pairs)):
@@ -858,7 +866,7 @@ def invert_point_blocks(
     scratch: EliminationBuffers,
     out: Float64,
 ) -> None:
-    """Write the inverse of ``V + damping I`` of the points ``first:last`` to ``out`` (p, 3, 3)."""
+    """Invert the damped 3 x 3 blocks ``V + damping I`` of the points ``first:last``."""
     block = scratch.block
     for p in range(first, last):
         for a in range(10):
@@ -868,7 +876,7 @@ def invert_point_blocks(
             s = linearize_observation(k, p, bundle, state)
             _add_point(s, state.rotations, bundle.obs.image[k], block, _ONLY)
         if not _invert_factor(block, _ONLY, 0.0):
-            # an unobserved direction with strong other ones: rounding cancelled the damping
+            # Rounding errors can cancel the damping of a point's unobserved direction.
             _invert_factor(block, _ONLY, 1e-12)
         i00, i10, i11 = block[0, 0], block[0, 1], block[0, 2]
         i20, i21, i22 = block[0, 3], block[0, 4], block[0, 5]

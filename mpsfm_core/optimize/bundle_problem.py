@@ -1,4 +1,4 @@
-"""Problem of bundle adjustment: input arrays, validation, and layout for the kernels."""
+"""Input arrays of bundle adjustment, their validation, and their layout for the kernels."""
 
 from __future__ import annotations
 
@@ -18,139 +18,147 @@ from mpsfm_core.optimize.options import BundleOptions
 from mpsfm_core.support.threads import thread_limit
 
 RANGE_SIZE = 8000
-"""Number of observations per range of points; a step on a range takes about 2 ms. [ours]"""
+"""Number of observations per range of 3D points that one thread processes at a time. [ours]"""
 MAX_RANGES = 8
-"""Maximum number of ranges, which run in parallel. [ours]"""
+"""Maximum number of ranges of 3D points, which threads process in parallel. [ours]"""
 MAX_BUFFER_BYTES = 1 << 30
-"""Memory of the copies of the reduced camera system above which fewer ranges are used. [ours]"""
+"""Maximum size in bytes of all copies of the reduced camera system, one per range. [ours]"""
 
 Result = TypeVar("Result")
 PointRange = tuple[int, int, int]
-"""Number of the range, its first point, and the end."""
+"""Number of a range of points, index of its first point, and index after its last point."""
 
 
 @dataclass(frozen=True, eq=False)
 class BundleProblem:
     """Parameters and observations of a bundle adjustment with n images, k cameras and p points.
 
-    Gauge: keep a pose constant. If no depth determines the scale, set ``scale_anchor`` too.
+    Callers fix the gauge by a constant pose. If no depth determines the scale, callers also set
+    ``scale_anchor``.
     """
 
     rotations: Float64
-    """(n, 3, 3) rotation of ``cam_from_world``."""
+    """(n, 3, 3) rotation of ``cam_from_world`` of each image."""
     translations: Float64
-    """(n, 3) translation of ``cam_from_world``."""
+    """(n, 3) translation of ``cam_from_world`` of each image."""
     intrinsics: Float64
-    """(k, 4) fx, fy, cx, cy in pixels."""
+    """(k, 4) camera parameters fx, fy, cx, cy in pixels."""
     camera_of_image: NDArray[np.integer[Any]]
-    """(n,) row of ``intrinsics`` of each image."""
+    """(n,) camera of each image, as row of ``intrinsics``."""
     points: Float64
-    """(p, 3) world points."""
+    """(p, 3) 3D points in the world frame."""
     obs_image: NDArray[np.integer[Any]]
-    """(m,) image of each observation."""
+    """(m,) index of the image of each observation."""
     obs_point: NDArray[np.integer[Any]]
-    """(m,) point of each observation."""
+    """(m,) index of the 3D point of each observation."""
     obs_xy: Float64
     """(m, 2) keypoint of each observation, in COLMAP's pixel coordinates."""
     obs_std_px: Float64 | float = 1.0
-    """(m,) or one number, standard deviation of the keypoints."""
+    """(m,) standard deviation in pixels of the keypoint of each observation, or one number for
+    all."""
     obs_log_depth: Float64 | None = None
-    """(m,) log of the depth map at each observation, NaN where invalid; None without depth."""
+    """(m,) log of the depth map at each observation, NaN if invalid (None without depth)."""
     obs_std_log_depth: Float64 | float = 1.0
-    """(m,) or one number, standard deviation of the log depth: sqrt(variance) / depth."""
+    """(m,) standard deviation ``sqrt(variance) / depth`` of each log depth, or one number for
+    all."""
     variable_pose: Bool | None = None
-    """(n,) bool; None makes all poses variable."""
+    """(n,) bool, True for images with variable pose (None makes all poses variable)."""
     variable_point: Bool | None = None
-    """(p,) bool; None makes all points variable."""
+    """(p,) bool, True for variable 3D points (None makes all points variable)."""
     variable_focal: Bool | None = None
-    """(k,) bool, cameras whose focal length is variable, with constant aspect ratio; None: none."""
+    """(k,) bool, True for cameras with variable focal length and constant ``fx / fy``. None keeps
+    all focal lengths constant."""
     prior_log_focals: Float64 | None = None
-    """(k,) mean of the prior of ``log fx``; None: the given ``fx``."""
+    """(k,) mean of the prior on ``log fx`` of each camera (None uses ``intrinsics``)."""
     prior_std_log_focals: Float64 | float = np.inf
-    """(k,) or one number, standard deviation of that prior; infinite without a prior."""
+    """(k,) standard deviation of the prior on ``log fx``, or one number for all. Infinity means no
+    prior."""
     log_scales: Float64 | None = None
-    """(n,) log of the factor on the depth map of each image; None: 0."""
+    """(n,) log of the scale factor on the depth map of each image (None uses 0)."""
     expected_log_scales: Float64 | None = None
-    """(n,) mean of the prior of the log scales; None: 0."""
+    """(n,) mean of the prior on the log scale of each depth map (None uses 0)."""
     std_log_scales: Float64 | float = np.inf
-    """(n,) or one number, standard deviation of that prior; infinite without a prior."""
+    """(n,) standard deviation of the prior on the log scales, or one number for all. Infinity means
+    no prior."""
     variable_scale: Bool | None = None
-    """(n,) bool, images whose log scale is variable; None: none."""
+    """(n,) bool, True for images whose depth map has a variable log scale (None keeps all
+    constant)."""
     scale_anchor: int | None = None
-    """A variable pose of which one translation coordinate is kept constant: the coordinate that a
-    change of scale about the first constant pose changes most."""
+    """Image with a variable pose, one translation coordinate of which is kept constant to fix the
+    scale. The constant coordinate is the most sensitive to a change of scale about the first
+    constant pose."""
 
 
 class ScalePrior(NamedTuple):
-    """Normal prior of the variable log scales."""
+    """Gaussian prior on the variable log scales of depth maps."""
 
     image: Int64
-    """(s,) image of each log scale."""
+    """(s,) index of the image of each log scale."""
     slot: Int64
-    """(s,) pose slot of the image."""
+    """(s,) pose slot of the image of each log scale."""
     log_scale: Float64
     """(s,) mean."""
     weight: Float64
-    """(s,) inverse variance."""
+    """(s,) inverse variance of each prior."""
 
     def cost(self, state: kernels.BundleParameters) -> float:
-        """Return half the weighted sum of squares."""
+        """Return the cost of the prior, half the weighted sum of squared residuals."""
         residuals = state.log_scales[self.image] - self.log_scale
         return 0.5 * float(residuals @ (self.weight * residuals))
 
 
 class FocalPrior(NamedTuple):
-    """Normal prior of the variable log focal lengths."""
+    """Gaussian prior on the variable log focal lengths of cameras."""
 
     camera: Int64
-    """(s,) camera of each focal length."""
+    """(s,) index of the camera of each focal length."""
     slot: Int64
-    """(s,) focal slot of the camera."""
+    """(s,) focal slot of the camera of each focal length."""
     log_focal: Float64
     """(s,) mean."""
     weight: Float64
-    """(s,) inverse variance."""
+    """(s,) inverse variance of each prior."""
 
     def residuals(self, state: kernels.BundleParameters) -> Float64:
-        """Return (s,) log focal lengths minus their means."""
+        """Return the residuals (s,), log focal lengths minus their prior means."""
         residuals: Float64 = np.log(state.intrinsics[self.camera, 0]) - self.log_focal
         return residuals
 
     def cost(self, state: kernels.BundleParameters) -> float:
-        """Return half the weighted sum of squares."""
+        """Return the cost of the prior, half the weighted sum of squared residuals."""
         residuals = self.residuals(state)
         return 0.5 * float(residuals @ (self.weight * residuals))
 
 
 class PreparedBundle(NamedTuple):
-    """Validated problem in the layout of the kernels."""
+    """Validated bundle adjustment problem in the array layout of the compiled kernels."""
 
     bundle: kernels.BundleData
     state: kernels.BundleParameters
     pairs: Int64
-    """(b, 2) pose slots of each block of the reduced camera system."""
+    """(b, 2) pose slots of the two images of each block of the reduced camera system."""
     scale_prior: ScalePrior
     focal_prior: FocalPrior
     held: Bool
-    """(s, 7) bool, constant parameters of the images with a pose slot."""
+    """(s, 7) bool, True for constant parameters of the images with a pose slot."""
     ranges: list[PointRange]
     longest: int
-    """Length of the longest track."""
+    """Number of observations of the longest track."""
 
 
 class RangeExecutor(Protocol):
-    """Callable that runs a function on all ranges of points, possibly in threads."""
+    """Callable that applies a function to all ranges of 3D points, possibly in threads."""
 
     def __call__(self, function: Callable[[int, int, int], Result]) -> list[Result]:
-        """Return the results in the order of the ranges."""
+        """Return the function's results in the order of the ranges of 3D points."""
 
 
 def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBundle:
-    """Validate a problem, copy its variable arrays, and sort its observations by point.
+    """Validate a bundle adjustment problem and sort its observations by point.
 
     Raises:
-        DataError: A shape or index is wrong, a value is not finite, or a standard deviation is not
-            positive.
+        DataError: An array of the problem has a wrong shape, an index out of range, a value that is
+            not finite, or a standard deviation that is not positive.
     """
     state = _state(problem)
     images, points, cameras = (len(a) for a in (state.rotations, state.points, state.intrinsics))
@@ -195,7 +203,7 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
 
 @contextmanager
 def range_executor(ranges: list[PointRange], threads: int | None) -> Iterator[RangeExecutor]:
-    """Provide an executor, with threads if there are several ranges and processors."""
+    """Provide an executor that processes ranges of 3D points, in threads if useful."""
     count = min(len(ranges), threads or thread_limit())
     if count < 2:
 
@@ -245,7 +253,7 @@ def _observations(problem: BundleProblem, images: int, points: int) -> kernels.B
 def _sorted_by_point(
     image: NDArray[np.int32], point: NDArray[np.int32], images: int, points: int
 ) -> tuple[Int64, Int64]:
-    """Sort observations by point, then image; returns ``(start, order)``."""
+    """Sort observations by point and image, and return each point's first observation."""
     by_image, order = np.empty(len(image), np.int64), np.empty(len(image), np.int64)
     start = np.zeros(points + 2, np.int64)
     kernels.counting_sort(image, np.arange(len(image)), np.zeros(images + 2, np.int64), by_image)
@@ -325,7 +333,7 @@ def _slots(variable: Bool) -> NDArray[np.int32]:
 
 
 def _scale_gauge(anchor: int, variable: Bool, state: kernels.BundleParameters) -> tuple[int, int]:
-    """Return the image and the pose coordinate that fix the scale gauge."""
+    """Return the image and pose parameter to keep constant, which fixes the scale gauge."""
     if not (0 <= anchor < len(variable) and variable[anchor]) or variable.all():
         raise DataError(
             "scale_anchor", "must be a variable pose, and another pose must be constant"
@@ -337,7 +345,7 @@ def _scale_gauge(anchor: int, variable: Bool, state: kernels.BundleParameters) -
 
 
 def _ranges(start: Int64, pairs: int) -> list[PointRange]:
-    """Split points into ranges of similar numbers of observations, independent of threads."""
+    """Split 3D points into ranges with similar numbers of observations."""
     max_count = MAX_BUFFER_BYTES // (8 * int(kernels.NUM_IMAGE_PARAMS) ** 2 * max(pairs, 1))
     count = max(1, min(MAX_RANGES, int(start[-1]) // RANGE_SIZE, max_count))
     ends = np.searchsorted(start, start[-1] * np.arange(1, count) / count)

@@ -22,12 +22,12 @@ def compute_point_covariances(
     """Compute the covariance of each point for fixed cameras.
 
     The covariance is the inverse of the block of the point in the normal equations, with the IRLS
-    weights of the robust losses, as in COLMAP's ``estimate_ba_covariance``. Unobserved directions
-    have the variance ``1 / DAMPING``.
+    weights of the robust losses, as in COLMAP's ``estimate_ba_covariance``. Directions that no
+    image observes have the variance ``1 / DAMPING``.
 
     Args:
-        problem: The bundle adjustment problem, whose points are all treated as variable.
-        options: Options with the robust losses and the number of threads.
+        problem: Bundle adjustment problem, whose points are all treated as variable.
+        options: Options of bundle adjustment with the robust losses and the number of threads.
 
     Returns:
         (p, 3, 3) float64 covariances in the world frame, in squared world units.

@@ -1,8 +1,8 @@
 """Refinement of a depth map with normals and triangulated points (paper appendix B).
 
-IRLS minimizes the energy of :mod:`mpsfm_core.optimize.integration_energy`. Each re-weighting gives
-a linear system with a five-point stencil, which a few multigrid-preconditioned CG iterations
-decrease. Large maps are first refined on every second pixel.
+IRLS minimizes the energy of depth integration (:mod:`mpsfm_core.optimize.integration_energy`). Each
+IRLS re-weighting gives a linear system with a five-point stencil, solved approximately by a few
+multigrid-preconditioned CG iterations. Large depth maps are first refined on every second pixel.
 """
 
 from __future__ import annotations
@@ -38,20 +38,22 @@ from mpsfm_core.optimize.subsampling import (
 )
 
 _FILLED_LOG_VARIANCE = 1.0
-"""Variance of the log depth of pixels that have a normal but no prior, which only makes the system
-non-singular."""
+"""Variance of the log depth of pixels with a normal but no depth prior, which makes the linear
+system non-singular."""
 _COARSE_COLUMNS = 300
-"""Half of the map width from which maps are first refined on every second pixel, which is faster
-and reaches a lower energy. [tuned: benchmarks.depth_integration]"""
+"""Width in pixels of half-resolution depth maps from which depth integration starts at half
+resolution. A coarse start is faster and reaches a lower energy. [tuned:
+benchmarks.depth_integration]"""
 _FINE_ITERATIONS = 3
-"""Maximum number of IRLS re-weightings on the whole map after the coarse refinement. [ours]"""
+"""Maximum number of IRLS re-weightings at full resolution after the coarse refinement. [ours]"""
 _MAX_EXTRAPOLATION = 100.0
-"""Maximum ratio of integrated to known depth, which would be exceeded at grazing normals. [ours]"""
+"""Maximum ratio of depth integrated from normals to known depth, a limit at grazing normals.
+[ours]"""
 POINT_MAX_RATIO = 1.5
 """Maximum ratio between the depth of a triangulated point and the scaled prior for which the point
 is used. [reference]"""
 _FIXED_WEIGHT = 1e15
-"""Weight that fixes pixels of known depth, relative to couplings below 1e12."""
+"""Weight of a known pixel depth in the linear system, far above other coefficients (1e12)."""
 
 
 class Anchors(NamedTuple):
@@ -62,7 +64,8 @@ class Anchors(NamedTuple):
     """
 
     xy: Float64
-    """(n, 2) positions in pixels of the depth map. The nearest pixel is constrained."""
+    """(n, 2) positions of the points in pixels of the depth map. Each point constrains the nearest
+    pixel."""
     depth: Float64
     """(n,) depth z of the points in the unit of the scaled prior."""
     variance: Float64
@@ -79,25 +82,25 @@ class RefinedDepth:
     log_depth: Float64
     """(h, w) float64 natural logarithm of depth in the unit of the scaled prior."""
     valid: Bool
-    """(h, w) bool, False for pixels with neither a prior nor a connected normal, whose
-    value is the median."""
+    """(h, w) bool, False for pixels with neither a depth prior nor normals that connect them to
+    depth. The log depth of these pixels is the median."""
     scale: float
     """Scale of the depth prior during the refinement."""
     initial_energy: float
-    """Energy of the initial map for the same anchors."""
+    """Energy of the initial depth map for the same anchors."""
     energy: float
-    """Energy of the refined map, at most ``initial_energy``."""
+    """Energy of the refined depth map, at most ``initial_energy``."""
     point_energy: float
-    """Mean energy of one anchor in the refined map."""
+    """Mean energy per anchor (sparse point) in the refined depth map."""
     iterations: int
-    """Number of IRLS re-weightings on the whole map."""
+    """Number of IRLS re-weightings at full resolution."""
     cg_iterations: int
-    """Number of conjugate-gradient iterations on the whole map."""
+    """Number of conjugate-gradient iterations at full resolution."""
     converged: bool
-    """True if the refinement stopped because of its tolerance."""
+    """True if the relative decrease of the energy fell below the tolerance."""
     skipped: bool
-    """True if the map was not refined again, because the anchors fit about as well as before. The
-    energies are then those of the last refinement."""
+    """True if the depth map was not refined again, because the anchors fit about as well as before.
+    The energies of a skipped map are those of its last refinement."""
 
     @property
     def depth(self) -> Float32:
@@ -106,7 +109,7 @@ class RefinedDepth:
 
 
 class _Solver:
-    """Majorize-minimize solver for the energy of one image."""
+    """Majorize-minimize solver for the depth integration energy of one image."""
 
     def __init__(self, terms: EnergyTerms) -> None:
         self._terms = terms
@@ -125,8 +128,8 @@ class _Solver:
 class DepthIntegrator:
     """Depth integration of one image, for changing anchors and depth scales.
 
-    Pixels with a normal but without depth are integrated from their surroundings. Instances are
-    immutable, so that several threads may use them.
+    Pixels with a normal but without depth are integrated from neighboring pixels. Several threads
+    may use one instance, because instances are immutable.
 
     Args:
         depth: Depth prior with variance, at the resolution of ``camera``.
@@ -135,7 +138,8 @@ class DepthIntegrator:
         options: Options of the integration.
 
     Raises:
-        DataError: The priors and the camera differ in size, or a prior has no variance.
+        DataError: The depth prior, normal prior and camera differ in size, or a prior has no
+            variance.
     """
 
     def __init__(
@@ -185,9 +189,9 @@ class DepthIntegrator:
         Args:
             anchors: Triangulated points.
             scale: Scale of the depth prior.
-            start: Earlier result of this instance, which is rescaled and used as initial map. The
-                earlier result is returned unrefined if the anchors fit about as well as before.
-                None starts from the scaled prior.
+            start: Earlier refined depth of this instance, which is rescaled and used as initial
+                depth map. The earlier depth map is returned unrefined if the anchors fit about as
+                well as before. With None, the refinement starts from the scaled prior.
         """
         if start is None:
             solver = _Solver(self._terms(anchors, scale))
@@ -205,10 +209,10 @@ class DepthIntegrator:
         """Compute the marginal variance of the refined log depth.
 
         The variance is the exact diagonal of the inverse Gauss-Newton Hessian with the present IRLS
-        weights. Multiply the variance by depth^2 for the variance of depth.
+        weights. The variance of depth is this variance times depth^2.
 
         Returns:
-            (h, w) float32 variance, infinite where depth is invalid.
+            (h, w) float32 variance of log depth, infinite at pixels without valid depth.
         """
         terms = self._terms(anchors, refined.scale)
         here = majorize(refined.log_depth, terms)
@@ -222,7 +226,7 @@ class DepthIntegrator:
         anchors: Anchors,
         scale: float,
     ) -> RefinedDepth:
-        """Minimize the energy from the scaled prior, or from the result of a coarser grid."""
+        """Refine the scaled depth prior, first at half resolution for large depth maps."""
         if self._coarse is None:
             return self._descend(prior, here, solver, scale)
         coarse = self._coarse.refine(
@@ -245,7 +249,7 @@ class DepthIntegrator:
         scale: float,
         max_iterations: int | None = None,
     ) -> RefinedDepth:
-        """Minimize the energy by IRLS from the map z. Every accepted step decreases the energy."""
+        """Minimize the depth integration energy by IRLS from an initial log depth z (h, w)."""
         options = self.options
         limit = options.max_iterations if max_iterations is None else max_iterations
         initial_energy = here.energy
@@ -293,7 +297,7 @@ class DepthIntegrator:
         )
 
     def _point_terms(self, anchors: Anchors, prior: Float64) -> PointTerms:
-        """Convert anchors to the log depth of pixels, without unusable anchors and outliers."""
+        """Convert anchors to log depths of pixels, and remove invalid anchors and outliers."""
         height, width = prior.shape
         columns, rows = np.asarray(anchors.xy, np.float64).reshape(-1, 2).T
         depth, variance = np.asarray(anchors.depth), np.asarray(anchors.variance)
@@ -307,7 +311,7 @@ class DepthIntegrator:
         return PointTerms(rows[near], columns[near], log_depth[near], precision)
 
     def _integrate_from(self, known: Bool) -> Float64:
-        """Integrate normals from known log depth, with quadratic losses."""
+        """Integrate normals from pixels of known log depth, with quadratic losses."""
         losses = EnergyLosses(sharpness=1e-9, normal_limit=1e12, prior_scale=1e6, point_scale=1.0)
         terms = EnergyTerms(
             build_normal_terms(self._normals, self.camera, self._active, 1.0),
@@ -324,7 +328,7 @@ class DepthIntegrator:
 
 
 def _reachable(depth_valid: Bool, normals_valid: Bool) -> Bool:
-    """Return pixels with depth, and pixels with a normal that connects them to depth."""
+    """Return masks of pixels with depth, and of pixels that normals connect to depth."""
     active: Bool = depth_valid | normals_valid
     if depth_valid.all():
         return active

@@ -1,11 +1,12 @@
-"""Marginal variances: the exact diagonal of the inverse of a five-point grid operator.
+"""Marginal variances of refined log depth, the diagonal of an inverse grid operator.
 
-The algorithm is selected inversion by nested dissection (George, 1973). Separator lines halve the
-grid until small blocks remain. Blocks and then separators are eliminated bottom-up. Each
+The algorithm is selected inversion by nested dissection (George, 1973). The operator is a sparse
+matrix with a five-point stencil on the pixel grid. Separator lines halve the grid until small
+blocks remain. Block elimination proceeds bottom-up, from the small blocks to the separators. Each
 elimination leaves a dense Schur complement on the boundary of the eliminated part. A top-down pass
 then computes the entries of the inverse on these boundaries. Parts of equal size are processed
-together as stacked dense matrices. For n pixels this takes O(n^1.5) operations and O(n log n)
-memory.
+together as stacked dense matrices. Selected inversion for n pixels takes O(n^1.5) operations and
+O(n log n) memory.
 """
 
 from __future__ import annotations
@@ -18,13 +19,13 @@ from threadpoolctl import threadpool_limits
 from mpsfm_core.data import Float32, Float64, Int64
 
 _BLOCK_SIDE = 6
-"""Maximum side in pixels of a block that is not divided. [ours, fastest of 3 to 12]"""
+"""Maximum side in pixels of a grid block that is not divided further. [ours]"""
 
 _Pixel = tuple[int, int]
 
 
 class _Part(NamedTuple):
-    """Rectangle of the grid: its size, and the sides on which it has neighbors."""
+    """Rectangular part of the pixel grid, with its size and the sides that have neighbors."""
 
     height: int
     width: int
@@ -35,45 +36,47 @@ class _Part(NamedTuple):
 
 
 class _Child(NamedTuple):
-    """One half of every part of a group, separated by a line of pixels."""
+    """First or second halves of all parts in a group of equally shaped grid parts."""
 
     group: int
-    """Number of the group that contains the halves."""
+    """Number of the group of grid parts that contains the halves."""
     members: slice
     """Indices of the halves within their group."""
     where: Int64
-    """Indices of the boundary pixels of a half among the inner and outer pixels of the part."""
+    """Indices of a half's boundary pixels among the inner and outer pixels of the divided part."""
 
 
 class _Group(NamedTuple):
-    """Parts of the grid that have equal shape."""
+    """Group of rectangular grid parts with equal shape, which are processed together."""
 
     origins: Int64
-    """(m, 2) top left pixel of each part of the group."""
+    """(m, 2) row and column of the top left pixel of each part of the group."""
     inner: list[_Pixel]
-    """Pixels that are eliminated, relative to the top left pixel of the part."""
+    """Pixels that are eliminated, relative to the top left pixel of the grid part."""
     outer: list[_Pixel]
-    """Boundary pixels around the part, relative to the top left pixel of the part."""
+    """Boundary pixels around the grid part, relative to the top left pixel of the part."""
     children: list[_Child]
-    """Two halves of each part, or no halves."""
+    """Two halves of each grid part, or no halves."""
 
 
 class _Elimination(NamedTuple):
-    """Result of the elimination of the inner pixels of the parts of a group."""
+    """Inverse blocks from eliminating the inner pixels of equally shaped grid parts."""
 
     inverse: Float64
     """(m, s, s) inverses of the blocks of inner pixels."""
     gain: Float64
-    """(m, s, b) products of inverse block and coupling of inner to outer pixels."""
+    """(m, s, b) products of each inverse block with the matrix block between inner and outer
+    pixels."""
 
 
 def compute_inverse_diagonal(east: Float32, south: Float32, mass: Float32) -> Float64:
-    """Compute ``diag(A^-1)`` of the operator A that ``multigrid`` describes.
+    """Compute the diagonal of the inverse of a five-point grid operator.
 
     Args:
-        east: (h, w) couplings of each pixel to the next pixel to the right.
-        south: (h, w) couplings of each pixel to the next pixel below.
-        mass: (h, w) masses of the pixels. Every connected set of pixels needs a positive mass.
+        east: (h, w) coupling weights between each pixel and the next pixel to the right.
+        south: (h, w) coupling weights between each pixel and the next pixel below.
+        mass: (h, w) mass of each pixel, which is added to the diagonal. Every connected set of
+            pixels requires a positive mass.
 
     Returns:
         (h, w) float64 variances, infinite for pixels without couplings and mass.
@@ -81,7 +84,7 @@ def compute_inverse_diagonal(east: Float32, south: Float32, mass: Float32) -> Fl
     planes = np.zeros((2, mass.shape[0] + 1, mass.shape[1] + 1))
     planes[0, :-1, :-2] = east[:, :-1]
     planes[1, :-2, :-1] = south[:-1]
-    # index -1 is the last row or column, which is zero
+    # Index -1 wraps to the last row or column, which is zero.
     diagonal = sum(plane + np.roll(plane, 1, 1 - axis) for axis, plane in enumerate(planes))
     diagonal = diagonal[:-1, :-1] + mass
     detached = diagonal == 0
@@ -95,7 +98,7 @@ def compute_inverse_diagonal(east: Float32, south: Float32, mass: Float32) -> Fl
 
 
 def _dissect(height: int, width: int) -> list[_Group]:
-    """Dissect the grid into groups of parts, parents before children, beginning with the grid."""
+    """Dissect the pixel grid recursively, and group parts of equal shape."""
     groups: list[_Group] = []
     level = {_Part(height, width): [np.zeros((1, 2), np.int64)]}
     while level:
@@ -124,7 +127,7 @@ def _dissect(height: int, width: int) -> list[_Group]:
 
 
 def _halve(part: _Part) -> tuple[list[_Pixel], list[tuple[_Pixel, _Part]]]:
-    """Return the separator of a part, and the offsets and shapes of the separated halves."""
+    """Return the separator of a grid part, and the offsets and shapes of both halves."""
     height, width = part.height, part.width
     if max(height, width) <= _BLOCK_SIDE:
         return [(r, c) for r in range(height) for c in range(width)], []
@@ -155,7 +158,7 @@ def _surrounding(part: _Part) -> list[_Pixel]:
 
 
 def _eliminate(groups: list[_Group], planes: Float64, diagonal: Float64) -> list[_Elimination]:
-    """Eliminate bottom-up, adding the Schur complement of each part to the matrix of its parent."""
+    """Eliminate the inner pixels of all grid parts, from small parts to the whole grid."""
     eliminations: dict[int, _Elimination] = {}
     remainders: dict[int, Float64] = {}
     for number in reversed(range(len(groups))):
@@ -174,7 +177,7 @@ def _eliminate(groups: list[_Group], planes: Float64, diagonal: Float64) -> list
 
 
 def _add_stencil(front: Float64, group: _Group, planes: Float64, diagonal: Float64) -> None:
-    """Add the operator rows of the inner pixels to the matrix of a part."""
+    """Add the grid operator's rows of inner pixels to the dense matrix of a grid part."""
     index = {pixel: k for k, pixel in enumerate(group.inner + group.outer)}
     rows, columns = group.origins.T
     for k, (r, c) in enumerate(group.inner):
@@ -192,7 +195,7 @@ def _add_stencil(front: Float64, group: _Group, planes: Float64, diagonal: Float
 def _recover(
     groups: list[_Group], eliminations: list[_Elimination], shape: tuple[int, int]
 ) -> Float64:
-    """Recover variances top-down, from boundary covariances to those of the inner pixels."""
+    """Compute the variances of inner pixels from boundary covariances, top-down."""
     variance = np.empty(shape)
     around = [np.empty((len(g.origins), len(g.outer), len(g.outer))) for g in groups]
     for group, (inverse, gain), outer in zip(groups, eliminations, around, strict=True):

@@ -1,13 +1,14 @@
-"""Energy of depth integration and its quadratic majorizer.
+"""Energy of depth integration from normals, and the energy's quadratic majorizer.
 
-The variable is the log depth z of all pixels (paper appendix B; the logarithm makes the perspective
-residuals linear)::
+The variable is the log depth z of all pixels (paper appendix B). The logarithm makes the
+perspective normal residuals linear. The energy is::
 
     energy = sum over pixels and axes of   w_n / var_r * soft_min(r_+^2, r_-^2, limit)
            + sum over pixels of            w_d * charbonnier((z - log d)^2 / var_log_d)
            + sum over sparse points of     cauchy((z - log D)^2 / var_log_D)
 
-r_+ and r_- are the one-sided residuals of bilateral normal integration (Cao et al., ECCV 2022)::
+The residuals r_+ and r_- compare a normal with the depth slope to the next and to the previous
+pixel, as in bilateral normal integration (Cao et al., ECCV 2022)::
 
     r_+ = s (z[p + e] - z[p]) + n,    s = f (n . ray),    n = n_x or n_y
 
@@ -16,11 +17,12 @@ residual. With sharpness k::
 
     soft_min(a, b, limit) = -log((exp(-k a) + exp(-k b) + exp(-k limit)) / (2 + exp(-k limit))) / k
 
-The soft minimum continues the surface to one side, to the other, or to none. Its derivatives are
-the sigmoid weights of the published method. The Charbonnier loss
-``2 c^2 (sqrt(1 + s / c^2) - 1)`` replaces the truncated loss of the paper, which loses strips at
-depth discontinuities. All losses are concave in the squared residuals, so that IRLS is a
-majorize-minimize algorithm: a step that decreases the quadratic decreases the energy.
+The soft minimum continues the surface to the next pixel, to the previous pixel, or to neither. The
+derivatives of the soft minimum are the sigmoid weights of bilateral normal integration. The
+Charbonnier loss ``2 c^2 (sqrt(1 + s / c^2) - 1)`` replaces the truncated loss of the paper, which
+loses strips at depth discontinuities. All losses are concave in the squared residuals, so IRLS is a
+majorize-minimize algorithm. Each step that decreases the quadratic majorizer also decreases the
+energy.
 """
 
 from __future__ import annotations
@@ -35,22 +37,22 @@ from mpsfm_core.support import jit
 _kernel, _helper = jit.kernel(fastmath=True), jit.helper(fastmath=True)
 
 _MISSING = 1e30
-"""Squared residual assigned to the side of a pixel that has no neighbor."""
+"""Squared normal residual of a pixel towards a missing neighbor."""
 _SQRT_3 = 1.7320508075688772
 _MIN_NORMAL_VARIANCE = 1e-4
-"""Minimum variance of a normal, (0.6 deg)^2. Smaller variances make the linear system
+"""Minimum variance of a normal, (0.6 deg)^2. Smaller variances of normals make the linear system
 ill-conditioned."""
 MIN_LOG_VARIANCE = 1e-6
 """Minimum variance of log depth, (0.1 %)^2."""
 MAX_LOG_VARIANCE = 1e2
 """Maximum variance of log depth, beyond which depth carries no information."""
 _MIN_FACING = 2e-3
-"""Minimum of -n . ray for unit normals n. Normals beyond 89.9 deg carry no information about the
-slope of depth."""
+"""Minimum of ``-n . ray`` for unit normals n. Normals more than 89.9 deg from the viewing direction
+carry no information about the slope of depth."""
 
 
 class EnergyLosses(NamedTuple):
-    """Sharpness of the soft minimum, and scales of the losses in standard deviations."""
+    """Parameters of the soft minimum and the robust losses in the depth integration energy."""
 
     sharpness: float
     normal_limit: float
@@ -59,20 +61,20 @@ class EnergyLosses(NamedTuple):
 
 
 class NormalTerms(NamedTuple):
-    """Normal residuals along x and y, with a frame of one pixel, (2, h + 2, w + 2)."""
+    """Normal residuals along x and y as arrays (2, h + 2, w + 2) with a border of one pixel."""
 
     slope: Float32
-    """s of each pixel."""
+    """Factor s of the normal residual ``s (z[p + e] - z[p]) + n`` of each pixel."""
     normal: Float32
-    """n of each pixel."""
+    """Component n_x or n_y of the normal of each pixel."""
     weight: Float32
-    """w_n / var_r; 0 without a normal."""
+    """Weight w_n / var_r of the normal residual of each pixel, 0 without a normal."""
     link: Bool
-    """True if a pixel and the next pixel along the axis may be linked."""
+    """True if normal residuals may link a pixel with the next pixel along the axis."""
 
 
 class PriorTerms(NamedTuple):
-    """Depth prior with log depth (h, w), precision 1 / var_log_d (h, w), and weight w_d."""
+    """Depth prior as log depth (h, w), precision 1 / var_log_d (h, w), and weight w_d."""
 
     log_depth: Float64
     precision: Float32
@@ -80,7 +82,7 @@ class PriorTerms(NamedTuple):
 
 
 class PointTerms(NamedTuple):
-    """Sparse points (n,) with pixel, log depth and precision 1 / var_log_D."""
+    """Pixels (n,), log depths (n,) and precisions 1 / var_log_D (n,) of sparse points."""
 
     rows: Int64
     columns: Int64
@@ -98,11 +100,11 @@ class EnergyTerms(NamedTuple):
 
 
 class QuadraticMajorizer(NamedTuple):
-    """Quadratic ``energy + 2 gradient . step + step' A step``, with A as in ``multigrid``."""
+    """Quadratic upper bound ``energy + 2 gradient . step + step' A step`` of the energy."""
 
     energy: float
     point_energy: float
-    """Mean energy of one sparse point."""
+    """Mean energy per sparse point."""
     gradient: Float64
     """(h, w) half of the gradient of the energy."""
     east: Float32
@@ -113,7 +115,7 @@ class QuadraticMajorizer(NamedTuple):
 def build_normal_terms(
     normals: NormalPrior, camera: PinholeCamera, active: Bool, weight: float
 ) -> NormalTerms:
-    """Build the residuals of a normal map with variance between the active pixels (h, w)."""
+    """Build the normal residuals between neighboring pixels of a mask (h, w)."""
     shape = (2, active.shape[0] + 2, active.shape[1] + 2)
     link = np.zeros(shape, np.bool_)
     link[0, 1:-1, 1:-2] = active[:, :-1] & active[:, 1:]
@@ -121,7 +123,7 @@ def build_normal_terms(
     terms = NormalTerms._make([*np.zeros((3, *shape), np.float32), link])
     usable = normals.valid & active
     assert normals.variance is not None
-    # numba would compile the kernel again for a read-only array
+    # A writable copy avoids a second compilation, because numba distinguishes read-only arrays.
     values, variance = (
         np.require(a, None, ("C", "W")) for a in (normals.normals, normals.variance)
     )
@@ -193,9 +195,9 @@ def _add_normals(
     coupling: Float32,
     gradient: Float64,
 ) -> float:
-    """Return the energy along one axis; adds to the couplings and to half the gradient.
+    """Compute the normal energy along one axis, and add its couplings and half gradient.
 
-    All maps have a frame and are contiguous: ``stride`` is the distance of neighbors in memory.
+    All arrays are contiguous and have a border of one pixel.
     """
     height, width = z.shape
     stride = 1 if axis == 0 else width
@@ -249,9 +251,9 @@ def _link_row(
     force_ahead: Float64,
     force_behind: Float64,
 ) -> float:
-    """Return the energy of a row of pixels; writes couplings and half the forces to both sides.
+    """Compute the normal energy of a row of pixels, with couplings and half gradients.
 
-    If one side is missing, the soft minimum is over the other side and the limit.
+    If a pixel has only one neighbor, the soft minimum uses this neighbor and the limit.
     """
     k, limit = losses.sharpness, losses.normal_limit
     two_sides, one_side = np.log(2.0 + np.exp(-k * limit)), np.log(1.0 + np.exp(-k * limit))
@@ -262,7 +264,7 @@ def _link_row(
         a = ahead * ahead if link_ahead[j] else _MISSING
         b = behind * behind if link_behind[j] else _MISSING
 
-        # exponentials relative to the smallest of a, b and the limit, against underflow
+        # Subtracting the smallest of a, b and the limit prevents underflow of all exponentials.
         low, high = min(a, b), max(a, b)
         of_gap = _exp(-k * abs(limit - low))
         of_low, of_limit = (1.0, of_gap) if low < limit else (of_gap, 1.0)
@@ -281,7 +283,7 @@ def _link_row(
 
 @_helper
 def _exp(x: float) -> float:
-    """Compute exp(x) for x <= 0 to 1e-14, bounded by exp(-60) below; the code vectorizes."""
+    """Compute exp(max(x, -60)) for x <= 0 with error 1e-14, in code that compilers vectorize."""
     scaled = max(x, -60.0) * 1.4426950408889634
     whole = np.floor(scaled + 0.5)
     f = (scaled - whole) * 0.6931471805599453
@@ -302,7 +304,7 @@ def _exp(x: float) -> float:
 
 @_helper
 def _log(x: float) -> float:
-    """Compute log(x) for x in [1, 3] to 1e-11 by the artanh series at sqrt(3)."""
+    """Compute log(x) for x in [1, 3] with error 1e-11 by the artanh series at sqrt(3)."""
     u = (x - _SQRT_3) / (x + _SQRT_3)
     q = u * u
     p = 1 / 13 + q * (1 / 15)
@@ -318,7 +320,7 @@ def _log(x: float) -> float:
 def _add_prior(
     z: Float64, prior: PriorTerms, scale: float, mass: Float32, gradient: Float64
 ) -> float:
-    """Return the Charbonnier energy of the depth prior; sets the mass, adds to the gradient."""
+    """Compute the Charbonnier energy of the depth prior, with mass and half gradient."""
     energy, square = 0.0, scale * scale
     for i in range(z.shape[0]):
         for j in range(z.shape[1]):
@@ -336,7 +338,7 @@ def _add_prior(
 def _add_points(
     z: Float64, points: PointTerms, scale: float, mass: Float32, gradient: Float64
 ) -> float:
-    """Return the Cauchy energy of the sparse points; adds to mass and gradient."""
+    """Compute the Cauchy energy of the sparse points, with mass and half gradient."""
     energy = 0.0
     for k in range(points.rows.size):
         i, j = points.rows[k], points.columns[k]

@@ -1,9 +1,9 @@
 """Robust losses in the convention of Ceres, ``(rho(s), rho'(s))`` of squared residuals s.
 
-A loss maps the squared residual ``s`` and the loss scale ``a``, in the unit of the residual, to
-``(rho(s), rho'(s))``. An objective is ``sum(rho(s)) / 2``, and ``rho'`` is the weight in
-iteratively re-weighted least squares (IRLS). The functions accept numpy arrays and, in kernels,
-scalars. :func:`evaluate_loss` selects a function by its :class:`Loss`.
+A loss function maps the squared residual ``s`` and the loss scale ``a`` to ``(rho(s), rho'(s))``.
+The scale has the unit of the residual. The minimized cost is ``sum(rho(s)) / 2``, and ``rho'`` is
+the weight in iteratively re-weighted least squares (IRLS). All loss functions accept numpy arrays
+and, in compiled kernels, scalars. :func:`evaluate_loss` selects a function by its :class:`Loss`.
 """
 # mypy: allow-untyped-decorators
 
@@ -23,27 +23,27 @@ from mpsfm_core.support import jit
 
 @register_jitable
 def trivial(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
-    """Evaluate ``rho = s``, the quadratic loss, on which the scale has no effect."""
+    """Evaluate the quadratic loss ``rho = s``, which has no scale."""
     return s, 0.0 * s + 1.0
 
 
 @register_jitable
 def soft_l1(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
-    """Evaluate ``rho = 2 a^2 (sqrt(1 + s / a^2) - 1)``, linear in large residuals."""
+    """Evaluate the soft-L1 loss ``rho = 2 a^2 (sqrt(1 + s / a^2) - 1)``."""
     root = np.sqrt(1.0 + s / (scale * scale))
     return 2.0 * s / (root + 1.0), 1.0 / root
 
 
 @register_jitable
 def cauchy(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
-    """Evaluate ``rho = a^2 log(1 + s / a^2)``, where large residuals lose influence."""
+    """Evaluate the Cauchy loss ``rho = a^2 log(1 + s / a^2)``."""
     ratio = s / (scale * scale)
     return scale * scale * np.log1p(ratio), 1.0 / (1.0 + ratio)
 
 
 @register_jitable
 def truncated(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
-    """Evaluate ``rho = min(s, a^2)``, where residuals above the scale have no influence."""
+    """Evaluate the truncated quadratic loss ``rho = min(s, a^2)``."""
     return np.minimum(s, scale * scale), (s < scale * scale) * 1.0
 
 
@@ -55,12 +55,13 @@ LOSSES: Mapping[Loss, Callable[[NDArray[Any], float], tuple[Any, Any]]] = Mappin
         Loss.TRUNCATED: truncated,
     }
 )
-"""Loss functions by :class:`Loss`, for numpy arrays. Kernels use :func:`evaluate_loss`."""
+"""Loss functions for numpy arrays, by member of the enumeration :class:`Loss`. Kernels use
+:func:`evaluate_loss`."""
 
 
 @jit.helper()
 def evaluate_loss(loss: int, s: float, scale: float) -> Any:
-    """Evaluate ``(rho, rho')`` of a squared residual for a :class:`Loss` given as int."""
+    """Evaluate ``(rho, rho')`` of a squared residual for the integer value of a :class:`Loss`."""
     if loss == 1:
         return soft_l1(s, scale)
     if loss == 2:

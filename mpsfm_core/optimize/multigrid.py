@@ -1,7 +1,8 @@
 """Conjugate gradients with a black-box multigrid preconditioner on image grids.
 
-The SPD operator is a weighted graph on the pixels, with non-negative couplings between horizontal
-and vertical neighbors and a non-negative mass per pixel::
+The linear system has a symmetric positive definite matrix A on the pixels. Its coefficients are
+non-negative couplings between horizontal and vertical neighbors, and a non-negative mass per pixel
+that is added to the diagonal::
 
     x' A x = sum east (x[i, j] - x[i, j+1])^2 + sum south (x[i, j] - x[i+1, j])^2 + sum mass x^2
 
@@ -9,11 +10,11 @@ Couplings jump by orders of magnitude at depth discontinuities, which breaks geo
 Following black-box multigrid (Dendy, 1982), the interpolation is derived from the operator, and the
 coarse operators are Galerkin products with nine-point stencils.
 
-The smoother relaxes whole lines of the rows and columns that the next coarser grid omits, because
-strips of one pixel width have no coarse pixel. All arrays are double precision. In single
-precision, regions with weak mass behind discontinuities take steps of rounding noise.
+The smoother solves for whole rows and columns that the next coarser grid omits, because strips of
+one pixel width have no coarse pixel. All arrays are double precision. Single precision would be too
+inexact in regions with small mass behind depth discontinuities.
 
-Arrays of a level have a frame of one zero pixel, so that no kernel branches at borders.
+All arrays have a border of one zero pixel, so that no kernel branches at image borders.
 """
 
 from __future__ import annotations
@@ -33,11 +34,11 @@ _kernel, _helper = (
 SOLVED = 1e-10
 """Relative error of the solution below which only rounding errors remain."""
 _TINY = 1e-30
-"""Maximum value of a diagonal entry that counts as zero."""
+"""Threshold below which a diagonal entry of the matrix is treated as zero."""
 _PLANES, _FIRST_WEIGHTS = 19, 11
-"""Number of planes of a level, and index of its first interpolation weights."""
+"""Number of arrays per multigrid level, and index of the first array of interpolation weights."""
 _Squares = tuple[float, ...]
-"""Six couplings and four masses of a cell."""
+"""Six couplings and four masses between the four corner pixels of a coarse grid cell."""
 _Corners = tuple[float, float, float, float]
 _NO_SQUARES: _Squares = (0.0,) * 10
 
@@ -46,21 +47,23 @@ class LinearSolution(NamedTuple):
     """Solution of a linear system by conjugate gradients."""
 
     x: Float64
-    """(h, w) float64."""
+    """(h, w) float64 solution of the linear system."""
     iterations: int
     """Number of conjugate-gradient iterations."""
     relative_error: float
-    """``sqrt(r' M r)`` with the preconditioner M, relative to x = 0, before the last iteration."""
+    """Residual norm ``sqrt(r' M r)`` with the preconditioner M, relative to the norm at x = 0."""
 
 
 class _Level(NamedTuple):
-    """Multigrid level of shape (h + 2, w + 2), with frame.
+    """Matrix and work arrays of a multigrid level, (h + 2, w + 2) with a border of one pixel.
 
-    ``east``, ``south``, ``southeast`` and ``southwest`` couple a pixel to the neighbor of that
-    name; the last two are zero on the finest level. ``diagonal`` is 1 for pixels without coupling
-    and mass. The pivots are inverse pivots of the line smoother. ``weights`` (8, h, w) interpolate
-    the next finer grid by cells. The pixel to the right of a coarse pixel uses (left, right), the
-    pixel below (top, bottom), and the pixel diagonally below the four corners.
+    The arrays ``east``, ``south``, ``southeast`` and ``southwest`` contain the coupling of each
+    pixel with the neighbor in this direction. On the finest level the diagonal couplings are zero.
+    The array ``diagonal`` is the matrix diagonal, or 1 at pixels without coupling and mass. The
+    arrays ``row_pivot`` and ``column_pivot`` are inverse pivots of the line smoother. The eight
+    ``weights`` (8, h, w) interpolate three fine pixels per coarse pixel. A fine pixel on a coarse
+    row has two weights (left, right), a fine pixel on a coarse column has two weights (top,
+    bottom), and a fine pixel between both has four weights.
     """
 
     east: Float64
@@ -78,7 +81,7 @@ class _Level(NamedTuple):
 
 
 class Multigrid:
-    """Solver for one grid size: ``update`` sets the operator, ``solve`` solves.
+    """Multigrid-preconditioned conjugate-gradient solver for a fixed grid size.
 
     The solver is deterministic and single-threaded. The kernels of the solver release the GIL, so
     several solvers may run in threads, but threads must not share a solver.
@@ -91,21 +94,23 @@ class Multigrid:
             shapes.append((height, width))
         framed = np.array(shapes, dtype=np.int64) + 2
         first = np.concatenate([[0], np.cumsum(_PLANES * framed.prod(axis=1))])
-        # one block of memory, large enough for huge pages
+        # A single array for all levels is large enough for huge memory pages.
         self._grids = _Grids(np.zeros(first[-1]), first, framed)
         self._levels = [_level(self._grids, number) for number in range(len(framed))]
         self._vectors = np.zeros((3, *self._levels[0].x.shape))
 
     def update(self, east: Float32, south: Float32, mass: Float32) -> None:
-        """Set the operator, in the time of 1.3 V-cycles.
+        """Set the coefficients of the linear system, and derive the matrices of all levels.
 
-        Pixels without couplings and mass stay zero, and their right-hand side must be zero.
+        The solution is zero at pixels without couplings and mass, where the right-hand side must be
+        zero.
 
         Args:
-            east: (h, w) non-negative couplings to the next pixel to the right. The last column is
-                ignored.
-            south: (h, w) non-negative couplings to the next pixel below. The last row is ignored.
-            mass: (h, w) non-negative masses of the pixels.
+            east: (h, w) non-negative couplings to the next pixel to the right. The couplings of the
+                last column are ignored.
+            south: (h, w) non-negative couplings to the next pixel below. The couplings of the last
+                row are ignored.
+            mass: (h, w) non-negative mass of each pixel, which is added to the matrix diagonal.
         """
         finest = self._levels[0]
         finest.east[1:-1, 1:-2] = east[:, :-1]
@@ -123,10 +128,10 @@ class Multigrid:
 
 
 class _Grids(NamedTuple):
-    """Memory of all levels, the finest first.
+    """Memory of the arrays of all multigrid levels, the finest level first.
 
-    ``first`` (n + 1,) is the start of each level in ``memory``, and ``shapes`` (n, 2) the shape of
-    its grid with frame.
+    The field ``first`` (n + 1,) is the start of each multigrid level in ``memory``. The field
+    ``shapes`` (n, 2) contains the grid size of each level, including the border.
     """
 
     memory: Float64
@@ -136,11 +141,11 @@ class _Grids(NamedTuple):
 
 @_helper
 def _level(grids: _Grids, number: int) -> _Level:
-    """Return a level as views of the memory."""
+    """Return the arrays of a multigrid level, which share the common memory."""
     height, width = grids.shapes[number]
     planes = grids.memory[grids.first[number] : grids.first[number + 1]]
     p = planes.reshape((_PLANES, height, width))
-    # numba cannot unpack an array into a named tuple
+    # Each field is given explicitly, because numba cannot unpack an array into a named tuple.
     return _Level(
         p[0], p[1], p[2], p[3], p[4], p[5], p[6], p[7], p[8], p[9], p[10], p[_FIRST_WEIGHTS:]
     )
@@ -148,7 +153,7 @@ def _level(grids: _Grids, number: int) -> _Level:
 
 @_kernel
 def _derive_levels(grids: _Grids) -> None:
-    """Derive all levels from couplings and mass of the finest level."""
+    """Derive all multigrid levels from couplings and masses of the finest level."""
     last = len(grids.shapes) - 1
     for number in range(last):
         fine, coarse = _level(grids, number), _level(grids, number + 1)
@@ -162,10 +167,11 @@ def _derive_levels(grids: _Grids) -> None:
 def _conjugate_gradients(
     grids: _Grids, vectors: Float64, iterations: int, tolerance: float
 ) -> tuple[int, float]:
-    """Solve for ``rhs`` of the finest level, which becomes the residual.
+    """Solve the linear system on the finest multigrid level by conjugate gradients.
 
-    ``vectors`` are x, direction and the image of the direction, with frame. Returns iterations and
-    relative error as in :class:`LinearSolution`.
+    The residual replaces the right-hand side. The rows of ``vectors`` are x, the search direction
+    p, and the product A p. The function returns the fields ``iterations`` and ``relative_error`` of
+    :class:`LinearSolution`.
     """
     finest = _level(grids, 0)
     x, direction, image, residual = vectors[0], vectors[1], vectors[2], finest.rhs
@@ -189,7 +195,7 @@ def _conjugate_gradients(
 
 @_helper
 def _v_cycle(grids: _Grids) -> None:
-    """Run a V-cycle: ``x`` of the finest level approximates the solution for its ``rhs``."""
+    """Approximate the solution of the linear system by a multigrid V-cycle."""
     last = len(grids.shapes) - 1
     for number in range(last):
         fine = _level(grids, number)
@@ -205,7 +211,7 @@ def _v_cycle(grids: _Grids) -> None:
 
 @_helper
 def _prepare_smoother(level: _Level) -> None:
-    """Compute the diagonal and the line pivots, in a form without cancellation."""
+    """Compute the matrix diagonal and the pivots of the line smoother without cancellation."""
     east, south, southeast, southwest = level.east, level.south, level.southeast, level.southwest
     height, width = level.mass.shape
     above, rest, pivot = np.zeros(width), level.work, level.row_pivot
@@ -237,7 +243,7 @@ def _prepare_smoother(level: _Level) -> None:
 
 @_helper
 def _chain(stiffness: float, coupling: float, rest: float) -> float:
-    """Return the stiffness of the next pixel of a line, including the line before it."""
+    """Return the next pivot in the elimination of a line, computed without cancellation."""
     coupling = max(coupling, 0.0)
     total: float = max(rest, 0.0) + coupling * stiffness * _inverse(coupling + stiffness)
     return total
@@ -245,13 +251,13 @@ def _chain(stiffness: float, coupling: float, rest: float) -> float:
 
 @_helper
 def _inverse(value: float) -> float:
-    """Return the inverse of a value, or 0 for values that count as zero."""
+    """Return the inverse of a value, or 0 for values below the threshold `_TINY`."""
     return 1.0 / value if value > _TINY else 0.0
 
 
 @_helper
 def _smooth(level: _Level, nine_point: bool, backward: bool) -> None:
-    """Smooth by Gauss-Seidel over three blocks from x = 0; ``backward`` is its adjoint."""
+    """Smooth by Gauss-Seidel over pixels, rows and columns, or in reverse order if ``backward``."""
     if backward:
         _relax_columns(level, nine_point)
         _relax_rows(level, nine_point)
@@ -264,7 +270,7 @@ def _smooth(level: _Level, nine_point: bool, backward: bool) -> None:
 
 @_helper
 def _start_points(level: _Level) -> None:
-    """Relax the points as ``_relax_points``, from x = 0."""
+    """Relax the pixels that the coarser grid contains, starting from x = 0."""
     x = level.x
     x[:] = 0
     for i in range(1, x.shape[0] - 1, 2):
@@ -274,7 +280,7 @@ def _start_points(level: _Level) -> None:
 
 @_helper
 def _relax_points(level: _Level, nine_point: bool) -> None:
-    """Relax the pixels that the coarser grid keeps, one by one."""
+    """Relax the pixels that the coarser grid contains, each pixel alone."""
     x, row = level.x, level.work[0]
     for i in range(1, x.shape[0] - 1, 2):
         _residual_row(level, i, nine_point, row)
@@ -284,7 +290,7 @@ def _relax_points(level: _Level, nine_point: bool) -> None:
 
 @_helper
 def _relax_rows(level: _Level, nine_point: bool) -> None:
-    """Relax the rows that the coarser grid omits, four at a time to overlap their recurrences."""
+    """Solve for each row that the coarser grid omits, four rows at a time for speed."""
     east, pivot, x, rows = level.east, level.row_pivot, level.x, level.work
     height, width = x.shape
     last = height - 2 - height % 2
@@ -295,7 +301,7 @@ def _relax_rows(level: _Level, nine_point: bool) -> None:
                 _residual_row(level, first + 2 * k, nine_point, rows[k])
         p, q, r, s = 0.0, 0.0, 0.0, 0.0
         for j in range(1, width - 1):
-            # the recurrences contain only one multiply-add
+            # The elimination recurrence has only one multiply-add per pixel.
             p = rows[0, j] * pivot[a, j] + max(east[a, j - 1], 0.0) * pivot[a, j] * p
             q = rows[1, j] * pivot[b, j] + max(east[b, j - 1], 0.0) * pivot[b, j] * q
             r = rows[2, j] * pivot[c, j] + max(east[c, j - 1], 0.0) * pivot[c, j] * r
@@ -316,13 +322,13 @@ def _relax_rows(level: _Level, nine_point: bool) -> None:
 
 @_helper
 def _four_rows(first: int, last: int) -> tuple[int, int, int, int]:
-    """Return four rows with step 2 from ``first``, bounded by ``last``."""
+    """Return the indices of four rows with step 2 from row ``first``, at most ``last``."""
     return first, min(first + 2, last), min(first + 4, last), min(first + 6, last)
 
 
 @_helper
 def _relax_columns(level: _Level, nine_point: bool) -> None:
-    """Relax the columns that the coarser grid omits. The loops cover all columns to vectorize."""
+    """Solve for each column that the coarser grid omits; loops over all columns vectorize."""
     south, pivot, x, change = level.south, level.column_pivot, level.x, level.work
     height, width = x.shape
     change[0] = 0
@@ -340,7 +346,7 @@ def _relax_columns(level: _Level, nine_point: bool) -> None:
 
 @_helper
 def _residual_row(level: _Level, i: int, nine_point: bool, row: Float64) -> None:
-    """Compute ``rhs - A x`` of one row."""
+    """Compute the residual ``rhs - A x`` of one pixel row."""
     east, south, southeast, southwest = level.east, level.south, level.southeast, level.southwest
     x = level.x
     for j in range(1, x.shape[1] - 1):
@@ -356,7 +362,7 @@ def _residual_row(level: _Level, i: int, nine_point: bool, row: Float64) -> None
 
 @_helper
 def _restrict(fine: _Level, coarse: _Level, nine_point: bool) -> None:
-    """Restrict the residual of ``fine`` to ``rhs`` of ``coarse``, by transposed interpolation."""
+    """Restrict the residual to the next coarser level by the transposed interpolation."""
     residual, weights = fine.work, coarse.weights
     for i in range(1, fine.x.shape[0] - 1):
         _residual_row(fine, i, nine_point, residual[i])
@@ -379,7 +385,7 @@ def _restrict(fine: _Level, coarse: _Level, nine_point: bool) -> None:
 
 @_helper
 def _prolong(coarse: _Level, fine: _Level) -> None:
-    """Add the interpolated correction of ``coarse`` to ``fine``."""
+    """Add the interpolated correction of a coarse level to the next finer level."""
     weights, x = coarse.weights, coarse.x
     for i in range(1, x.shape[0] - 1):
         r = 2 * i - 1
@@ -396,7 +402,7 @@ def _prolong(coarse: _Level, fine: _Level) -> None:
 
 @_helper
 def _derive_interpolation(fine: _Level, coarse: _Level) -> None:
-    """Derive Dendy's weights: each fine pixel solves its equation, collapsed onto its line."""
+    """Derive the interpolation weights of black-box multigrid (Dendy 1982) from the matrix."""
     east, south, southeast, southwest = fine.east, fine.south, fine.southeast, fine.southwest
     weights = coarse.weights
     rows, columns = fine.x.shape[0] - 2, fine.x.shape[1] - 2
@@ -444,10 +450,10 @@ def _derive_interpolation(fine: _Level, coarse: _Level) -> None:
 
 @_helper
 def _shares(first: float, second: float, mass: float) -> tuple[float, float]:
-    """Return the interpolation weights of two neighbors.
+    """Return the interpolation weights of the two coarse neighbors of a fine pixel.
 
-    Coarse couplings and masses can be negative. A negative mass, which comes from strong couplings
-    across the line, reduces the weights as a positive one does.
+    Coarse couplings and masses can be negative. Strong couplings across a line can make a mass
+    negative. Negative masses reduce the interpolation weights as positive masses of equal size do.
     """
     first, second = max(first, 0.0), max(second, 0.0)
     inverse = _inverse(first + second + abs(mass))
@@ -456,7 +462,7 @@ def _shares(first: float, second: float, mass: float) -> tuple[float, float]:
 
 @_helper
 def _coarsen(fine: _Level, coarse: _Level, nine_point: bool) -> None:
-    """Compute the Galerkin product by cells: fine terms are squares of coarse values."""
+    """Compute the coarse matrix as Galerkin product, from the quadratic form of each cell."""
     weights = coarse.weights
     for plane in (coarse.east, coarse.south, coarse.southeast, coarse.southwest, coarse.mass):
         plane[:] = 0
@@ -464,7 +470,7 @@ def _coarsen(fine: _Level, coarse: _Level, nine_point: bool) -> None:
         r = 2 * i - 1
         for j in range(1, coarse.x.shape[1] - 1):
             c = 2 * j - 1
-            # fine pixels of a cell in terms of its four corners
+            # Interpolation weights of the fine pixels of a cell from its four corners.
             c00, c01 = (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0)
             c10, c11 = (0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 0.0, 1.0)
             top = (weights[0, i, j], weights[1, i, j], 0.0, 0.0)
@@ -510,11 +516,11 @@ def _coarsen(fine: _Level, coarse: _Level, nine_point: bool) -> None:
 
 @_helper
 def _add_mass(q: _Squares, mass: float, a: _Corners) -> _Squares:
-    """Add ``mass * (a . corners)^2`` to the couplings (6) and masses (4) of a cell.
+    """Add a fine pixel's mass term to the six couplings and four masses of a coarse cell.
 
-    Positive masses are lumped, which avoids negative couplings at isolated large masses. Lumping is
-    an upper bound. For negative masses it would be a lower bound, and the coarse operator could
-    become indefinite; they are added exactly.
+    The mass term is ``mass * (a . corners)^2`` with the interpolation weights ``a``. Positive
+    masses are lumped to the corners, which avoids negative couplings at isolated large masses.
+    Negative masses are added exactly, because lumping could make the coarse matrix indefinite.
     """
     a0, a1, a2, a3 = a[0], a[1], a[2], a[3]
     heavy, light = max(mass, 0.0), min(mass, 0.0)
@@ -536,7 +542,7 @@ def _add_mass(q: _Squares, mass: float, a: _Corners) -> _Squares:
 
 @_helper
 def _add_coupling(q: _Squares, coupling: float, a: _Corners, b: _Corners) -> _Squares:
-    """Add ``coupling * ((a - b) . corners)^2`` to a cell."""
+    """Add the coupling term of two fine pixels, ``coupling * ((a - b) . corners)^2``, to a cell."""
     v0, v1, v2, v3 = a[0] - b[0], a[1] - b[1], a[2] - b[2], a[3] - b[3]
     total = v0 + v1 + v2 + v3
     return (
@@ -555,7 +561,7 @@ def _add_coupling(q: _Squares, coupling: float, a: _Corners, b: _Corners) -> _Sq
 
 @_helper
 def _apply(level: _Level, x: Float64, image: Float64) -> float:
-    """Compute ``image = A x`` on the finest level, and return ``x' A x``."""
+    """Compute the product ``A x`` on the finest multigrid level, and return ``x' A x``."""
     east, south, mass = level.east, level.south, level.mass
     curvature = 0.0
     for i in range(1, x.shape[0] - 1):
@@ -571,7 +577,7 @@ def _apply(level: _Level, x: Float64, image: Float64) -> float:
 
 @_helper
 def _step(length: float, direction: Float64, image: Float64, x: Float64, residual: Float64) -> None:
-    """Move x along the direction and update the residual."""
+    """Move x along the conjugate-gradient search direction, and update the residual."""
     for i in range(1, x.shape[0] - 1):
         for j in range(1, x.shape[1] - 1):
             x[i, j] += length * direction[i, j]
@@ -580,7 +586,7 @@ def _step(length: float, direction: Float64, image: Float64, x: Float64, residua
 
 @_helper
 def _turn(factor: float, preconditioned: Float64, direction: Float64) -> None:
-    """Compute the next conjugate direction."""
+    """Compute the next conjugate-gradient search direction."""
     for i in range(1, direction.shape[0] - 1):
         for j in range(1, direction.shape[1] - 1):
             direction[i, j] = preconditioned[i, j] + factor * direction[i, j]
@@ -588,7 +594,7 @@ def _turn(factor: float, preconditioned: Float64, direction: Float64) -> None:
 
 @_helper
 def _dot(a: Float64, b: Float64) -> float:
-    """Return the dot product of two vectors without their frames."""
+    """Return the dot product of two pixel arrays, without their borders."""
     total = 0.0
     for i in range(1, a.shape[0] - 1):
         for j in range(1, a.shape[1] - 1):

@@ -21,72 +21,74 @@ class Loss(IntEnum):
 
 
 class BundleOptions(Options):
-    """Options of bundle adjustment. Scales of losses are in standard deviations of the residual."""
+    """Options of bundle adjustment. All loss scales are in standard deviations of the residual."""
 
     reprojection_loss: Loss = expert(Loss.CAUCHY)
-    """Loss of reprojection errors. Learned keypoints have heavier tails than the soft-L1 loss of
-    the reference expects. [tuned: benchmarks.ablation]"""
+    """Robust loss of reprojection errors. Errors of learned keypoints have heavier tails than the
+    soft-L1 loss of the published code assumes. [tuned: benchmarks.ablation]"""
     reprojection_scale: float = expert(0.65, gt=0)
     """Scale of the reprojection loss. Raising the scale gives outliers more influence. [tuned:
     benchmarks.ablation]"""
     depth_loss: Loss = expert(Loss.CAUCHY)
-    """Loss of log-depth errors. [paper appendix B] [reference]"""
+    """Robust loss of log-depth errors. [paper appendix B] [reference]"""
     depth_scale: float = expert(2.0, gt=0)
     """Scale of the log-depth loss. Raising the scale gives wrong depth more influence. [reference
     rob_std]"""
     function_tolerance: float = expert(1e-6, ge=0)
-    """Relative decrease of the cost at which the solver stops. Raising this value stops earlier.
-    [Ceres function_tolerance]"""
+    """Relative decrease of the cost at which bundle adjustment stops. Raising this value stops
+    bundle adjustment earlier. [Ceres function_tolerance]"""
     max_iterations: int = expert(50, ge=1)
-    """Maximum number of steps, accepted or rejected. [Ceres max_num_iterations]"""
+    """Maximum number of Levenberg-Marquardt steps, accepted or rejected. [Ceres
+    max_num_iterations]"""
     dense_poses: int = expert(500, ge=0)
     """Maximum number of variable poses for a dense Cholesky factorization of the reduced camera
-    system. Larger systems are solved by conjugate gradients. [tuned:
+    system. Conjugate gradients solve systems with more poses. [tuned:
     benchmarks.bundle_adjustment]"""
     threads: int | None = expert(None, ge=1)
-    """Number of threads of bundle adjustment. null uses all threads of the run. The number of
-    threads does not change the results."""
+    """Number of threads of bundle adjustment (null uses all threads of the run). The number of
+    threads does not change the result of bundle adjustment."""
 
 
 SOFT_L1_OPTIONS = BundleOptions(reprojection_loss=Loss.SOFT_L1, reprojection_scale=1.5)
-"""Losses of the published system: soft-L1 for reprojection errors. [reference]"""
+"""Bundle adjustment options of the published system, with soft-L1 reprojection loss. [reference]"""
 
 
 class IntegrationOptions(Options):
     """Options of depth integration."""
 
     independent_depths: float = expert(100.0, gt=0)
-    """Number of independent measurements that a depth prior counts as, at any resolution.
+    """Number of independent measurements per depth prior, whatever its resolution.
 
-    Errors of neighboring pixels are correlated, so each of n pixels has weight
-    ``min(1, this / n)``. Raising this number keeps the refined depth closer to the prior. [tuned:
+    Depth errors of neighboring pixels are correlated, so each of n pixels has the weight ``min(1,
+    number / n)``. Raising this number keeps the refined depth closer to the prior. [tuned:
     benchmarks.depth_integration]"""
     independent_normals: float = expert(1000.0, gt=0)
-    """Number of independent measurements that a normal prior counts as. Raising this number follows
-    the normals more closely. [tuned: benchmarks.depth_integration]"""
+    """Number of independent measurements per normal prior, whatever its resolution. Raising this
+    number makes the refined depth follow the normals more closely. [tuned:
+    benchmarks.depth_integration]"""
     sharpness: float = expert(2.0, gt=0)
-    """Sharpness k of the soft minimum of both one-sided residuals. Raising k makes the choice of a
-    side harder. [bilateral normal integration: 2; reference: 1]"""
+    """Sharpness k of the soft minimum of both one-sided residuals. Raising k approaches a hard
+    choice of the smaller residual. [bilateral normal integration: 2; reference: 1]"""
     normal_limit: float = expert(6.0, gt=0)
-    """Squared normal residual above which two pixels are no longer linked. Raising this value
-    smooths depth discontinuities. [tuned: benchmarks.depth_integration]"""
+    """Squared normal residual above which depth may be discontinuous between two pixels. Raising
+    this value smooths depth discontinuities. [tuned: benchmarks.depth_integration]"""
     prior_scale: float = expert(1.0, gt=0)
     """Scale of the Charbonnier loss of the depth prior, in standard deviations. Raising the scale
     gives wrong depth more influence. [tuned: benchmarks.depth_integration]"""
     point_scale: float = expert(2.0, gt=0)
-    """Scale of the Cauchy loss of the points, in standard deviations. Raising the scale gives wrong
-    points more influence. [reference rob_std]"""
+    """Scale of the Cauchy loss of sparse points, in standard deviations. Raising the scale gives
+    outlier points more influence. [reference rob_std]"""
     max_iterations: int = expert(10, ge=0)
-    """Maximum number of IRLS re-weightings. [reference]"""
+    """Maximum number of IRLS re-weightings per depth map. [reference]"""
     cg_iterations: int = expert(2, ge=1)
     """Conjugate-gradient iterations per IRLS re-weighting. Raising this number makes each
     re-weighting more exact and slower. [tuned: benchmarks.depth_integration]"""
     over_relaxation: float = expert(1.4, gt=0)
-    """Factor on all IRLS steps after the first, because the majorizer underestimates how far a
-    concave energy decreases. [tuned: benchmarks.depth_integration]"""
+    """Factor that lengthens all IRLS steps after the first, because the majorizer gives too short
+    steps for concave losses. [tuned: benchmarks.depth_integration]"""
     tolerance: float = expert(5e-2, ge=0)
-    """Relative decrease of the energy at which re-weighting stops. Raising this value stops
-    earlier. [reference]"""
+    """Relative decrease of the energy at which depth integration stops. Raising this value stops
+    depth integration earlier. [reference]"""
     max_point_growth: float = expert(1.2, ge=0)
-    """Maximum growth of the mean energy of the points for which a map is not refined again. Raising
-    this value skips more refinements. [tuned: benchmarks.depth_integration]"""
+    """Maximum increase of the sparse points' mean energy for which a depth map is not refined
+    again. Raising this value skips more refinements. [tuned: benchmarks.depth_integration]"""

@@ -1,9 +1,9 @@
-"""Refinement of a camera pose from keypoints and 3D segments.
+"""Refinement of a camera pose from keypoints and 3D points of uncertain depth.
 
-The 3D point of a match is a segment on the ray of the other image, whose ends are given by bounds
-of its depth. Both ends are equal if the point is known. The objective is Tukey's biweight of the
-distances between keypoints and projected segments, minimized by IRLS with Gauss-Newton steps ``R <-
-exp(w) R, t <- t + dt``.
+Each keypoint matches a keypoint in a registered image. The 3D point of the match lies on a segment
+of the viewing ray in the registered image, between a minimum and maximum depth. If the 3D point is
+known, both ends of the segment are equal. IRLS with Gauss-Newton steps ``R <- exp(w) R, t <- t +
+dt`` minimizes Tukey's biweight loss of the distances between keypoints and projected segments.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from mpsfm_core.optimize.bundle_kernels import MIN_DEPTH, rotation_from_vector
 from mpsfm_core.support import jit
 
 DAMPING = 1e-6
-"""Relative damping of the normal equations, against singular problems. [ours]"""
+"""Relative damping of the normal equations of pose refinement, against singularity. [ours]"""
 MAX_TURN = 1.0
-"""Maximum rotation of a step in radians. Larger rotations come from matches that determine no pose.
-[ours]"""
+"""Maximum rotation of a Gauss-Newton step in radians. Larger rotations result from matches that do
+not constrain the pose. [ours]"""
 
 
 class RaySegments(NamedTuple):
-    """Keypoints and the 3D segments that contain their points."""
+    """Keypoints of an image, and 3D segments that contain their 3D points."""
 
     near: Float64
     """(m, 3) near end of each segment in the world frame."""
@@ -33,17 +33,20 @@ class RaySegments(NamedTuple):
     xy: Float64
     """(m, 2) keypoints in pixels of the image."""
     limit: Float64
-    """(m,) distance in pixels beyond which a match has no influence."""
+    """(m,) distance in pixels between keypoint and projected segment above which a match has no
+    influence."""
     weight: Float64
-    """(m,) weight of each match."""
+    """(m,) weight of each match in the objective."""
 
 
 class _NearestPoint(NamedTuple):
-    """Nearest point of a projected segment to its keypoint.
+    """Point of a projected 3D segment that is nearest to the keypoint.
 
-    ``near`` and ``far`` are the ends in the camera frame, ``near_q`` and ``far_q`` their rotated
-    world points. ``share`` is the position between the projected ends. ``du``, ``dv`` are the
-    residual in pixels. ``au``, ``av`` is the direction of the segment, or 0 at an end.
+    The fields ``near`` and ``far`` are the segment's ends in the camera frame, and ``near_q`` and
+    ``far_q`` are these ends without the translation. The field ``share`` in [0, 1] is the position
+    of the nearest point between the projected ends. The vector ``(du, dv)`` is the residual in
+    pixels. The vector ``(au, av)`` is the direction of the projected segment, or 0 if an end is
+    nearest.
     """
 
     visible: bool
@@ -59,7 +62,7 @@ class _NearestPoint(NamedTuple):
 
 
 POSE = np.int64(6)
-"""Number of parameters of a pose."""
+"""Number of parameters of a pose, 3 for rotation and 3 for translation."""
 _kernel, _helper = jit.kernel(), jit.helper()
 
 
@@ -74,8 +77,8 @@ def measure_segments(
         segments: Keypoints and segments.
 
     Returns:
-        Distances (m,) in pixels and depths (m,) of the nearest points; NaN if an end is behind the
-        camera.
+        Distances (m,) in pixels and depths (m,) of the nearest points on the segments. Both are NaN
+        if an end of the segment is behind the camera.
     """
     distances, depths = np.empty((2, len(segments.xy)))
     rotation, translation = map(np.ascontiguousarray, pose)
@@ -86,7 +89,7 @@ def measure_segments(
 def refine_pose(
     pose: Pose, intrinsics: Float64, segments: RaySegments, *, scales: Float64
 ) -> tuple[Float64, Float64]:
-    """Refine a pose by one Gauss-Newton step per scale of the limits.
+    """Refine a camera pose by one Gauss-Newton step per scale of the distance limits.
 
     Args:
         pose: Initial ``cam_from_world``.
@@ -95,7 +98,7 @@ def refine_pose(
         scales: Factors on the distance limits, the largest first (graduated non-convexity).
 
     Returns:
-        The refined pose, or the last valid pose if the matches determine no pose.
+        The refined pose, or the last valid pose if the matches do not constrain the pose.
     """
     rotation, translation = map(np.ascontiguousarray, pose)
     matrix, vector = np.empty((POSE, POSE)), np.empty(POSE)
@@ -122,11 +125,11 @@ def linearize_pose(
     matrix: Float64,
     gradient: Float64,
 ) -> float:
-    """Write the Gauss-Newton matrix (6, 6) and the gradient (6,) of the objective.
+    """Compute the Gauss-Newton matrix (6, 6) and gradient (6,) of pose refinement.
 
     The objective is ``sum(weight (1 - (1 - s)^3)) / 6`` with ``s = min(1, (distance / limit)^2)``
-    and limits times ``scale``. Its gradient is that of ``sum(w distance^2) / 2`` with the IRLS
-    weights ``w``.
+    and limits times ``scale``. The objective and ``sum(w distance^2) / 2`` with the IRLS weights
+    ``w`` have equal gradients.
 
     Returns:
         The objective.
@@ -224,7 +227,7 @@ def _differentiate(
     intrinsics: Float64,
     out: Float64,
 ) -> None:
-    """Compute ``out (2, 6) <- d(u, v) / d(w, dt)`` of the projection of a point."""
+    """Compute the Jacobian (2, 6) of a projected point by rotation and translation."""
     inverse = 1.0 / point[2]
     fx, fy = intrinsics[0] * inverse, intrinsics[1] * inverse
     a, b = point[0] * inverse, point[1] * inverse

@@ -1,4 +1,4 @@
-"""Subsampling of maps, priors and cameras, and bilinear upsampling."""
+"""Subsampling of depth maps, normal maps and cameras, and bilinear upsampling."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ Prior = TypeVar("Prior", DepthPrior, NormalPrior)
 
 
 def compute_subsampling_step(num_columns: int, max_columns: int) -> int:
-    """Return the step that reduces ``num_columns`` to about ``max_columns``."""
+    """Return the subsampling step that reduces ``num_columns`` to about ``max_columns``."""
     return max(1, round(num_columns / max_columns))
 
 
 def subsample(values: NDArray[Scalar], step: int) -> NDArray[Scalar]:
     """Return every ``step``-th row and column of a map (h, w, ...), starting at ``step // 2``."""
-    # contiguous, because kernels are compiled for contiguous arrays
+    # Compiled kernels require contiguous arrays.
     return np.ascontiguousarray(values[step // 2 :: step, step // 2 :: step])
 
 
@@ -38,7 +38,7 @@ def subsample_prior(prior: Prior, step: int) -> Prior:
 
 
 def subsample_camera(camera: PinholeCamera, step: int) -> PinholeCamera:
-    """Return the camera of a subsampled map."""
+    """Return the pinhole camera of a subsampled depth map."""
     columns, rows = (len(range(step // 2, size, step)) for size in camera.size)
     fx, fy, cx, cy = camera.params
     offset = _offset(step)
@@ -54,10 +54,10 @@ def subsample_pixels(xy: Float64, step: int) -> Float64:
 
 
 def upsample(values: Float64, valid: Bool, shape: tuple[int, int]) -> Float32:
-    """Upsample a subsampled map bilinearly to its original grid of ``shape`` (h, w).
+    """Upsample a subsampled map bilinearly to its original size (h, w).
 
-    Invalid pixels have no weight. The result is 0 for pixels without a valid pixel in their
-    neighborhood.
+    Invalid pixels have no weight in the interpolation. The upsampled map is 0 at pixels without a
+    valid neighbor.
     """
     rows, columns = shape
     step = compute_subsampling_step(columns, values.shape[1])
@@ -68,7 +68,7 @@ def upsample(values: Float64, valid: Bool, shape: tuple[int, int]) -> Float32:
 
 
 def _stretched(values: Float32, size: int, step: int) -> Float32:
-    """Interpolate linearly along the first axis, and extend the outermost values to the border."""
+    """Interpolate an array linearly along its first axis, with constant extrapolation."""
     at = (np.arange(size) + 0.5) / step - _offset(step) - 0.5
     at = np.clip(at, 0, len(values) - 1)
     low = np.minimum(at.astype(np.int64), max(len(values) - 2, 0))
@@ -79,5 +79,5 @@ def _stretched(values: Float32, size: int, step: int) -> Float32:
 
 
 def _offset(step: int) -> float:
-    """Return the offset between the pixel coordinates of both grids, in subsampled pixels."""
+    """Return the offset between pixel coordinates of full and subsampled map."""
     return (step // 2 + 0.5) / step - 0.5
