@@ -136,7 +136,7 @@ class Mapper:
         models: The completed components.
         unregistered: (n,) bool mask of the images that are in no completed component.
         reweighted_problem: The mapping problem with match scores reweighted by depth checks of
-        image pairs, or None before such checks.
+            image pairs, or None before such checks.
     """
 
     component: Component

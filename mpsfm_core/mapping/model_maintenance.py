@@ -45,7 +45,7 @@ class ModelMaintenance:
         refiner: Object that runs bundle adjustment and depth integration.
         history: Record of failed and successful image registration attempts.
         thresholds: Acceptance thresholds of image registration, which relax if no image can be
-        registered.
+            registered.
     """
 
     def __init__(
@@ -151,7 +151,7 @@ class ModelMaintenance:
         Args:
             image: The image.
             max_violations: Largest share of pixels with contradicting depth, before thresholds
-            relax.
+                relax.
 
         Returns:
             None if the depth is consistent, else the reason.

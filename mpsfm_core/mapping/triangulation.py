@@ -137,7 +137,7 @@ def triangulate_or_lift(
         target: (m,) target keypoints that match the source keypoints.
         max_error_px: Largest reprojection error in pixels in both images.
         options: The option ``min_angle_deg`` is the triangulation angle below which points are
-        lifted from depth.
+            lifted from depth.
 
     Returns:
         Points (m, 3) in the world frame, and a mask (m,) of points in front of both cameras with

@@ -137,7 +137,7 @@ def estimate_global_poses(scene: Scene, candidates: Bool) -> GlobalPoses | None:
 def average_rotations(
     a: Int64, b: Int64, b_from_a: Float64, weights: Float64, num_images: int
 ) -> Float64:
-    """Average relative rotations: IRLS in the tangent space with a Cauchy loss.
+    """Average relative rotations by IRLS in the tangent space with a Cauchy loss.
 
     The rotations are averaged by IRLS as in Chatterjee and Govindu, Efficient and Robust
     Large-Scale Rotation Averaging, ICCV 2013, but with a Cauchy loss. The maximum spanning tree
@@ -166,7 +166,7 @@ def average_rotations(
 def average_differences(
     a: Int64, b: Int64, differences: Float64, weights: Float64, num_nodes: int
 ) -> Float64:
-    """Solve ``x[b] - x[a] = differences`` robustly: IRLS with a Cauchy loss.
+    """Solve ``x[b] - x[a] = differences`` for node values ``x`` by IRLS with a Cauchy loss.
 
     Args:
         a: (m,) index of the first node of each edge.

@@ -1,4 +1,4 @@
-"""Conversion of the scene of the mapper to a reconstruction, in meters if depth is metric."""
+"""Conversion of the mapper's scene to a reconstruction, in meters if depth is metric."""
 
 from __future__ import annotations
 
@@ -13,20 +13,24 @@ from mpsfm_core.mapping.scene.reconstruction import MetricScale, Reconstruction,
 from mpsfm_core.mapping.scene.scene import Scene
 
 MAX_METRIC_SPREAD = 0.15
-"""Largest relative spread of the scales of images for which the unit is trusted. [ours]"""
+"""Largest relative spread of the metric scales estimated by the images, for which the
+reconstruction is scaled to meters. [ours]"""
 MIN_METRIC_IMAGES = 3
-"""Number of images below which the unit is not trusted. [ours]"""
+"""Smallest number of images with a metric scale, for which the reconstruction is scaled to meters.
+[ours]"""
 
 
 def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | None:
-    """Estimate meters per world unit from the scales of metric priors.
+    """Estimate meters per world unit from the scales of metric depth priors.
 
     Args:
         scene: The scene.
-        keep_units: Do not apply the scale, because the user defines the world.
+        keep_units: Do not apply the estimated scale, because known poses define the unit of the
+            world.
 
     Returns:
-        The scale, ``trusted`` if it is to be applied; None without metric priors.
+        The estimated scale, ``trusted`` if it is to be applied, or None without metric depth
+        priors.
     """
     images = [int(i) for i in scene.registered_images()]
     maps = [scene.maps[i] for i in images if scene.maps[i].active and scene.maps[i].prior.metric]
@@ -41,11 +45,11 @@ def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | No
 
 
 def convert_scene(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
-    """Convert the scene to a reconstruction, in meters if the scale is trusted.
+    """Convert the scene to a reconstruction, in meters if the metric scale is reliable.
 
     Args:
-        scene: The scene; deleted points are removed from its tracks.
-        keep_units: Keep the unit of the world.
+        scene: The scene, whose tracks lose the rows of deleted points.
+        keep_units: Keep the unit of the world instead of scaling to meters.
     """
     scene.tracks.compact()
     metric = estimate_metric_scale(scene, keep_units=keep_units)
@@ -65,7 +69,7 @@ def convert_scene(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
 
 
 def capture_scene_state(scene: Scene) -> SceneState:
-    """Copy poses, points and depth of the scene, in world units."""
+    """Copy poses, points and depth maps of the scene, in world units."""
     images = (convert_image(scene, int(i), 1.0, False) for i in scene.registered_images())
     tracks = scene.tracks
     observed = np.unique(tracks.point_of[tracks.observations()])
@@ -76,13 +80,13 @@ def capture_scene_state(scene: Scene) -> SceneState:
 
 
 def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> RegisteredImage:
-    """Convert a registered image.
+    """Convert a registered image of the scene to an image of the reconstruction.
 
     Args:
         scene: The scene.
-        index: Index of the image in the problem.
-        factor: Output units per world unit.
-        in_metres: Whether the output unit is the meter.
+        index: Index of the image in the mapping problem.
+        factor: Factor from world units to the unit of the reconstruction.
+        in_metres: Whether the unit of the reconstruction is the meter.
     """
     image, depth_map = scene.problem.images[index], scene.maps[index]
     depth = depth_map.depth * np.float32(factor)
@@ -103,7 +107,7 @@ def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> R
 
 
 def _get_focal_reason(scene: Scene, index: int) -> Reason | None:
-    """Return why the focal length of an image is not refined; None if it is refined."""
+    """Return the reason why a focal length is not refined, or None if it is refined."""
     if scene.problem.images[index].focal_known:
         return CameraReason.KNOWN.because()
     outcome = FocalOutcome(int(scene.focal_outcome[index]))

@@ -1,4 +1,4 @@
-"""Depth map of one image: prior, scale and refined depth."""
+"""Depth map of one image, with its prior, scale and refined depth."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample,
 
 
 class DepthMap:
-    """Depth of an image in world units: the scaled prior, or the refined map if it exists.
+    """Depth of an image in world units, from the refined map or else from the scaled prior.
 
     Attributes:
-        prior: Depth prior of the image, in its own unit.
+        prior: Depth prior of the image, in the unit of the prior.
         normals: Normal prior.
         camera: Intrinsics in pixels of the depth map.
-        scale: Scale of the prior, in world units per unit of the prior.
-        active: True if the scale of the prior has been estimated.
-        refined: Refined depth of the image, or None.
-        log_std: (h, w) float32 standard deviation of the log depth of the prior, 0 where invalid.
+        scale: Scale of the depth prior, in world units per unit of the prior.
+        active: True if the scale of the depth prior has been estimated.
+        refined: Refined depth of the image, or None before refinement.
+        log_std: (h, w) float32 standard deviation of the log depth prior, 0 where invalid.
         keypoints: (n, 2) float64 keypoints in pixels of the depth map.
-        keypoint_valid: (n,) bool, True if the prior is valid around the keypoint.
+        keypoint_valid: (n,) bool mask of the keypoints around which the depth prior is valid.
         keypoint_log_std: (n,) float64 standard deviation of the log depth at the keypoints.
         typical_log_std: Median of ``keypoint_log_std`` where valid, NaN without valid keypoints.
     """
@@ -49,7 +49,7 @@ class DepthMap:
 
     @property
     def valid(self) -> Bool:
-        """(h, w) bool, True where the depth prior is valid."""
+        """(h, w) bool mask of the pixels with a valid depth prior."""
         return self.prior.valid
 
     @property
@@ -65,15 +65,15 @@ class DepthMap:
         return variance
 
     def prior_at_keypoints(self, rows: Int64 | slice = slice(None)) -> Float64:
-        """Return the unscaled prior (m,) at keypoints where :attr:`keypoint_valid` is True."""
+        """Return the unscaled depth prior (m,) at keypoints with a valid depth prior."""
         return self._prior_at[rows]
 
     def at_keypoints(self, rows: Int64 | slice = slice(None)) -> Float64:
-        """Return world depth (m,) at keypoints where :attr:`keypoint_valid` is True."""
+        """Return the depth (m,) in world units at keypoints with a valid depth prior."""
         return self._best_at[rows] * self._factor
 
     def set_scale(self, scale: float) -> None:
-        """Set the scale of the depth prior, and scale a refined depth map by the same factor."""
+        """Set the scale of the depth prior, and rescale the refined depth by the same factor."""
         self.scale, self.active = scale, True
         self._factor = scale / self.refined.scale if self.refined else scale
 
@@ -99,7 +99,7 @@ class DepthMap:
         self.camera = camera.resized(columns, rows)
 
     def reset(self) -> None:
-        """Discard the scale and the refined depth of the map."""
+        """Discard the scale and the refined depth of the depth map."""
         self.scale, self.active, self.refined = 1.0, False, None
         self._use_prior()
 

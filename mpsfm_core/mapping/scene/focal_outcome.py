@@ -9,13 +9,13 @@ MIN_FOCAL_IMAGES = 3
 
 
 class FocalOutcome(IntEnum):
-    """Decision of self-calibration about the camera of an image."""
+    """Decision of self-calibration about the focal length of a camera."""
 
     NOT_ESTIMATED = 0
     """The focal length is known, or bundle adjustment did not estimate it."""
     REFINED = 1
-    """The camera has the estimated focal length."""
+    """The camera takes the focal length that bundle adjustment estimated."""
     NOT_OBSERVABLE = 2
-    """The observations do not determine the focal length; the guess stays."""
+    """The observations do not determine the focal length, so the camera keeps the guess."""
     OUT_OF_RANGE = 3
-    """The estimate is no plausible focal length; the guess stays."""
+    """The estimated focal length is not plausible, so the camera keeps the guess."""

@@ -7,7 +7,7 @@ import numpy as np
 from mpsfm_core.data import Float64, Int64, MappingProblem, VerifiedPair
 
 MIN_SCORE = 0.05
-"""Minimum score of a match, because every match passed geometric verification. [ours]"""
+"""Lower bound of match scores, because every match passed geometric verification. [ours]"""
 
 
 class CorrespondenceGraph:
@@ -17,7 +17,7 @@ class CorrespondenceGraph:
     each match in both directions, sorted by source, so that the edges of an image are one slice.
 
     Attributes:
-        offsets: (n + 1,) int64 number of the first global keypoint of each image.
+        offsets: (n + 1,) int64 global number of the first keypoint of each image, and the total.
         num_images: Number of images.
         image_of: (k,) int64 image index of each global keypoint.
         source: (e,) int64 global keypoint at the start of each edge.
@@ -69,9 +69,9 @@ class CorrespondenceGraph:
                 self.keypoint_weight[self.keypoints_of(index)] /= image.keypoint_std_factor**2
 
     def edges_of(self, image: int) -> slice:
-        """Return the slice of the edges that start in an image."""
+        """Return the slice of the edge list with the matches of one image."""
         return slice(int(self._first_edge[image]), int(self._first_edge[image + 1]))
 
     def keypoints_of(self, image: int) -> slice:
-        """Return the global keypoint numbers of an image."""
+        """Return the global numbers of the keypoints of an image."""
         return slice(int(self.offsets[image]), int(self.offsets[image + 1]))

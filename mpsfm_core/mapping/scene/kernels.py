@@ -15,7 +15,7 @@ def sort_keypoints_by_point(point_of: Int64, num_points: int) -> Int64:
     """Return the keypoints that observe a point, sorted by point, then by keypoint.
 
     Args:
-        point_of: (k,) int64 point of each keypoint, less than ``num_points``, or negative without
+        point_of: (k,) int64 index of the point that each keypoint observes, or negative without a
             point.
         num_points: Number of points.
     """
@@ -37,15 +37,15 @@ def sort_keypoints_by_point(point_of: Int64, num_points: int) -> Int64:
 def compute_max_triangulation_angles(
     points: Float64, observation_points: Int64, centers: Float64
 ) -> Float64:
-    """Compute the largest angle between two rays of the track of each point.
+    """Compute the largest triangulation angle between two rays of each point's track.
 
     Args:
         points: (p, 3) float64 points in the world frame.
         observation_points: (o,) int64 row in ``xyz`` of the point of each observation, sorted.
-        centers: (o, 3) float64 camera center of each observation in the world frame.
+        centers: (o, 3) float64 camera center of each observation, in the world frame.
 
     Returns:
-        (p,) float64 in degrees, in [0, 90]; 0 for points with fewer than two observations.
+        (p,) float64 angles in [0, 90] degrees, 0 for points with fewer than two observations.
     """
     angles = np.zeros(len(points))
     count = len(observation_points)

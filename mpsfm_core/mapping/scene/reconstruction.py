@@ -1,4 +1,4 @@
-"""Reconstruction: the result of the mapper."""
+"""Data classes of the reconstruction that the mapper returns."""
 
 from __future__ import annotations
 
@@ -21,39 +21,44 @@ class RegisteredImage:
     """Index in :attr:`mpsfm_core.data.MappingProblem.images`."""
     name: str
     camera: PinholeCamera
-    """Undistorted intrinsics, with the refined focal length."""
+    """Intrinsics of the undistorted image, with the refined focal length."""
     rotation: Float64
     """(3, 3) float64 rotation of ``cam_from_world``."""
     translation: Float64
     """(3,) float64 translation of ``cam_from_world``, in world units."""
     point_ids: Int64
-    """(n,) int64 row in :attr:`Reconstruction.points` of each keypoint, or -1."""
+    """(n,) int64 row in :attr:`Reconstruction.points` of the point that each keypoint observes, or
+    -1."""
     depth: DepthPrior
-    """Refined depth in world units on the grid of the prior, with its relative variance."""
+    """Refined depth map in world units on the pixel grid of the depth prior, with its relative
+    variance."""
     scale: float
-    """World units per unit of the prior."""
+    """Scale of the depth prior, in world units per unit of the prior."""
     confirmed: bool = True
     """False if the image was registered tentatively, without verification."""
     focal_log_std: float | None = None
-    """Posterior standard deviation of the log focal length; None if it was not estimated."""
+    """Posterior standard deviation of the log focal length, or None if the focal length was not
+    estimated."""
     focal_reason: Reason | None = None
-    """Why the focal length is not refined, a ``CameraReason``; None if it is refined."""
+    """Reason (``CameraReason``) why the focal length is not refined, or None if it is refined."""
 
 
 @dataclass(frozen=True)
 class MetricScale:
-    """Estimate of the meter, from the scales of metric priors or from GPS."""
+    """Estimate of meters per world unit, from the scales of metric depth priors or from GPS."""
 
     metres_per_unit: float
-    """Meters per world unit before scaling; it has been applied if ``trusted``."""
+    """Meters per world unit before the reconstruction was scaled by this factor (if
+    ``trusted``)."""
     spread: float
-    """Robust relative standard deviation (1.4826 MAD) of the estimates of the images."""
+    """Robust relative standard deviation (1.4826 MAD) of the metric scales estimated by the
+    images."""
     num_images: int
-    """Number of images with an estimate."""
+    """Number of images that estimate the metric scale."""
     trusted: bool
-    """Whether the coordinates are meters."""
+    """Whether the coordinates of the reconstruction are in meters."""
     by: str = "depth maps"
-    """Source of the estimate, for the report."""
+    """Source of the metric scale, for the report."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,28 +66,28 @@ class Reconstruction:
     """Registered images and points of one component."""
 
     images: tuple[RegisteredImage, ...]
-    """Registered images by index."""
+    """Registered images, sorted by index in the mapping problem."""
     points: Float64
-    """(p, 3) float64 world points."""
+    """(p, 3) float64 points in world coordinates."""
     errors_px: Float64
-    """(p,) float64 mean reprojection error of each point."""
+    """(p,) float64 mean reprojection error of each point, in pixels."""
     metric: MetricScale | None = None
-    """Estimate of the meter; None without metric priors."""
+    """Estimate of meters per world unit, or None without metric depth priors."""
 
     @property
     def poses(self) -> dict[str, Pose]:
-        """Image name -> pose."""
+        """Poses ``cam_from_world`` of the registered images, by image name."""
         return {image.name: (image.rotation, image.translation) for image in self.images}
 
     def num_multi_view_points(self) -> Int64:
-        """Return the number (n,) of points of each image that at least three images observe."""
+        """Return the number (n,) of each image's points that at least three images observe."""
         observed = [np.unique(image.point_ids[image.point_ids >= 0]) for image in self.images]
         num_views = np.bincount(np.concatenate([*observed, _NO_ROWS]), minlength=len(self.points))
         return np.array([(num_views[rows] >= 3).sum() for rows in observed], dtype=np.int64)
 
     @property
     def confirmed_images(self) -> tuple[RegisteredImage, ...]:
-        """Images that are not registered tentatively."""
+        """Images whose registration was verified, without tentatively registered images."""
         return tuple(image for image in self.images if image.confirmed)
 
 
@@ -91,15 +96,15 @@ class MappingReport:
     """Report of the mapper, for ``summary.json``."""
 
     image_reasons: Mapping[str, Reason] = field(default_factory=dict)
-    """Image name -> why the image is not registered."""
+    """Reason why each unregistered image is not registered, by image name."""
     pair_reasons: Mapping[str, Reason] = field(default_factory=dict)
-    """``"name_a name_b"`` -> why the pair could not initialize a component."""
+    """Reason why an image pair could not initialize a component, by ``"name_a name_b"``."""
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """Step -> time, summed over all runs."""
+    """Run time of each mapper step in seconds, summed over all mapper runs."""
     counts: Mapping[str, int] = field(default_factory=dict)
-    """Step -> number of calls, summed over all runs."""
+    """Number of calls of each mapper step, summed over all mapper runs."""
     runs: int = 1
-    """Number of runs with different seeds."""
+    """Number of mapper runs with different seeds."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +112,8 @@ class MappingResult:
     """Result of the mapper."""
 
     reconstructions: tuple[Reconstruction, ...]
-    """Disconnected components, the largest first; empty if no initialization succeeded."""
+    """Disconnected components, the largest first, or an empty tuple if no initialization
+    succeeded."""
     report: MappingReport
 
 
@@ -118,14 +124,14 @@ def transform_reconstruction(
     translation: Float64,
     metric: MetricScale | None,
 ) -> Reconstruction:
-    """Transform a reconstruction to another world, ``x' = scale * rotation @ x + translation``.
+    """Transform a reconstruction by the similarity ``x' = scale * rotation @ x + translation``.
 
     Args:
         reconstruction: The reconstruction.
         scale: Scale of the similarity transform.
         rotation: (3, 3) rotation.
-        translation: (3,) translation in units of the new world.
-        metric: Estimate of the meter in the new world.
+        translation: (3,) translation of the similarity transform, in units of the new world.
+        metric: Estimate of meters per unit of the new world.
     """
     images = []
     for image in reconstruction.images:

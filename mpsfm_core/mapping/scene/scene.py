@@ -1,4 +1,4 @@
-"""Scene of the mapper: poses, points with tracks, and depth maps."""
+"""Scene of the mapper with poses, points, tracks and depth maps."""
 
 from __future__ import annotations
 
@@ -37,30 +37,32 @@ class Scene:
     """Poses, tracks, depth maps and intrinsics of all images, registered or not.
 
     Args:
-        problem: Images with priors, and verified matches.
-        weigh_by_score: Weight matches by their scores; False weights them equally.
+        problem: Images with depth and normal priors, and geometrically verified matches.
+        weigh_by_score: Weight matches by their scores, whereas False weights all matches equally.
 
     Attributes:
-        graph: Correspondence graph; its global numbers index keypoints here.
-        tracks: Points and their observations.
+        graph: Correspondence graph, whose global keypoint numbers index all keypoint arrays.
+        tracks: 3D points and the keypoints that observe them.
         rotations: (n, 3, 3) float64 rotation of ``cam_from_world`` of each image.
-        translations: (n, 3) float64 translation of ``cam_from_world``.
-        registered: (n,) bool.
-        intrinsics: (n, 4) float64 fx, fy, cx, cy of each image in pixels.
-        camera_of: (n,) int64 camera of each image. Images with the same estimated focal length
-            share a camera.
+        translations: (n, 3) float64 translation of ``cam_from_world`` of each image.
+        registered: (n,) bool mask of the registered images.
+        intrinsics: (n, 4) float64 intrinsics fx, fy, cx, cy of each image in pixels.
+        camera_of: (n,) int64 camera index of each image. Images with the same estimated focal
+            length share a camera.
         focal_outcome: (n,) int64 :class:`FocalOutcome` of the camera of each image.
-        focal_log_std: (n,) float64 posterior standard deviation of the log focal length, NaN if it
-            was not estimated.
-        focal_estimate_px: (n,) float64 estimate of ``fx``, also a refused one; NaN without one.
-        depth_group_of: (n,) int64; images of a group have depth in the same unit and share the
-            scale of their priors.
+        focal_log_std: (n,) float64 posterior standard deviation of the log focal length of each
+            image, NaN without an estimate.
+        focal_estimate_px: (n,) float64 estimated ``fx`` of each image, also an implausible one, NaN
+            without an estimate.
+        depth_group_of: (n,) int64 depth group of each image. The depth priors of a group have the
+            same unit and share their scale.
         keypoints: (k, 2) float64 keypoints of all images in pixels.
-        keypoint_std_px: (n,) float64 standard deviation of the keypoints of each image.
+        keypoint_std_px: (n,) float64 standard deviation of the keypoint positions of each image, in
+            pixels.
         maps: Depth map of each image.
         keypoint_prior: (k,) float64 unscaled prior depth at the keypoints.
-        keypoint_log_std: (k,) float64 standard deviation of its logarithm.
-        keypoint_valid: (k,) bool, keypoints where the prior is valid.
+        keypoint_log_std: (k,) float64 standard deviation of the log prior depth at the keypoints.
+        keypoint_valid: (k,) bool mask of the keypoints at which the depth prior is valid.
     """
 
     def __init__(self, problem: MappingProblem, *, weigh_by_score: bool = True) -> None:
@@ -94,7 +96,7 @@ class Scene:
 
     @property
     def num_images(self) -> int:
-        """Number of images, registered or not."""
+        """Number of all images, registered or not."""
         return len(self.registered)
 
     def registered_images(self) -> Int64:
@@ -102,7 +104,7 @@ class Scene:
         return np.flatnonzero(self.registered)
 
     def mask(self, images: Sequence[int] | Int64) -> Bool:
-        """Return (n,) bool, True for the images."""
+        """Return a bool mask (n,) of the given images among all images."""
         chosen = np.zeros(self.num_images, dtype=np.bool_)
         chosen[images] = True
         return chosen
@@ -120,7 +122,8 @@ class Scene:
             image: The image.
             rotation: (3, 3) rotation.
             translation: (3,) translation.
-            focal_px: ``fx`` that was estimated with the pose; None keeps the present one.
+            focal_px: Focal length ``fx`` that was estimated with the pose, or None to keep the
+                present focal length.
         """
         if focal_px is not None:
             fx, fy, _, _ = self.intrinsics_with_focal(image, focal_px)
@@ -129,7 +132,7 @@ class Scene:
         self.registered[image] = True
 
     def deregister(self, image: int) -> None:
-        """Deregister an image; remove its observations and points left with fewer than two."""
+        """Deregister an image, and remove its observations and points that lose their track."""
         self.registered[image] = False
         self.maps[image].reset()
         keypoints = self.graph.keypoints_of(image)
@@ -145,7 +148,7 @@ class Scene:
 
         Args:
             image: The image.
-            focal_px: ``fx`` in pixels; None keeps the present one.
+            focal_px: Focal length ``fx`` in pixels, or None to keep the present focal length.
         """
         intrinsics: Float64 = self.intrinsics[image].copy()
         if focal_px is not None:
@@ -153,13 +156,13 @@ class Scene:
         return intrinsics
 
     def has_free_focal(self, image: int) -> bool:
-        """Return whether a focal length is a guess that no registered image shares."""
+        """Return whether a focal length is a guess and no registered image shares the camera."""
         shares_camera = self.camera_of == self.camera_of[image]
         is_guess = not self.problem.images[image].focal_known
         return is_guess and not bool((shares_camera & self.registered).any())
 
     def has_determined_focal(self, images: Int64) -> Bool:
-        """Return (m,) bool, images (m,) whose focal length is known or refined."""
+        """Return a bool mask (m,) of the images whose focal length is known or refined."""
         known = np.array([image.focal_known for image in self.problem.images], dtype=np.bool_)
         determined: Bool = (known | (self.focal_outcome == FocalOutcome.REFINED))[images]
         return determined
@@ -170,7 +173,7 @@ class Scene:
         self.maps[image].set_camera(self.camera(image))
 
     def set_shared_focal(self, image: int, fx: float, fy: float) -> None:
-        """Set the focal length of all images that share the camera of an image, in pixels."""
+        """Set the focal length in pixels of all images that share the camera of an image."""
         shares_camera = self.camera_of == self.camera_of[image]
         for other in np.flatnonzero(
             shares_camera & (self.intrinsics[:, :2] != (fx, fy)).any(axis=1)
@@ -183,10 +186,10 @@ class Scene:
         """Record the outcome of self-calibration for all images that share a camera.
 
         Args:
-            image: An image of the camera.
+            image: Index of an image that was taken by the camera.
             outcome: The decision.
             log_std: Posterior standard deviation of the log focal length.
-            estimate_px: Estimate of ``fx``, also if it is refused.
+            estimate_px: Estimated ``fx`` in pixels, also an implausible one.
         """
         shares_camera = self.camera_of == self.camera_of[image]
         self.focal_outcome[shares_camera] = outcome
@@ -198,7 +201,7 @@ class Scene:
         return camera_center(self.rotations, self.translations)
 
     def rays(self, keypoints: Int64) -> Float64:
-        """Return the rays (m, 3) with z = 1 through keypoints (m,), in camera frames."""
+        """Return the rays (m, 3) with z = 1 through keypoints (m,), in their camera frames."""
         fx, fy, cx, cy = self.intrinsics[self.graph.image_of[keypoints]].T
         xy = self.keypoints[keypoints]
         return np.stack([(xy[:, 0] - cx) / fx, (xy[:, 1] - cy) / fy, np.ones(len(xy))], axis=1)
@@ -213,7 +216,7 @@ class Scene:
         """Return the depth of keypoints (m,) in world units.
 
         Returns:
-            ``(depth, valid)``, both (m,); the depth is 0 where invalid.
+            Depth (m,), 0 where invalid, and a mask (m,) of the valid depths.
         """
         images = self.graph.image_of[keypoints]
         depth = np.zeros(len(keypoints))
@@ -235,7 +238,7 @@ class Scene:
         return world
 
     def lift(self, keypoints: Int64) -> tuple[Float64, Bool]:
-        """Lift keypoints (m,) to world points (m, 3) by depth; also return where it is valid."""
+        """Lift keypoints (m,) to world points (m, 3) by depth, with a mask (m,) of valid depth."""
         depth, valid = self.depth_at(keypoints)
         return self.at_depth(keypoints, depth), valid
 
@@ -243,7 +246,7 @@ class Scene:
         """Project world points (m, 3) into the images of keypoints (m,).
 
         Returns:
-            ``(errors_px, depth)``, both (m,) float64; the error is inf behind the camera.
+            Reprojection errors (m,) in pixels, inf behind the camera, and depth (m,) of the points.
         """
         images = self.graph.image_of[keypoints]
         camera = np.einsum("nij,nj->ni", self.rotations[images], points)
@@ -256,17 +259,17 @@ class Scene:
         return np.where(front, np.hypot(dx, dy), np.inf), camera[:, 2]
 
     def scales(self) -> Float64:
-        """Return the scales (n,) of the priors; 1 where not estimated."""
+        """Return the scales (n,) of the depth priors of all images, 1 without an estimate."""
         return np.array([depth_map.scale for depth_map in self.maps])
 
     def explained_edges(self) -> Bool:
-        """Return (e,) bool, edges whose keypoints observe the same point."""
+        """Return a bool mask (e,) of the matches whose keypoints observe the same 3D point."""
         points = self.tracks.point_of[self.graph.source]
         same: Bool = (points >= 0) & (points == self.tracks.point_of[self.graph.target])
         return same
 
     def track_angles_deg(self) -> Float64:
-        """Return the largest triangulation angle (p,) of each point, in degrees."""
+        """Return the largest triangulation angle (p,) in degrees of each point's track."""
         observations = self.tracks.observations()
         centers = self.centers()[self.graph.image_of[observations]]
         angles: Float64 = compute_max_triangulation_angles(
@@ -294,7 +297,7 @@ class Scene:
                 self.set_focal_outcome(image.index, outcome, image.focal_log_std, image.camera.fx)
 
     def snapshot(self) -> Snapshot:
-        """Return a copy of the state for :meth:`restore`."""
+        """Return a copy of the scene's state for :meth:`restore`."""
         maps = [(m.scale, m.active, m.refined) for m in self.maps]
         return Snapshot(
             self.rotations.copy(),
@@ -310,7 +313,7 @@ class Scene:
         )
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Roll back to an earlier state."""
+        """Roll back the scene to an earlier state."""
         self.rotations = snapshot.rotations.copy()
         self.translations = snapshot.translations.copy()
         self.registered = snapshot.registered.copy()
@@ -332,7 +335,7 @@ class Scene:
 
 
 def _depth_groups(problem: MappingProblem) -> Int64:
-    """Number the depth groups; images without a group form groups of one."""
+    """Number the depth groups, where an image without a group is a group of its own."""
     first_single = len(problem.images)
     numbers: dict[int, int] = {}
     keys = [
@@ -343,7 +346,7 @@ def _depth_groups(problem: MappingProblem) -> Int64:
 
 
 def _shared_cameras(problem: MappingProblem) -> Int64:
-    """Number the cameras; estimated cameras with equal intrinsics are shared."""
+    """Number the cameras, which images with equal estimated intrinsics share."""
     numbers: dict[object, int] = {}
     keys = [
         number if image.focal_known else image.camera for number, image in enumerate(problem.images)

@@ -19,8 +19,8 @@ class Tracks:
 
     Attributes:
         xyz: (p, 3) float64 points in the world frame. Rows of deleted points remain until
-            :meth:`compact`.
-        point_of: (k,) int64 row in ``xyz`` of the point that each global keypoint observes, or -1.
+            :meth:`compact` is called.
+        point_of: (k,) int64 row in ``xyz`` of the point that each keypoint observes, or -1.
     """
 
     def __init__(self, num_keypoints: int) -> None:
@@ -45,12 +45,12 @@ class Tracks:
         """Return the observations of distinct points ``points`` (m,).
 
         Returns:
-            ``(keypoints, rows)``: global keypoints, and the row in 0..m-1 of the point that each
-            observes; sorted by row, then keypoint.
+            Global keypoint numbers (o,), and the row (o,) in 0..m-1 of the point that each keypoint
+            observes, sorted by row, then keypoint.
         """
         row_of = np.full(len(self.xyz) + 1, NO_POINT, dtype=np.int64)
         row_of[points] = np.arange(len(points))
-        row_of_keypoint = row_of[self.point_of]  # no point: last entry
+        row_of_keypoint = row_of[self.point_of]  # keypoints without a point read the last entry
         keypoints = sort_keypoints_by_point(row_of_keypoint, len(points))
         return keypoints, row_of_keypoint[keypoints]
 
@@ -59,7 +59,7 @@ class Tracks:
 
         Args:
             xyz: (m, 3) points in the world frame.
-            keypoints: (o,) global keypoints that observe the added points.
+            keypoints: (o,) global numbers of the keypoints that observe the added points.
             track: (o,) row in 0..m-1 of the added point that each keypoint observes.
 
         Returns:
@@ -71,14 +71,14 @@ class Tracks:
         return np.arange(first, first + len(xyz))
 
     def delete(self, points: Bool) -> None:
-        """Delete the points marked in ``points`` (p,) bool."""
+        """Delete the points that the bool mask ``points`` (p,) selects."""
         observed = self.point_of >= 0
         is_removed = np.zeros_like(observed)
         is_removed[observed] = points[self.point_of[observed]]
         self.point_of[is_removed] = NO_POINT
 
     def remove_observations(self, keypoints: Int64, min_length: int = 2) -> int:
-        """Remove observations, and points with fewer than ``min_length`` remaining observations.
+        """Remove observations, and points that keep fewer than ``min_length`` observations.
 
         Returns:
             The number of removed observations.
