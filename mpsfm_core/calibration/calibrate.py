@@ -69,12 +69,12 @@ class CalibrationImages:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """Calibration file and report of a calibration."""
+    """Result of a calibration with the calibration file and the report."""
 
     file: CalibrationFile
-    """Fitted calibration with its provenance."""
+    """Fitted calibration with the data about its origin."""
     report: dict[str, Any]
-    """All values of the report as plain data."""
+    """All values of the calibration report as plain data."""
 
 
 def calibrate(
@@ -94,16 +94,16 @@ def calibrate(
         photos: Images on which the provider is calibrated.
         config: Configuration whose ``depth`` or ``normals`` provider is calibrated.
         kind: Kind of the provider, depth or normals.
-        ground_truth: Options of the provider ``files``, which reads the true maps.
+        ground_truth: Options of the provider ``files``, which reads the true depth or normal maps.
         model: COLMAP model whose points are true depth. Without true maps and model, the images are
             reconstructed repeatedly until the std converges.
-        alignments: Candidate alignments of depth; by default only the scale for metric networks,
-            and all alignments for non-metric networks.
-        options: Options of the calibration study.
+        alignments: Candidate alignments of prior depth to true depth, by default only the scale for
+            metric networks, and all alignments for non-metric networks.
+        options: Options of pixel sampling, cross-validation and bootstrap.
         registry: Registry of plugins; by default all installed plugins.
 
     Raises:
-        InputError: An argument is wrong, or there are too few samples for a fit.
+        InputError: An argument is invalid, or there are too few samples to fit the std.
         ReconstructionError: Self-calibration cannot reconstruct the images.
     """
     if ground_truth is not None and model is not None:
@@ -136,7 +136,7 @@ def compare_prior(
     Args:
         photos: Images on which prior and truth are compared.
         config: Configuration with the provider of the prior.
-        ground_truth: Options of the provider ``files``, which reads the true maps.
+        ground_truth: Options of the provider ``files``, which reads the true depth or normal maps.
         kind: Kind of the provider, depth or normals.
         model: COLMAP model whose points are true depth.
         options: Options of the pixel sampling.
@@ -159,7 +159,7 @@ def compare_prior(
 
 
 class _Run:
-    """Calibration run on a folder of images with one configuration."""
+    """Calibration of one provider on a folder of images with one configuration."""
 
     def __init__(
         self,
@@ -171,7 +171,8 @@ class _Run:
         options: StudyOptions,
     ) -> None:
         stages = Stages(registry)
-        needed = ("depth", "normals", "masks")  # Self-calibration resolves more providers.
+        # Self-calibration also reconstructs the images, which needs all providers.
+        needed = ("depth", "normals", "masks")
         config = resolve_providers(config, registry, stages, needed).config
         self._photos, self._config, self._kind = photos, config, kind
         self._registry, self._options = registry, options
@@ -276,7 +277,7 @@ class _Run:
 
 
 def _median_change(data: CalibrationData, before: Calibration, after: Calibration) -> float:
-    """Compute the median relative change of the declared std between two calibrations."""
+    """Compute the median relative change of the declared depth std between two calibrations."""
     stds = [std_of(c, data.residuals(c)) for c in (before, after)]
     return float(np.expm1(np.median(np.abs(np.log(stds[1] / stds[0])))))
 

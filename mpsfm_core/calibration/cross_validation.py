@@ -1,4 +1,4 @@
-"""Calibration study: fit, bootstrap intervals, and cross-validation over images."""
+"""Fit of a calibration with bootstrap intervals and cross-validation over images."""
 
 from __future__ import annotations
 
@@ -26,18 +26,18 @@ from mpsfm_core.geometry.statistics import MAD_TO_STD
 from mpsfm_core.providers.uncertainty.calibration import Calibration
 
 FEW_IMAGES = 10
-"""Number of images below which the report warns [ours]."""
+"""Number of images below which the report warns that the fit is uncertain [ours]."""
 WIDE_INTERVAL = 0.25
-"""Relative half width of a confidence interval above which the report warns [ours]."""
+"""Relative half width of a std factor's confidence interval above which the report warns [ours]."""
 MANY_GROSS = 0.2
-"""Ratio of gross errors above which the report doubts the ground truth [ours]."""
+"""Ratio of gross errors above which the report warns that the ground truth may be wrong [ours]."""
 _INTERVAL = (2.5, 97.5)
 
 CalibrationData: TypeAlias = DepthData | NormalData
 
 
 class StudyOptions(Options):
-    """Options of a calibration study: sampling, cross-validation and bootstrap."""
+    """Options of pixel sampling, cross-validation and bootstrap of a calibration study."""
 
     seed: int = Field(0, ge=0)
     """Seed of the pixel sampling and of the bootstrap."""
@@ -50,7 +50,7 @@ class StudyOptions(Options):
     bootstraps: int = Field(100, ge=0)
     """Number of bootstrap samples for confidence intervals; 0 disables the intervals."""
     samples_per_image: int = Field(500, ge=20)
-    """Maximum number of pixels per image from dense true maps, whose errors are correlated."""
+    """Maximum number of pixels sampled per image from true maps, whose errors are correlated."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +60,9 @@ class CalibrationStudy:
     calibration: Calibration
     """Calibration that is fitted to all images."""
     report: dict[str, Any]
-    """All values of the report as plain data."""
+    """All values of the calibration report as plain data."""
     warnings: tuple[str, ...]
-    """Warnings with reasons to doubt the calibration."""
+    """Warnings that give reasons to doubt the calibration."""
 
 
 def run_study(
@@ -72,8 +72,8 @@ def run_study(
 
     Args:
         data: Samples of prior and truth from at least one image.
-        declared: Calibration that the plugin declares.
-        options: Options of the study.
+        declared: Calibration that the provider's plugin declares.
+        options: Options of pixel sampling, cross-validation and bootstrap.
     """
     candidates = data.fit()
     best = select_candidate(candidates)
@@ -123,8 +123,8 @@ def evaluate_calibrations(
 ) -> dict[str, Any]:
     """Compute the metrics of each fold's calibration on the test images of the fold.
 
-    The metrics pool all images after scaling each depth map. Coverage is also reported per fold,
-    and without scaling for metric priors.
+    The metrics pool all images after scaling each depth map. The coverage (ratio of errors within
+    1, 2 and 3 stds) is also reported per fold, and without scaling for metric priors.
     """
     scaled, std = _apply(held_out, calibrations, scaled=True)
     metrics = compute_metrics(concatenate_residuals(scaled), np.concatenate(std))
@@ -151,14 +151,14 @@ def _coverage(residuals: Residuals, std: Float64) -> list[float]:
 
 
 def _place(data: CalibrationData) -> str:
-    """Return the label of the quantity, depth or slant, that groups errors."""
+    """Return the label (depth or slant) of the quantity by which errors are grouped."""
     if isinstance(data, NormalData):
         return "slant (degrees)"
     return "depth (m)" if data.in_meters else "depth (unit of the model)"
 
 
 def _scale(data: CalibrationData, calibration: Calibration) -> dict[str, float] | None:
-    """Compute the median over images of the scale (true to prior depth), and the std of its log."""
+    """Compute the median over images of the ratio true to prior depth, and its log std."""
     if isinstance(data, NormalData):
         return None
     scales = data.residuals(calibration).scales
@@ -170,7 +170,7 @@ def _scale(data: CalibrationData, calibration: Calibration) -> dict[str, float] 
 def _intervals(
     residuals: Residuals, fit: StdFit, count: int, rng: np.random.Generator
 ) -> dict[str, list[float]]:
-    """Compute 95 % confidence intervals of the determined std factors; angles in degrees."""
+    """Compute 95 % intervals of the std factors that the data determine; angles in degrees."""
     if count == 0 or residuals.images < 2:
         return {}
     low, high = np.percentile(bootstrap_fit(residuals, fit, count, rng), _INTERVAL, axis=0)

@@ -28,7 +28,7 @@ class FileTruth:
     Args:
         context: Extraction context.
         kind: ``depth`` or ``normals``.
-        options: Options of the provider ``files``.
+        options: Options of the provider ``files``, which reads the true maps.
         count: Maximum number of pixels per image.
         seed: Seed of the pixel sampling.
     """
@@ -52,7 +52,7 @@ class FileTruth:
         self._count, self._seed = count, seed
 
     def has(self, view: View) -> bool:
-        """Return True if a view has a true map."""
+        """Return True if a view has a true depth or normal map."""
         try:
             find_file(self._options, view, "ground truth")
         except InputError:

@@ -18,7 +18,7 @@ CURVE_POINTS = 50
 BINS = 10
 """Number of bins of a calibration curve."""
 RANGES = 5
-"""Number of ranges of depth or slant in the report."""
+"""Number of ranges of depth or slant for which the report gives the coverage."""
 NORMAL_COVERAGE = (ONE_SIGMA, 0.9545, 0.9973)
 """Probabilities that a normally distributed error is within 1, 2 and 3 stds."""
 
@@ -87,7 +87,7 @@ def sensitivity_curve(errors: Float64, std: Float64) -> dict[str, list[float]]:
 
 
 def _curve_by_std(error: Float64, total: Float64) -> list[dict[str, float]]:
-    """Compute declared and actual std in bins of similar declared std."""
+    """Compute declared std and actual error std in bins of similar declared std."""
     return [
         {
             "std": float(np.sqrt((total[rows] ** 2).mean())),

@@ -30,14 +30,15 @@ from mpsfm_core.providers.uncertainty.calibration import (
 )
 
 Alignment = Literal["scale", "scale-shift", "disparity"]
-"""Alignment of depth priors: scale, scale and depth shift, or scale and inverse depth shift."""
+"""Alignment of prior to true depth by scale, scale and depth shift, or scale and inverse depth
+shift."""
 
 EDGE_RATIOS = (1.05, 1.1, 1.2)
 """Candidate ratios of neighboring depths at depth edges, larger than on slanted planes [ours]."""
 SHIFT_RANGE = (-0.95, 5.0)
 """Range of candidate shifts in units of the depth map's median [ours]."""
 DEFAULT_FLOOR = 0.02
-"""Default floor of the std in meters, if the data do not determine the floor [paper, appendix
+"""Default minimum of the depth std in meters, if the data do not determine it [paper, appendix
 C]."""
 MIN_GAIN_STD_ERRORS = 2.0
 """Minimum log density gain of a more complex model in standard errors [ours]."""
@@ -58,7 +59,7 @@ class Candidate:
     name: str
     """Description of the calibration model for the report."""
     fit: StdFit
-    """Maximum-likelihood fit of the std."""
+    """Maximum-likelihood fit of the std to the errors."""
     calibration: Calibration
     """Calibration with the fitted parameters."""
     gain: float
@@ -70,7 +71,7 @@ class Candidate:
 
 
 def std_of(calibration: Calibration, residuals: Residuals) -> Float64:
-    """Compute the std (n,) of log depth, or of normals in rad, that a calibration declares."""
+    """Compute the declared std (n,) of log depth, or of normals in rad, of a calibration."""
     if isinstance(calibration, DepthCalibration):
         factors = {
             "std_scale": calibration.std_scale * calibration.use_network_variance,
@@ -116,7 +117,7 @@ class DepthData:
         return depth_residuals(self.samples, calibration, scaled=scaled)
 
     def fit(self) -> list[Candidate]:
-        """Fit candidates of growing complexity: alignment, then std terms, then depth edges."""
+        """Fit candidates with growing complexity of alignment, then std terms, then depth edges."""
         floor = ("std_floor",) * self.samples[0].metric
         search = _ModelSearch()
         for alignment in self.alignments:
@@ -164,10 +165,11 @@ def select_candidate(candidates: Sequence[Candidate]) -> Candidate:
 
 
 def calibration_from_fit(base: Calibration, fit: StdFit) -> Calibration:
-    """Convert a fit to a calibration with the shift of `base`, rounded to four digits.
+    """Convert a std fit to a calibration with the depth shift of `base`, rounded to four digits.
 
-    The calibration omits std terms that are rarely the largest, because the data do not determine
-    them. An undetermined floor has the default value.
+    The std is the maximum of several terms. The calibration omits terms that are rarely the
+    largest, because the data do not determine them. A std floor that the data do not determine has
+    the default value.
     """
     factors = {
         name: round_significant(value)
@@ -198,7 +200,7 @@ def calibration_from_fit(base: Calibration, fit: StdFit) -> Calibration:
 
 
 class _CandidateModel(NamedTuple):
-    """Calibration model to fit, with the shift of the alignment in `base`."""
+    """Calibration model to fit, with the depth shift of the alignment in `base`."""
 
     base: Calibration
     residuals: Residuals
@@ -207,7 +209,7 @@ class _CandidateModel(NamedTuple):
 
 
 class _ModelSearch:
-    """Search for the best calibration model by growing complexity."""
+    """Search for the best calibration model, from simple to complex models."""
 
     def __init__(self) -> None:
         self.candidates: list[Candidate] = []
@@ -215,7 +217,7 @@ class _ModelSearch:
         self._density: Float64 | None = None
 
     def offer(self, name: str, attempts: Sequence[_CandidateModel]) -> None:
-        """Fit variants of a model and select the most likely if better than the selected model."""
+        """Fit variants of a model; select the most likely if better than the selected model."""
         fits = [fit_std(a.residuals, a.names, a.edge_ratio) for a in attempts]
         place = int(np.argmax([fit.log_density.mean() for fit in fits]))
         attempt, fit = attempts[place], fits[place]
@@ -231,7 +233,7 @@ class _ModelSearch:
 
 
 def _standard_error(values: Float64) -> float:
-    """Return the standard error of the mean; infinite for a single value."""
+    """Return the standard error of the mean of values; infinite for a single value."""
     return float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else np.inf
 
 

@@ -5,7 +5,8 @@ The depth priors of the reconstruction therefore do not influence the true depth
 a point contains only the errors of its rays.
 
 Points concentrate on texture, where depth networks have smaller errors than on textureless
-surfaces. Pixels are therefore sampled uniformly, and each pixel uses its nearest point.
+surfaces. Pixels are therefore sampled uniformly, and each pixel gets the depth of its nearest
+point.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ MIN_ANGLE_DEG = 2.0
 MAX_LOG_STD = 0.05
 """Maximum relative std of the depth of a true point [ours]."""
 MAX_ERROR_STD = 4.0
-"""Maximum reprojection error of a true point in stds [reference: 4 px]."""
+"""Maximum reprojection error of a true point in keypoint stds [reference: 4 px]."""
 STD_PX_RANGE = (0.3, 3.0)
 """Minimum and maximum of the estimated keypoint noise in pixels [ours]."""
 REACH = 0.08
@@ -66,7 +67,8 @@ def sample_evenly(
 ) -> DepthTruth:
     """Sample pixels uniformly and return the true depth of the point nearest to each pixel.
 
-    A point may be sampled repeatedly. Pixels without a point within :data:`REACH` are omitted.
+    The same point may be sampled for several pixels. Pixels without a point within :data:`REACH`
+    are omitted.
 
     Args:
         truth: True depth at the observed points of a view.

@@ -18,12 +18,13 @@ Metrics = Mapping[str, Any]
 
 
 def draw_plots(metrics: Mapping[str, Metrics], place: str, error: str) -> tuple[str, bytes]:
-    """Draw four plots of the metrics ``before`` and ``after`` as SVG element and PNG file.
+    """Draw plots of the metrics before and after calibration as SVG element and PNG file.
 
     Args:
-        metrics: Metrics of the calibrations ``before`` and ``after``.
-        place: Label of the quantity that groups errors, depth or slant.
-        error: Label of the errors.
+        metrics: Metrics of the declared calibration (``before``) and of the fitted calibration
+            (``after``).
+        place: Axis label of the quantity that groups errors, depth or slant.
+        error: Axis label of the errors with their unit.
     """
     panels: tuple[Callable[[Axes, Mapping[str, Metrics]], None], ...] = (
         _sensitivity,

@@ -30,7 +30,7 @@ from mpsfm_core.providers.uncertainty.calibration_file import CalibratedKind
 Samples = TypeVar("Samples", DepthSamples, NormalSamples)
 
 ALL_ALIGNMENTS: tuple[Alignment, ...] = ("scale", "scale-shift", "disparity")
-"""Candidate alignments of depth priors that are not metric."""
+"""Candidate alignments to true depth, for depth priors that are not metric."""
 
 
 class PriorComparison:
@@ -39,8 +39,9 @@ class PriorComparison:
     Args:
         context: Extraction context.
         kind: Kind of the prior, depth or normals.
-        alignments: Candidate alignments of depth, or None for the default of the provider.
-        options: Options of the calibration study.
+        alignments: Candidate alignments of prior depth to true depth, or None for the default of
+            the provider.
+        options: Options of pixel sampling, cross-validation and bootstrap.
     """
 
     def __init__(
@@ -62,10 +63,10 @@ class PriorComparison:
         return (self._kind == "normals" and self._raw.normals) or self._raw.depth
 
     def with_files(self, options: Mapping[str, Any]) -> CalibrationData:
-        """Compare the priors with true map files; images without a file are omitted.
+        """Compare the priors with true maps; images without a true map file are omitted.
 
         Args:
-            options: Options of the provider ``files``.
+            options: Options of the provider ``files``, which reads the true maps.
 
         Raises:
             InputError: No image has a true map file with enough valid pixels.

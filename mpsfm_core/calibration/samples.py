@@ -1,4 +1,4 @@
-"""Samples of prior and true depth or normals, and the errors that a calibration fits."""
+"""Samples of prior and true depth or normals, and the errors to which the std is fitted."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class DepthSamples:
     step: Float64
     """(n,) maximum difference of log depth to the four neighboring pixels."""
     truth: Float64
-    """(n,) true depth at the samples."""
+    """(n,) true depth at the sampled pixels."""
     truth_std: Float64
     """(n,) std of the true log depth."""
     depth_medians: tuple[float, float]
@@ -90,7 +90,7 @@ class NormalSamples:
 
 @dataclass(frozen=True, eq=False)
 class Residuals:
-    """Errors of a prior at n samples, with the m terms of their std ``max_j(theta_j * term_j)``."""
+    """Errors of a prior at n pixels, with the m terms of their std ``max_j(theta_j * term_j)``."""
 
     error: Float64
     """(n,) errors of log depth, or of a normal along one tangent direction in rad."""
@@ -109,11 +109,11 @@ class Residuals:
     unit: Float64
     """(n,) factor that converts the modeled std to the unit of ``magnitude``."""
     place: Float64
-    """(n,) quantity that groups errors in the report: depth, or slant in degrees."""
+    """(n,) quantity (depth, or slant in degrees) by which the report groups errors."""
     images: int
     """Number of images."""
     limit: float
-    """Maximum error, at which larger errors are clipped."""
+    """Maximum error in the unit of ``error``, at which larger errors are clipped."""
     scales: Float64
     """(images,) log of the depth scale of each image; empty for normals."""
 
@@ -121,12 +121,12 @@ class Residuals:
         return len(self.error)
 
     def weights(self) -> Float64:
-        """Return sample weights (n,), the inverse number of samples of the image."""
+        """Return weights (n,) of the samples, the inverse number of samples of their image."""
         return 1.0 / np.bincount(self.image, minlength=self.images)[self.image]
 
 
 def concatenate_residuals(parts: Sequence[Residuals]) -> Residuals:
-    """Concatenate the residuals of disjoint groups of images."""
+    """Concatenate the prior errors of disjoint groups of images."""
     names = ("error", "noise", "terms", "step", "magnitude", "unit", "place", "scales")
     arrays: dict[str, Any] = {n: np.concatenate([getattr(p, n) for p in parts]) for n in names}
     firsts = np.cumsum([0, *(part.images for part in parts)])
@@ -137,7 +137,7 @@ def concatenate_residuals(parts: Sequence[Residuals]) -> Residuals:
 def compare_depth(
     name: str, prior: DepthPrior, size: tuple[int, int], truth: DepthTruth
 ) -> DepthSamples | None:
-    """Sample a depth prior bilinearly at pixels with true depth, as the mapper at keypoints.
+    """Sample a depth prior bilinearly at pixels with true depth.
 
     Args:
         name: Name of the image.

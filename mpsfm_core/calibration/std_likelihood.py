@@ -41,12 +41,12 @@ _NORMALISER = gamma(0.5 * (FREEDOM + 1)) / gamma(0.5 * FREEDOM) / np.sqrt(FREEDO
 _RESTARTS = 5
 _SMALLEST_GAIN = 1e-6
 _RANGE = 1e4
-"""Bound of a factor of the std relative to its value as the only term."""
+"""Bound of a std factor, relative to the factor that is fitted if its term is the only term."""
 
 
 @dataclass(frozen=True, eq=False)
 class StdFit:
-    """Fitted model of the std with m terms."""
+    """Fitted model of the std, the maximum of m scaled terms."""
 
     names: tuple[str, ...]
     """Names of the m terms of the std."""
@@ -55,7 +55,7 @@ class StdFit:
     edge_ratio: float | None
     """Minimum ratio of neighboring depths at a depth edge, or None for a model without edges."""
     edge_scale: float
-    """Factor of the std at depth edges."""
+    """Factor by which the std is larger at depth edges."""
     gross: float
     """Ratio of gross errors in the mixture."""
     shares: Float64
@@ -74,7 +74,7 @@ def fit_std(
 
     Args:
         residuals: Errors and terms.
-        names: Names of the fitted terms; all terms by default.
+        names: Names of the std terms to fit; all terms by default.
         edge_ratio: Minimum ratio of neighboring depths at a depth edge, or None to fit no edge
             factor.
     """
@@ -145,13 +145,13 @@ class _Problem:
         self._alone = self._factors_alone()
 
     def reweighted(self, repeats: Int64) -> _Problem:
-        """Return the problem with each image repeated, for a bootstrap sample."""
+        """Return the fit problem with repeated images of a bootstrap sample."""
         other = copy(self)
         other._weights = self._weights * repeats[self._residuals.image]
         return other
 
     def starts(self) -> list[Float64]:
-        """Return start parameters with equal terms, and with each term dominant in turn."""
+        """Return start parameters with equal std terms, and with each std term dominant in turn."""
         count = len(self._names)
         rest = [0.0] * (self._edge_ratio is not None) + [-2.0]
         mixes = [np.zeros(count)]
@@ -166,12 +166,12 @@ class _Problem:
         return np.concatenate([np.log(fit.values), edges, [np.log(share / (1 - share))]])
 
     def solve(self, start: Float64) -> tuple[Float64, float]:
-        """Minimize the negative log likelihood and return parameters and minimum."""
+        """Minimize the negative log likelihood, and return the parameters and the minimum."""
         span = np.log(_RANGE)
         bounds = [(v - span, v + span) for v in self._alone]
         bounds += [(0.0, span)] * (self._edge_ratio is not None) + [(-9.0, 9.0)]
         best = minimize(self._objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
-        for _ in range(_RESTARTS):  # A new largest term invalidates the L-BFGS memory.
+        for _ in range(_RESTARTS):  # A new largest std term invalidates the L-BFGS memory.
             again = minimize(self._objective, best.x, jac=True, method="L-BFGS-B", bounds=bounds)
             gain = best.fun - again.fun
             best = again if gain > 0 else best
@@ -180,7 +180,7 @@ class _Problem:
         return np.asarray(best.x), float(best.fun)
 
     def finish(self, vector: Float64) -> StdFit:
-        """Scale all factors to the coverage of one std and build the fit."""
+        """Scale all std factors to a coverage of 68.27 % within one std, and build the fit."""
         state = self._evaluate(vector)
         count = len(self._names)
         inside = np.maximum(self._squared - self._noise, 0) / state.variance
@@ -205,7 +205,7 @@ class _Problem:
         )
 
     def _limits(self, vector: Float64) -> Float64:
-        """Compute the factor below which each term is rarely the largest; infinite for one term."""
+        """Compute the factor below which each std term is rarely the largest, or infinity."""
         count = len(self._names)
         limits = np.full(count, np.inf)
         scaled = self._terms * np.exp(vector[:count])
@@ -215,7 +215,7 @@ class _Problem:
         return limits
 
     def _factors_alone(self) -> Float64:
-        """Compute the log of each factor from the median error, if its term is the only term."""
+        """Compute the log of each std factor from the median error, for its term alone."""
         spread = MAD_TO_STD * np.median(np.abs(self._residuals.error))
         values: Float64 = np.log(max(spread, 1e-9) / np.median(self._terms, axis=0))
         return values

@@ -58,7 +58,8 @@ def build_app() -> typer.Typer:
         callback=_configure_logging,
         no_args_is_help=True,
         add_completion=False,
-        pretty_exceptions_show_locals=False,  # local variables include whole images
+        # Tracebacks omit local variables, because these may be whole images.
+        pretty_exceptions_show_locals=False,
     )
     app.command("reconstruct")(reconstruct.reconstruct)
     app.command("demo")(demo.demo)
@@ -104,4 +105,5 @@ def _configure_logging(
     logging.basicConfig(format="mpsfm: %(levelname)s: %(message)s", level=logging.WARNING)
     logging.getLogger("mpsfm_core").setLevel(logging.DEBUG if debug else logging.WARNING)
     if not debug:
-        os.environ.setdefault("GLOG_minloglevel", "1")  # hides COLMAP's info messages
+        # The log level 1 of glog hides the info messages of COLMAP.
+        os.environ.setdefault("GLOG_minloglevel", "1")

@@ -52,7 +52,8 @@ def _explain(error: Exception) -> tuple[str, int]:
     """Convert an exception to a message and an exit code."""
     if isinstance(error, MpsfmError):
         return str(error), error.exit_code
-    if isinstance(error, OSError):  # for example a full disk or missing permissions
+    # An OSError is a machine failure, for example a full disk or missing permissions.
+    if isinstance(error, OSError):
         return str(error), 1
     name = type(error).__name__
     return f"internal error: {name}: {error} (run mpsfm --debug ... for a traceback)", 1

@@ -214,7 +214,8 @@ def _default_weights() -> Iterator[tuple[str, WeightsFile]]:
     registry = Registry.discover()
     for status in registry.status():
         if status.available and status.kind != "plugin":
-            with suppress(InputError):  # the provider has no default weights
+            # Providers without default weights raise an InputError and are omitted.
+            with suppress(InputError):
                 for file in registry.weights(status.kind, status.name):
                     yield f"{status.kind}/{status.name}", file
 

@@ -187,7 +187,8 @@ def prepare_sets(
     loaded = resolve_providers(loaded, registry, stages).config
     image_list = work / "images.txt"
     write_file(image_list, "\n".join(names) + "\n")
-    inputs = loaded.inputs.model_copy(update={"strict": True})  # No image may be skipped.
+    # The option makes an unreadable image an error, because no image may be skipped.
+    inputs = loaded.inputs.model_copy(update={"strict": True})
     images = load_images(scene.images, scene.intrinsics, image_list, inputs)
     no_adjustment = loaded.adjustment.model_copy(update={"enabled": False})
     unadjusted = loaded.model_copy(update={"adjustment": no_adjustment})

@@ -36,7 +36,8 @@ def estimate_chained_poses(problem: MappingProblem, seed: int = 0) -> list[dict[
         Poses ``cam_from_world`` by image name of each component, the largest first.
     """
     options = RegistrationOptions()
-    scene = Scene(problem)  # Without poses, the 3D points are in the camera frame.
+    # Without poses, the 3D points of each depth map are in the camera frame.
+    scene = Scene(problem)
     for depth_map in scene.maps:
         depth_map.set_scale(1.0)
     links: dict[tuple[int, int], _RelativePose] = {}

@@ -22,8 +22,8 @@ from mpsfm_core.support.threads import count_cores
 T = TypeVar("T")
 
 _MAX_WORKERS = 4
-"""Default limit for ``runtime.workers``. Each worker loads its own copy of a network, so further
-CPU cores become threads of the workers."""
+"""Default maximum of the option ``runtime.workers``. Each worker loads its own copy of a network,
+so further CPU cores become threads of the workers."""
 _MAX_URI_LENGTH = 1000
 
 
@@ -77,7 +77,8 @@ class ActiveProvider:
     def instance(self) -> Any:
         """The provider instance of this thread."""
         if not hasattr(self._local, "provider"):
-            with self._lock:  # imports and downloads once, not in every thread at the same time
+            # The lock makes one thread import libraries and download weights, not all threads.
+            with self._lock:
                 self._local.provider = self._create()
         return self._local.provider
 
@@ -96,8 +97,8 @@ class ActiveProvider:
 
         Args:
             key: Key of the result in the cache.
-            compute: Computes the result with a provider instance.
-            timeout_s: Time limit in seconds, None for no limit.
+            compute: Function that computes the result with a provider instance.
+            timeout_s: Time limit of the computation in seconds, or None for no limit.
 
         Raises:
             ProviderRunError: the time limit is exceeded.
@@ -155,7 +156,7 @@ class ActiveProvider:
     def _hashes(self, kind: Kind, name: str, values: dict[str, Any]) -> dict[str, str]:
         """Return the SHA-256 of the weight files and of the files named in options.
 
-        Missing weights are downloaded first, by creating the provider.
+        Missing weights are downloaded first, by creating a provider instance.
         """
         named = [uri for uri in _texts(values) if is_remote(uri) or self._store.locate(uri)]
         weights = [file.uri for file in self._registry.weights(kind, name, values)]
@@ -167,7 +168,7 @@ class ActiveProvider:
 
 
 def run_with_timeout(seconds: float | None, compute: Callable[[], T]) -> T:
-    """Run a computation; raise TimeoutError if the computation takes longer than ``seconds``."""
+    """Run a function; raise TimeoutError if the function takes longer than ``seconds``."""
     if seconds is None:
         return compute()
     outcome: list[Any] = []
@@ -190,7 +191,7 @@ def run_with_timeout(seconds: float | None, compute: Callable[[], T]) -> T:
 
 
 def worker_count(runtime: RuntimeOptions) -> int:
-    """Return the number of worker threads of an extraction stage."""
+    """Return the number of parallel worker threads of an extraction stage."""
     return runtime.workers or min(_MAX_WORKERS, count_cores())
 
 
@@ -223,7 +224,7 @@ def _may_have_gpu() -> bool:
 
 
 def _texts(values: object) -> Iterator[str]:
-    """Yield all texts in plain data that can be a file name or URI."""
+    """Yield all strings in nested plain data that can be a file name or URI."""
     if isinstance(values, dict):
         values = list(values.values())
     if isinstance(values, list):

@@ -39,8 +39,8 @@ class Cache:
     """Folder of cache entries, shared by threads and processes.
 
     Args:
-        folder: Cache folder, default ``$MPSFM_CACHE`` or the platform's user cache. Entries are
-            stored in the subfolder ``extraction/``.
+        folder: Cache folder, default ``$MPSFM_CACHE`` or the platform's user cache. Cache entries
+            are stored in its subfolder ``extraction/``.
     """
 
     def __init__(self, folder: Path | None = None) -> None:
@@ -92,7 +92,7 @@ class Cache:
 
 
 def cache_folder(folder: Path | None = None) -> Path:
-    """Return ``folder`` if given, else ``$MPSFM_CACHE``, else the platform's user cache."""
+    """Return the cache folder, ``folder`` if given, else ``$MPSFM_CACHE`` or the user cache."""
     return user_cache_folder() if folder is None else Path(folder).expanduser()
 
 
@@ -112,7 +112,7 @@ def digest(value: object) -> str:
 
 
 def pack(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """Flatten a data object to arrays by field path; fields that are None are omitted."""
+    """Flatten a data object to a dictionary of arrays by field path; omit fields that are None."""
     if isinstance(value, tuple) and value and is_dataclass(value[0]):
         return {
             name: array

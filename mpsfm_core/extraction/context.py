@@ -1,4 +1,4 @@
-"""Shared state of the extraction stages: masked views, providers, cache, failures, progress."""
+"""State shared by extraction stages, with masked views, providers, cache and failures."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ class ExtractionContext:
         """Error message of each skipped image, by image index."""
         self._events = events
         self.run_remotely: Callable[[str, Sequence[Any]], Generator[None, None, None]] | None = None
-        """Function that runs a stage on remote workers, or None without an executor."""
+        """Function that runs an extraction stage on remote workers, or None without a remote
+        executor."""
         self.shared_run = ""
         """Identifier of the run, under which remote workers share provider failures."""
         self._mask_providers: list[ActiveProvider] = []
@@ -72,8 +73,8 @@ class ExtractionContext:
             stage: Name of the stage, for progress messages.
             items: Input of each call of ``work``.
             work: Function that computes the result of one item.
-            providers: Providers that the stage uses; each limits the number of threads.
-            local: If true, run on this machine even if an executor is configured.
+            providers: Providers that the stage uses; each provider limits the number of threads.
+            local: If true, the stage runs on this machine even if a remote executor is configured.
         """
         workers = min((p.workers for p in providers), default=worker_count(self.config.runtime))
         is_cached = providers and not any(provider.can("uncached") for provider in providers)
@@ -99,8 +100,8 @@ class ExtractionContext:
 
         Args:
             provider: Provider to run.
-            cls: Class of the result.
-            inputs: Plain data that identifies the input.
+            cls: Data class of the provider result.
+            inputs: Plain data that identifies the input of the provider in the cache.
             compute: Function that computes the result with a provider instance.
             images: Indices of the images that the input shows.
 
@@ -138,7 +139,7 @@ class ExtractionContext:
                 raise ProviderRunError(str(known))
 
     def failed(self, images: Sequence[int]) -> bool:
-        """Check whether a provider failed on one of the images."""
+        """Check whether a provider failed on one of the given images in this run."""
         return any(index in self.failures for index in images)
 
     def _record_failure(self, images: Sequence[int], error: MpsfmError) -> None:
@@ -171,7 +172,7 @@ class ExtractionContext:
         return is_usable if mask is None else is_usable & mask
 
     def view_inputs(self, index: int, provider: ActiveProvider) -> list[object]:
-        """Return the cache-key parts of a view: pixels, masks and, if used, intrinsics."""
+        """Return pixels, masks and, if used, intrinsics of a view as parts of a cache key."""
         pixels, *intrinsics = self._unmasked_inputs(index, provider)
         masks = [self._combined_mask(index)[1]] if self._mask_providers else []
         return [pixels, *masks, *intrinsics]
@@ -193,7 +194,7 @@ class ExtractionContext:
             self.each("masks", range(len(self.images)), self._combined_mask, *self._mask_providers)
 
     def _combined_mask(self, index: int) -> tuple[UInt8, str]:
-        """Return the packed conjunction of all masks of an image, and its digest."""
+        """Return the logical AND of all masks of an image as packed bits, and its hash."""
         if index not in self._masks:
             combined = np.array(True)
             for provider in self._mask_providers:

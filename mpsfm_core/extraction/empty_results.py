@@ -51,4 +51,5 @@ EMPTY_RESULTS: Mapping[type, Callable[[], object]] = MappingProxyType(
         PairMatches: _matches,
     }
 )
-"""Constructors of empty results by class. Masks and global descriptors have no empty value."""
+"""Constructors of empty provider results by data class. Masks and global descriptors have no empty
+result."""

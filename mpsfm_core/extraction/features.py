@@ -1,4 +1,4 @@
-"""Feature extraction; features in masked areas are removed."""
+"""Extraction of features, without the features in masked areas."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ CACHED_BYTES = 512 << 20
 
 
 class FeatureTable:
-    """Features of each image outside of masks; an LRU cache in front of the disk cache."""
+    """Features of each image outside of masks, in an LRU cache in front of the disk cache."""
 
     def __init__(self, context: ExtractionContext, backend: ProviderConfig) -> None:
         self._context = context
@@ -29,7 +29,7 @@ class FeatureTable:
         )
 
     def extract(self) -> list[Features]:
-        """Compute features of all images; the result has no descriptors, to limit memory."""
+        """Compute features of all images; return them without descriptors, to limit memory."""
         images = range(len(self._context.images))
         return self._context.each("features", images, self._without_descriptors, self._provider)
 

@@ -13,24 +13,26 @@ class PairOptions(Options):
     """Selection of the image pairs to match."""
 
     mode: Literal["auto", "exhaustive", "sequential", "retrieval"] = "exhaustive"
-    """``exhaustive``: all pairs. ``sequential``: neighbors in the order of the images.
-    ``retrieval``: the most similar images by global descriptors [reference]. ``auto``: the most
-    similar images by a few local features (or by ``retrieval``, if configured), and neighbors by
-    numbered file names. ``auto`` then also matches pairs between unconnected components."""
+    """The mode ``exhaustive`` matches all image pairs, and ``sequential`` matches neighbors in the
+    order of the images. The mode ``retrieval`` matches the most similar images by global
+    descriptors [reference]. The mode ``auto`` matches the most similar images by a few local
+    features (or by the retrieval provider, if configured), and neighbors by numbered file names.
+    The mode ``auto`` then also matches pairs between unconnected components of the match graph."""
     partners: int = Field(30, ge=1)
-    """``auto``: minimum number of images that each image is matched with. A larger value finds more
-    pairs of small overlap and takes proportionally longer. [tuned: benchmarks.pairs]"""
+    """Minimum number of images that each image is matched with, in mode ``auto``. A larger value
+    finds more pairs of small overlap and takes proportionally longer. [tuned: benchmarks.pairs]"""
     overlap: int = Field(2, ge=1)
-    """``sequential`` and ``auto``: number of following images that each image is paired with.
-    [reference noverlap]"""
+    """Number of following images that each image is paired with, in modes ``sequential`` and
+    ``auto``. [reference noverlap]"""
     quadratic: bool = expert(False)
-    """``sequential`` and ``auto``: pair each image with the images 1, 2, 4, 8 ... positions later.
-    [COLMAP quadratic_overlap]"""
+    """Pair each image with the images 1, 2, 4, 8 ... positions later, in modes ``sequential`` and
+    ``auto``. [COLMAP quadratic_overlap]"""
     top_k: int = Field(20, ge=1)
-    """``retrieval``: number of most similar images that each image is paired with. [reference
-    nquery]"""
+    """Number of most similar images that each image is paired with, in mode ``retrieval``.
+    [reference nquery]"""
     min_similarity: float = expert(0.0)
-    """``retrieval``: minimum dot product of the global descriptors of a pair. [reference]"""
+    """Minimum dot product of the global descriptors of a pair, in mode ``retrieval``.
+    [reference]"""
 
 
 class VerificationOptions(Options):
@@ -45,7 +47,7 @@ class VerificationOptions(Options):
     pairs of small overlap. [COLMAP min_num_inliers]"""
     max_chance: float = expert(1e-8, ge=0, le=1)
     """Maximum probability that random matches give as many inliers for a fixed epipolar geometry
-    (a-contrario test). The value 1 disables the test. [tuned: benchmarks.pairs]"""
+    (a-contrario test). The value 1 disables the a-contrario test. [tuned: benchmarks.pairs]"""
 
 
 class AdjustmentOptions(Options):
@@ -57,16 +59,17 @@ class AdjustmentOptions(Options):
 
 
 class ExtractionOptions(Options):
-    """Resolution of prior maps, groups of a multi-view network, and dense match handling."""
+    """Options for the resolution of prior maps, multi-view networks and dense matches."""
 
     integration_size: int = expert(387, ge=16)
-    """Longer side of the depth and normal maps of the mapper, pixels. A larger value costs memory
-    and time of depth integration. [reference normscale]"""
+    """Longer side of the depth and normal maps of the mapper, pixels. A larger map costs memory and
+    time of depth integration. [reference normscale]"""
     group_size: int = expert(8, ge=1)
-    """Number of images per forward pass of a multi-view network. Memory grows with the square."""
+    """Number of images per forward pass of a multi-view network. The memory of the network grows
+    with the square of this number."""
     edge_ratio: float | None = expert(1.015, gt=1)
     """Ratio of neighboring depths above which normals get no weight; null weights all normals.
     [reference continuity]"""
     dense_snap_px: float = expert(2.0, ge=0)
-    """Without a sparse matcher: maximum distance of a dense match to the keypoints that it is
-    assigned to in both images, pixels. [reference RoMa]"""
+    """Maximum distance in pixels between a dense match and the keypoints to which the match is
+    assigned, if no sparse matcher is configured. [reference RoMa]"""

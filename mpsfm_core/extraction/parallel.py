@@ -24,9 +24,9 @@ def run_stage(
 ) -> list[Result]:
     """Compute ``[work(item) for item in items]`` in parallel threads.
 
-    The first exception, or Ctrl-C, stops the stage after the running calls. Threads suffice,
-    because providers compute in native code that releases Python's global interpreter lock.
-    Processes would each load a copy of every library and network.
+    The first exception, or Ctrl-C, stops the stage when the running calls of ``work`` end. Threads
+    suffice, because providers compute in native code that releases Python's global interpreter
+    lock. Processes would each load a copy of every library and network.
 
     Args:
         events: Receiver of progress; called in the calling thread.

@@ -70,7 +70,7 @@ def _create_executor(context: ExtractionContext) -> Executor | None:
 
 
 class _RemoteStages:
-    """Runs the stages of one run on its executor."""
+    """Runs the extraction stages of one reconstruction on a remote executor."""
 
     def __init__(self, context: ExtractionContext, executor: Executor) -> None:
         runtime = context.config.runtime.model_copy(update={"executor": THREADS})

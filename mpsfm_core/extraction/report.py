@@ -25,10 +25,10 @@ def describe(
 
     Args:
         context: Images, failures and providers of the run.
-        problem: Input of the mapper.
+        problem: Input of the mapper with images and verified pairs.
         proposed: Number of selected pairs before plugins filter the pairs.
         candidates: Candidate matches of all matched pairs.
-        outcomes: Two-view geometry of each candidate.
+        outcomes: Two-view geometry of the candidate matches of each pair.
     """
     names = context.images.names
     pairs = [

@@ -1,4 +1,4 @@
-"""Run the configured providers on all images, and assemble the mapper's problem.
+"""Run the configured providers on all images, and assemble the input of the mapper.
 
 The stages run in the order masks, features, image similarity, matching, verification, matching and
 verification of further pairs between components, keypoint adjustment, multi-view networks, depth,
@@ -49,7 +49,7 @@ class Extraction:
     """Result of extraction."""
 
     problem: MappingProblem
-    """The mapper's problem; its images have the order of the image set."""
+    """Input of the mapper, with the images in the order of the image set."""
     report: dict[str, Any]
     """Plain data for ``summary.json``: matched and dropped pairs, and the usage of providers."""
 
@@ -70,16 +70,17 @@ def extract(
         config: Configuration with resolved providers.
         registry: The installed providers.
         events: Receives progress.
-        imported: Keypoints and matches that replace features, pairs and matchers; they are
-            verified as well.
+        imported: Imported keypoints and matches, which are verified and replace feature extraction,
+            pair selection and matching.
 
     Returns:
-        The mapper's problem and a report.
+        The input of the mapper and the extraction report.
 
     Raises:
-        InputError: a provider, its weights or its files are missing, or blocks do not fit together.
+        InputError: a provider, its weights or its files are missing, or the configured providers
+            are incompatible.
         ProviderRunError: a provider failed.
-        ProviderOutputError: a provider broke its contract.
+        ProviderOutputError: the output of a provider violates the provider contract.
         ConfigError: the executor is unavailable, or its workers do not share the cache.
         OutputError: the cache cannot be written.
     """
@@ -101,14 +102,15 @@ def extend_matches(
 ) -> Extraction:
     """Extend an extraction by matches of the images that the fast pass does not constrain.
 
-    Depth and normals stay. Raises the same errors as :func:`extract`.
+    Depth and normals of the first pass are reused. Raises the same errors as :func:`extract`.
 
     Args:
         images: The images.
         config: Configuration whose ``features`` and matchers are used.
         registry: The installed providers.
-        first: Extraction of the fast pass.
-        unconstrained: Indices of the images; each new pair contains one of them.
+        first: Extraction result of the fast first pass.
+        unconstrained: Indices of the images to match again; each new pair contains at least one of
+            these images.
         events: Receives progress.
     """
     context = ExtractionContext(images, config, registry, events or NullExtractionEvents())
@@ -128,7 +130,7 @@ def extend_matches(
 def adjust_problem(
     images: ImageSet, config: Config, registry: Registry, problem: MappingProblem
 ) -> MappingProblem:
-    """Adjust the keypoints of a problem that was extracted without adjustment.
+    """Adjust the keypoints of a mapping problem that was extracted without adjustment.
 
     Raises the same errors as :func:`extract`.
 
@@ -136,7 +138,7 @@ def adjust_problem(
         images: The images.
         config: Configuration with the options of adjustment.
         registry: The installed providers.
-        problem: The problem, or a part of its pairs.
+        problem: Mapping problem to adjust, with all or a part of its image pairs.
     """
     context = ExtractionContext(images, config, registry, NullExtractionEvents())
     with threadpool_limits(thread_count(config.runtime), user_api="blas"):
@@ -204,10 +206,10 @@ class MatchingOutcome:
     located: list[Features]
     """Features of the images, without descriptors."""
     proposed: int
-    """Number of selected pairs before the filters of plugins."""
+    """Number of selected pairs before plugins filter the pairs."""
     candidates: list[CandidateMatches]
     geometries: list[TwoViewGeometry]
-    """Two-view geometry of each candidate."""
+    """Two-view geometry of the candidate matches of each pair."""
     matcher: PairMatcher | None = None
 
 
@@ -220,7 +222,8 @@ def _match(
 
     Args:
         context: The run.
-        unconstrained: Images of which each pair must contain one; None allows all pairs.
+        unconstrained: Indices of images of which each pair contains at least one; if None, all
+            pairs are allowed.
         verified: Pairs that an earlier pass verified, which connect components.
     """
     features = context.config.features
@@ -240,7 +243,7 @@ def _match(
 
 
 def _verify_imported(context: ExtractionContext, imported: ImportedMatches) -> MatchingOutcome:
-    """Verify imported matches, without those in masked areas."""
+    """Verify imported matches, after removing matches in masked areas."""
     located, allowed = [], []
     for index, (xy, std_px) in enumerate(zip(imported.keypoints, imported.std_px, strict=True)):
         mask = context.mask(index)

@@ -122,7 +122,8 @@ def preview_providers(
     def require(file: WeightsFile) -> None:
         if store.locate(file.uri) is None:
             if store.offline or not is_remote(file.uri):
-                store.resolve(file.uri, file.sha256)  # raises an error with the remedy
+                # The call raises a WeightsError, whose message tells how to get the weights.
+                store.resolve(file.uri, file.sha256)
             absent.append(file)
 
     return _ProviderSearch(registry, require, absent)(config, blocks)

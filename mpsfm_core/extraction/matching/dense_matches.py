@@ -23,9 +23,9 @@ class PointMatches:
     """Point correspondences of an image pair that are not tied to detected keypoints."""
 
     xy_a: Float64
-    """(m, 2) matched points in the first view, pixels."""
+    """(m, 2) matched points in the first view in pixels."""
     xy_b: Float64
-    """(m, 2) matched points in the second view, pixels."""
+    """(m, 2) matched points in the second view in pixels."""
     scores: Float32
     """(m,) scores of the matches."""
 
@@ -56,7 +56,7 @@ def snap_to_keypoints(
 def sample_dense_matches(
     dense: DenseMatches, keypoints_a: Float64, keypoints_b: Float64
 ) -> PointMatches:
-    """Select confident dense matches that keep a distance to keypoints and each other.
+    """Select confident dense matches that are distant from keypoints and from each other.
 
     See the MP-SfM paper, appendix "two-view correspondences".
 
@@ -76,7 +76,7 @@ def sample_dense_matches(
 
 
 def _suppress_neighbors(points: Float64) -> Bool:
-    """Apply greedy non-maximum suppression to points (n, 2), sorted best first."""
+    """Apply greedy non-maximum suppression to points (n, 2) that are sorted best first."""
     survives = np.ones(len(points), dtype=np.bool_)
     if not len(points):
         return survives
@@ -91,7 +91,7 @@ def _suppress_neighbors(points: Float64) -> Bool:
 
 
 def _nearest(keypoints: Float64, points: Float64) -> tuple[Float64, Int64]:
-    """Return distance and row of each point's nearest keypoint; infinite without keypoints."""
+    """Return distance and index of each point's nearest keypoint; infinite without keypoints."""
     if not len(keypoints):
         return np.full(len(points), np.inf), np.zeros(len(points), dtype=np.int64)
     distance, row = cKDTree(keypoints).query(points)

@@ -31,10 +31,10 @@ CACHED_BYTES = 256 << 20
 BLUR_PX = 0.8
 """Standard deviation of the Gaussian blur of gray images, pixels."""
 MAX_ALIGNMENTS = 4
-"""Maximum number of matches per keypoint whose patches are aligned, best scores first."""
+"""Maximum number of matches per keypoint whose patches are aligned; the best scores are used."""
 RADIUS_STD = 9
-"""Radius of the round patches in keypoint standard deviations. Cost grows with the square, and a
-larger patch is less often planar."""
+"""Radius of the round image patches in keypoint standard deviations. The cost of alignment grows
+with the square of the radius, and larger patches are less often planar."""
 MIN_CORRELATION = 0.8
 """Minimum normalized cross-correlation of aligned patches."""
 MAX_SHIFT_STD = 3.0
@@ -44,8 +44,8 @@ ADJUSTED_STD_RATIO = 0.25
 _NOISE_CORRELATION_PX = float(2 * np.sqrt(np.pi) * BLUR_PX)
 """Correlation length of image noise after the Gaussian blur, pixels."""
 _MIN_ALIGNMENT_STD = 0.05
-"""Minimum standard deviation of a patch alignment, in keypoint standard deviations. Accounts for
-interpolation and non-planar surfaces."""
+"""Minimum standard deviation of a patch alignment, in keypoint standard deviations. The minimum
+accounts for interpolation and non-planar surfaces."""
 _CAUCHY_SCALE = 0.3
 """Scale of the Cauchy loss on alignment residuals, in keypoint standard deviations."""
 _NUM_REWEIGHTINGS = 3
@@ -59,13 +59,13 @@ class AlignedPair:
     """Linear equations ``shift_b - warp @ shift_a = offset`` of the keypoint shifts of a pair."""
 
     rows: Int64
-    """(m,) rows of the matches whose patches were aligned."""
+    """(m,) indices of the matches whose patches were aligned."""
     warp: Float64
     """(m, 2, 2) affine warp from view a to view b."""
     offset: Float64
-    """(m, 2) offset in pixels of view b."""
+    """(m, 2) offset of the linear equations, in pixels of view b."""
     information: Float64
-    """(m, 2, 2) inverse covariance of the offset, pixels^-2 of view b."""
+    """(m, 2, 2) inverse covariance of the offset, in pixels^-2 of view b."""
 
 
 _EQUATION = ("warp", "offset", "information")
@@ -115,7 +115,7 @@ class KeypointAdjuster:
         self._gray: LruCache[int, Float32] = LruCache(CACHED_BYTES, lambda image: image.nbytes)
 
     def run(self, pairs: Sequence[VerifiedPair]) -> list[AdjustedKeypoints]:
-        """Align the best matches of all pairs, and adjust the keypoints of all images."""
+        """Align the patches of the best matches of all pairs, and adjust all keypoints."""
         counts = [len(xy) for xy in self._keypoints]
         pairs = select_best_matches(pairs, counts, MAX_ALIGNMENTS)
         aligned = self._context.each("adjustment", pairs, self._align)
@@ -151,7 +151,7 @@ def select_best_matches(
         max_matches: Number of best matches per keypoint.
 
     Returns:
-        Pairs with the selected matches, without empty pairs.
+        Image pairs with their selected matches; pairs without selected matches are omitted.
     """
     if not pairs:
         return []
@@ -255,17 +255,17 @@ def adjust_keypoints(
     aligned: Sequence[AlignedPair],
     max_shift_std: float = MAX_SHIFT_STD,
 ) -> list[AdjustedKeypoints]:
-    """Move the keypoints of all images to fit the alignments of all pairs.
+    """Move the keypoints of all images to fit the patch alignments of all pairs.
 
     The detected keypoint position has a Gaussian prior.
 
     Args:
         keypoints: (n, 2) keypoints of each image, pixels.
         std_px: Standard deviation of the keypoints of each image.
-        pairs: Pairs that were aligned.
-        aligned: Alignment of each pair.
-        max_shift_std: Maximum shift in keypoint standard deviations; keypoints with larger shifts
-            are not moved.
+        pairs: Image pairs whose patches were aligned.
+        aligned: Linear equations of the keypoint shifts of each image pair.
+        max_shift_std: Maximum keypoint shift in keypoint standard deviations; keypoints with larger
+            shifts are not moved.
     """
     counts = [len(xy) for xy in keypoints]
     std = np.repeat(np.asarray(std_px, dtype=np.float64), counts)
@@ -292,14 +292,14 @@ def solve_shifts(
 
     Args:
         std: (n,) standard deviations of the detected keypoints.
-        a: (m,) keypoint of view a of each alignment.
-        b: (m,) keypoint of view b of each alignment.
-        warp: (m, 2, 2), see :class:`AlignedPair`.
-        offset: (m, 2), see :class:`AlignedPair`.
-        information: (m, 2, 2), see :class:`AlignedPair`.
+        a: (m,) keypoint index in view a of each aligned patch pair.
+        b: (m,) keypoint index in view b of each aligned patch pair.
+        warp: (m, 2, 2) affine warps from view a to view b.
+        offset: (m, 2) measured offsets ``shift_b - warp @ shift_a`` in pixels of view b.
+        information: (m, 2, 2) inverse covariances of the offsets, in pixels^-2.
 
     Returns:
-        (n, 2) shifts in pixels; zero for keypoints without alignment.
+        (n, 2) keypoint shifts in pixels, zero for keypoints without aligned patch.
     """
     scale = _CAUCHY_SCALE * std[b]
     used, position = np.unique(np.concatenate([a, b]), return_inverse=True)

@@ -48,7 +48,7 @@ class CandidateMatches:
     sparse: SparseMatches
     """Matches between detected features."""
     points: PointMatches
-    """Matches sampled from dense matches; in match indices, ``points`` follow ``sparse``."""
+    """Matches sampled from dense matches; match indices count ``sparse`` first, then ``points``."""
     std_px: float
     """Standard deviation of the sampled ``points``, pixels."""
     precision: tuple[float, float] = (0.0, 0.0)
@@ -70,7 +70,7 @@ class PairMatcher:
         self._snaps = config.matcher is None and table is not None
 
     def match(self, pairs: list[Pair], located: list[Features]) -> list[CandidateMatches]:
-        """Match image pairs, given the features of all images; descriptors may be empty."""
+        """Match image pairs with the features of all images, whose descriptors may be empty."""
 
         def work(pair: Pair) -> CandidateMatches:
             return self._match_pair(pair, located[pair[0]], located[pair[1]])
@@ -78,7 +78,7 @@ class PairMatcher:
         return self._context.each("matching", pairs, work, *self._providers)
 
     def results(self, pair: Pair) -> list[PairMatches]:
-        """Return the results of all matchers for an image pair; cached."""
+        """Return the cached or computed results of all matchers for an image pair."""
         return [self._run(provider, pair) for provider in self._providers]
 
     def pair_depth(self, pair: Pair, side: int) -> DepthPrior:
@@ -135,14 +135,14 @@ class PairMatcher:
 
 
 class PairVerifier:
-    """Estimates the two-view geometry of candidate matches; cached."""
+    """Estimates the two-view geometry of candidate matches and caches the results."""
 
     def __init__(self, context: ExtractionContext, located: list[Features]) -> None:
         self._context = context
         self._located = located
 
     def verify(self, candidates: list[CandidateMatches]) -> list[TwoViewGeometry]:
-        """Verify all candidates; return their two-view geometries in the same order."""
+        """Verify the candidate matches of all pairs; return their two-view geometries in order."""
         return self._context.each("verification", candidates, self._verify)
 
     def _verify(self, matches: CandidateMatches) -> TwoViewGeometry:
@@ -187,7 +187,7 @@ class AssembledMatches:
 def assemble_matches(
     candidates: list[CandidateMatches], outcomes: list[TwoViewGeometry], located: list[Features]
 ) -> AssembledMatches:
-    """Collect the keypoints of each image: features, then sampled points of verified pairs."""
+    """Collect the features of each image, and the sampled points of its verified pairs."""
     keypoints = [[features.keypoints] for features in located]
     counts = [len(features) for features in located]
     noise = [[(len(features), features.std_px)] for features in located]
@@ -224,7 +224,7 @@ def assemble_matches(
 
 
 def adjust_assembled(context: ExtractionContext, assembled: AssembledMatches) -> AssembledMatches:
-    """Adjust the keypoints of assembled matches, if adjustment is enabled."""
+    """Adjust the keypoints of all verified matches, if keypoint adjustment is enabled."""
     options = context.config.adjustment
     if not (options.enabled and assembled.pairs):
         return assembled
@@ -257,7 +257,7 @@ def adjust_problem_keypoints(context: ExtractionContext, problem: MappingProblem
 
 
 def merge_matches(problem: MappingProblem, more: AssembledMatches) -> MappingProblem:
-    """Add matches to a mapping problem; append new keypoints to its keypoints."""
+    """Add verified matches to a mapping problem, and append their new keypoints."""
     offsets = [len(image.keypoints) for image in problem.images]
     images = tuple(
         replace(
@@ -286,7 +286,7 @@ def _std_factor(image: MappingImage) -> Float64:
 
 
 def _merge_pair(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:
-    """Concatenate two match lists of a pair; use the geometry with more inliers."""
+    """Concatenate two lists of verified matches of a pair; use the pose with more inliers."""
     if a is None:
         return b
     return replace(
@@ -297,7 +297,7 @@ def _merge_pair(a: VerifiedPair | None, b: VerifiedPair) -> VerifiedPair:
 
 
 def _median_std(parts: list[tuple[int, float]]) -> float:
-    """Return the median standard deviation of keypoints, given as groups (number, std)."""
+    """Return the median std of keypoints, given as tuples (number of keypoints, std)."""
     values = np.repeat([std for _, std in parts], [count for count, _ in parts])
     return float(np.median(values)) if len(values) else 1.0
 
@@ -310,7 +310,7 @@ def _precision(results: list[PairMatches]) -> tuple[float, float]:
 
 
 def _mean_precision(depth: DepthPrior) -> float:
-    """Return the mean inverse variance of valid depths, which ranks pairs [reference]."""
+    """Return the mean inverse variance of valid depths, to rank image pairs [reference]."""
     if depth.variance is None or not depth.valid.any():
         return 0.0
     return float((1.0 / depth.variance[depth.valid].astype(np.float64)).mean())

@@ -85,12 +85,12 @@ def verify_matches(
         camera_b: Camera of the second view.
         xy_a: (m, 2) matched keypoints of the first view, pixels.
         xy_b: (m, 2) matched keypoints of the second view, pixels; row i matches row i of ``xy_a``.
-        options: Thresholds of inliers and of accepted pairs.
+        options: Inlier threshold, and minimum number of inliers of a verified pair.
         std_px: Standard deviation of the keypoints, pixels; scales the inlier threshold.
         seed: Seed of RANSAC; the same input and seed give the same result.
 
     Returns:
-        The geometry, or the reason why the pair is dropped.
+        The two-view geometry, or the reason why the pair is dropped.
     """
     if len(xy_a) < options.min_inliers:
         return _dropped(PairReason.TOO_FEW_MATCHES)
@@ -128,8 +128,8 @@ def _chance_of_inliers(inliers: int, matches: int, camera: PinholeCamera, error_
 
     A random match is an inlier if its second point falls into the error band around the epipolar
     line. The epipolar line is at most as long as the image diagonal. The Sampson error combines the
-    distances in both images, hence the factor ``sqrt(2)``. Matches of the minimal sample do not
-    count (a-contrario test, Moisan and Stival, IJCV 2004).
+    distances in both images, so the width of the band has the factor ``sqrt(2)``. The matches of
+    the minimal sample are not counted (a-contrario test, Moisan and Stival, IJCV 2004).
     """
     area = camera.width * camera.height
     band = 2 * math.sqrt(2) * error_px * math.hypot(camera.width, camera.height) / area
@@ -137,7 +137,7 @@ def _chance_of_inliers(inliers: int, matches: int, camera: PinholeCamera, error_
 
 
 def _dropped(reason: PairReason, configuration: str = "", num_inliers: int = 0) -> TwoViewGeometry:
-    """Return the result for a dropped pair."""
+    """Return a two-view geometry without inliers for a dropped image pair."""
     none = np.empty(0, np.int64)
     return TwoViewGeometry(reason.value, configuration, num_inliers, none, np.eye(3), np.zeros(3))
 
@@ -150,7 +150,8 @@ def _colmap_options(
     colmap.min_E_F_inlier_ratio = _MIN_E_F_RATIO
     colmap.max_H_inlier_ratio = _MAX_H_RATIO
     colmap.compute_relative_pose = True
-    colmap.detect_watermark = False  # watermarks occur in internet photo collections only
+    # COLMAP detects watermarks only for photos from the internet.
+    colmap.detect_watermark = False
     ransac = colmap.ransac
     ransac.max_error = options.max_error_px * max(1.0, std_px)
     ransac.min_inlier_ratio = _MIN_INLIER_RATIO

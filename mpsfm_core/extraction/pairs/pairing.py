@@ -1,4 +1,4 @@
-"""Generation of image pairs: exhaustive, sequential, by similarity or by file numbers."""
+"""Generation of image pairs, either exhaustive, sequential, by similarity or by file number."""
 
 from __future__ import annotations
 
@@ -46,9 +46,9 @@ def most_similar_pairs(
 
     Args:
         similarity: (n, n) similarity of all images.
-        count: Number of partners per image.
+        count: Number of most similar images that each image is paired with.
         min_similarity: Minimum similarity of a pair.
-        images: Images that get partners; default: all.
+        images: Indices of the images that are paired with similar images; default: all images.
     """
     ranked = similarity.copy()
     np.fill_diagonal(ranked, -np.inf)
@@ -96,5 +96,5 @@ def filter_pairs(
 
 
 def _sort_pairs(pairs: Iterable[Pair]) -> list[Pair]:
-    """Sort the image pairs and the two images of each pair; drop duplicates."""
+    """Sort the image pairs and the two images of each pair; drop duplicate pairs."""
     return sorted({(min(pair), max(pair)) for pair in pairs})

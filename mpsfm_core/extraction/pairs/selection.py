@@ -27,9 +27,9 @@ class PairSelection:
 
     Args:
         context: Options, cache and progress of the run.
-        table: Features of the images, None without a feature provider.
-        unconstrained: Images to match again after the fast pass; each pair has at least one of
-            these images. None allows all pairs.
+        table: Features of the images, or None without a feature provider.
+        unconstrained: Images to match again after the fast first pass, of which each pair contains
+            at least one; if None, all pairs are allowed.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class PairSelection:
     def _compute_similarity(self) -> Float64 | None:
         """Compute the similarity (n, n) of all images by retrieval, or else by local features.
 
-        Returns None if neither a retrieval provider nor a feature provider is configured.
+        The similarity is None if neither a retrieval provider nor a feature provider is configured.
         """
         backend = self._context.config.retrieval
         if backend is not None:
@@ -154,7 +154,7 @@ class PairSelection:
         return scores
 
     def describe(self, index: int) -> Any:
-        """Compute the global descriptor (d,) of an image; cached.
+        """Return the cached or computed global descriptor (d,) of an image.
 
         Raises:
             ConfigError: no retrieval provider is configured.

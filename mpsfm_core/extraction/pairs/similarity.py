@@ -15,8 +15,8 @@ import numpy as np
 from mpsfm_core.data import Features, Float32, Float64
 
 NUM_DESCRIPTORS = 512
-"""Number of descriptors per image that are compared. Cost grows with the square.
-[tuned: benchmarks.pairs]"""
+"""Number of descriptors per image that are compared. The cost of comparison grows with the square
+of this number. [tuned: benchmarks.pairs]"""
 DIFFUSION_RATIO = 0.8
 """Diffusion weight ``alpha`` of manifold ranking. [tuned: benchmarks.pairs]"""
 _TINY = np.float32(1e-12)
@@ -50,13 +50,13 @@ def match_score(a: Float32, b: Float32) -> float:
 
 
 def diffuse_similarity(scores: Float64) -> Float64:
-    """Convert match scores to similarities by excess over chance and diffusion.
+    """Convert match scores to similarities by subtracting chance scores and by diffusion.
 
     Args:
         scores: (n, n) match scores of all pairs, symmetric with zero diagonal.
 
     Returns:
-        (n, n) similarities, nonnegative.
+        (n, n) nonnegative similarities of all images.
     """
     image_scores = scores.sum(axis=1)
     by_chance = np.outer(image_scores, image_scores) / max(image_scores.sum(), float(_TINY))

@@ -21,8 +21,8 @@ def choose_groups(count: int, matches: dict[Pair, int], size: int) -> list[tuple
     """Partition the images into groups that share verified matches.
 
     A group starts with the ungrouped image that has most matches. The group grows greedily by the
-    image that shares most matches with the group. Remaining space is filled with images of other
-    groups, because more images improve the prediction.
+    image that shares most matches with the group. A group below the maximum size is filled with
+    images of other groups, because more images improve the prediction.
 
     Args:
         count: Number of images.
@@ -30,8 +30,9 @@ def choose_groups(count: int, matches: dict[Pair, int], size: int) -> list[tuple
         size: Maximum size of a group.
 
     Returns:
-        Each group with its number of core images, which come first. Each image is a core image of
-        exactly one group.
+        The image indices of each group and the number of its core images, which come first in the
+        group. Each image is a core image of exactly one group, whose prediction gives the depth of
+        the image.
     """
     shared = np.zeros((count, count), dtype=np.int64)
     for (a, b), number in matches.items():
@@ -60,7 +61,7 @@ def _grow_group(group: list[int], shared: Int64, allowed: Any, size: int) -> lis
 
 
 class GroupPriors:
-    """Runs the multi-view provider on groups of images; cached."""
+    """Runs the multi-view provider on groups of images and caches the predictions."""
 
     def __init__(self, context: ExtractionContext) -> None:
         assert context.config.multiview is not None
@@ -80,7 +81,7 @@ class GroupPriors:
         self._poses = self._context.each("multiview", shown, self._predict_poses, self.provider)
 
     def predict(self, group: Group) -> MultiViewPrior:
-        """Predict depth and poses of an image group with the multi-view network; cached."""
+        """Return cached or computed depth and poses of an image group by the multi-view network."""
         context, provider = self._context, self.provider
 
         def compute(instance: Any) -> MultiViewPrior:
@@ -113,7 +114,7 @@ class GroupPriors:
         return [[names[image] for image in group] for group, _ in self.groups]
 
     def _predict_poses(self, group: Group) -> Float64 | None:
-        """Predict the poses of a group; depth maps stay in the disk cache, to limit memory."""
+        """Predict the poses of an image group; depth maps stay in the disk cache."""
         return self.predict(group).poses
 
 

@@ -44,7 +44,7 @@ def resize_depth(prior: DepthPrior, grid: tuple[int, int]) -> DepthPrior:
 def resize_normals(prior: NormalPrior, grid: tuple[int, int]) -> NormalPrior:
     """Resize a normal prior to a grid (width, height).
 
-    Averages normals, normalizes them, and averages the variance. A pixel is valid if all
+    The normals are averaged and normalized, and their variance is averaged. A pixel is valid if all
     contributing pixels are valid.
     """
     if (prior.shape[1], prior.shape[0]) == grid:

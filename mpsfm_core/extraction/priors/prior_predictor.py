@@ -1,4 +1,4 @@
-"""Prediction of the mapper's prior maps: predict, calibrate, resize and mask."""
+"""Prediction, calibration, resizing and masking of the depth and normal maps of the mapper."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ class PriorPredictor:
         return self._on_grid(index, depth, self._normal_calibration.apply(normals))
 
     def full_size(self, index: int) -> tuple[DepthPrior, NormalPrior]:
-        """Return full-size calibrated depth and uncalibrated normals of an image; cached."""
+        """Return full-size calibrated depth and uncalibrated normals of an image from the cache."""
         raw_depth, normals = self.predicted(index)
         depth = self._depth_calibration.apply(raw_depth)
         return depth, self._raw.predict_normals(index, depth) if normals is None else normals
 
     def predicted(self, index: int) -> tuple[DepthPrior, NormalPrior | None]:
-        """Return uncalibrated depth, and normals if the depth network predicts both; cached."""
+        """Return uncalibrated depth (and normals if the network predicts both) from the cache."""
         if self._groups is not None:
             return self._groups.depth(index), None
         if self._best is not None:
@@ -81,7 +81,7 @@ class PriorPredictor:
         return self._raw.predict(index)
 
     def _from_matcher(self, index: int) -> DepthPrior:
-        """Return the matcher's most precise depth of an image; an empty prior without a pair."""
+        """Return the matcher's most precise depth of an image; an empty prior if unmatched."""
         assert self._best is not None and self._matcher is not None
         if index not in self._best:
             empty = np.zeros((1, 1), dtype=np.float32)
@@ -129,7 +129,7 @@ def check_depth_source(config: Config, registry: Registry) -> None:
 
 
 def _best_pairs(candidates: list[CandidateMatches]) -> dict[int, tuple[CandidateMatches, int]]:
-    """Return each image's pair with the most precise depth, and the image's side (0 or 1)."""
+    """Return the pair with the most precise depth of each image, and the image's index in it."""
     best: dict[int, tuple[float, CandidateMatches, int]] = {}
     for matches in candidates:
         for side, image in enumerate(matches.pair):

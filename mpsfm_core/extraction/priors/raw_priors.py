@@ -1,4 +1,4 @@
-"""Uncalibrated depth and normals from the providers; cached."""
+"""Prediction and caching of uncalibrated depth and normals."""
 
 from __future__ import annotations
 
