@@ -1,7 +1,8 @@
 """Structure-from-Motion with monocular depth and normal priors from exchangeable plugins.
 
-Everything that users and plugin authors need is exported here. Heavy modules are imported when a
-name is first used, because the light module of a plugin imports this package.
+The package ``mpsfm_core`` exports all names that users and plugin authors need. Modules with slow
+imports are loaded when an exported name is first used, because listing the installed plugins
+imports ``mpsfm_core``.
 """
 
 from __future__ import annotations
@@ -64,11 +65,11 @@ _LAZY_MODULES = {
     "ReconstructionResult": "mpsfm_core.pipeline.run",
     "Registry": "mpsfm_core.providers.registry",
 }
-"""Modules of the names that are imported at first use."""
+"""Module of each exported name that is imported only when the name is first used."""
 
 
 def __getattr__(name: str) -> Any:
-    """Import a lazy name, or read the version of the installed package."""
+    """Import an exported name at first use, or read the version of the installed package."""
     if name == "__version__":
         value: Any = importlib.import_module("mpsfm_core.providers.registry").core_version()
     elif name in _LAZY_MODULES:

@@ -1,7 +1,7 @@
-"""Public functions of the package, exported by :mod:`mpsfm_core`.
+"""Public functions of the package ``mpsfm_core``, which re-exports them.
 
 Each function imports its dependencies when called, because the descriptor module of a plugin
-imports ``mpsfm_core``, and listing plugins must not load the optimizers.
+imports ``mpsfm_core``, and listing plugins must not load slow modules such as the mapper.
 """
 
 from __future__ import annotations
@@ -23,14 +23,15 @@ def load_config(
 
     Args:
         name_or_path: Name of a shipped configuration, or a YAML file.
-        overrides: Settings such as ``"runtime.workers=2"``, applied last.
-        registry: Providers to check names against; default: all installed providers.
+        overrides: Settings such as ``"runtime.workers=2"``, which replace those of the file.
+        registry: Providers that the configuration may name, by default all installed ones.
 
     Returns:
-        The configuration with all defaults.
+        The configuration, with the default value of every setting that the file omits.
 
     Raises:
-        ConfigError: a setting is wrong. The message has file, line and the nearest valid key.
+        ConfigError: a setting is wrong. The error message has file and line of the wrong setting
+        and the nearest valid key.
     """
     from mpsfm_core.config import load_config
 
@@ -58,19 +59,20 @@ def reconstruct(
             by ``inputs.video`` and written into ``frames/`` of the output.
         output: Result folder, used by one run at a time, or None to write nothing.
         config: Name of a shipped configuration, a YAML file, or a loaded configuration.
-        intrinsics: ``intrinsics.yaml``, a COLMAP model or ``transforms.json``. Default: the cameras
-            of ``poses``, else EXIF, else the estimate of the depth provider, else a default.
-        image_list: Text file with one image name per line; default: all images.
+        intrinsics: Camera intrinsics as ``intrinsics.yaml``, a COLMAP model or ``transforms.json``.
+            If missing, focal lengths are taken from ``poses``, else from EXIF, else estimated by
+            the depth provider, else set to a default.
+        image_list: Text file with one image name per line, by default all images of the folder.
         poses: COLMAP model or ``transforms.json`` with poses of some or all images;
             ``mapping.known_poses`` chooses whether known poses are fixed or refined.
         overrides: Settings such as ``"runtime.workers=2"``; not allowed with a loaded
             configuration.
-        registry: Providers to choose from; default: all installed providers.
-        fresh: Ignore the checkpoint of an interrupted run, and map from the start.
-        database: COLMAP database whose keypoints and matches replace features and matchers. Its
-            matches are verified again. Its cameras are ignored unless the database is also given as
-            ``intrinsics``.
-        hloc: Features file and matches file of hloc, instead of ``database``.
+        registry: Providers that the configuration may name, by default all installed ones.
+        fresh: If true, ignore the checkpoint of an interrupted run and start mapping again.
+        database: COLMAP database whose keypoints and matches replace features and matchers. The
+            matches of the database are verified again. The cameras of the database are ignored
+            unless ``intrinsics`` names the database too.
+        hloc: Features file and matches file of hloc, as an alternative to ``database``.
 
     Returns:
         COLMAP models of the original photos, arrays of the mapper, and the summary.

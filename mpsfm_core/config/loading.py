@@ -1,19 +1,19 @@
 """Read YAML files and ``--set`` overrides into one checked :class:`Config`.
 
 A configuration file may extend a shipped configuration or another file with ``extends:``. Mappings
-are merged key by key, and other values replace those of the parent file. The merge has three
-exceptions:
+are merged key by key, and other values replace those of the parent file. Merging a file with its
+parent file has three exceptions:
 
-* A provider block with another ``use:`` drops all keys of the parent's block, because another
-  provider has different options.
+* A provider block with another ``use:`` than the parent file drops all keys of the parent's block,
+  because another provider has different options.
 
-* A provider block with ``use:`` drops the parent's ``fallback:``.
+* A provider block with ``use:`` drops the ``fallback:`` providers of the parent file.
 
-* Naming features, a matcher or a multi-view network drops the parent's ``fast_pass:``, because the
-  fast pass would replace the named provider for most images.
+* Naming features, a matcher or a multi-view network drops the block ``fast_pass:`` of the parent
+  file, because the inexpensive first pass would replace the named provider for most images.
 
-The choice among ``use:`` and ``fallback:`` depends on the machine and is made at the start of a
-run, in :mod:`mpsfm_core.pipeline.provider_resolution`.
+The choice among the providers of ``use:`` and ``fallback:`` depends on the machine and is made at
+the start of a run, in :mod:`mpsfm_core.pipeline.provider_resolution`.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.yaml_text import find_line, parse_assignment, parse_yaml
 
 _REPLACE_FAST_PASS = ("features", "matcher", "dense_matcher", "multiview")
-"""Blocks whose ``use:`` drops the parent's fast pass. ``multiview`` is included because the groups
-of images of a multi-view network are chosen by their matches."""
+"""Configuration blocks whose ``use:`` drops the block ``fast_pass`` of the parent file.
+The block ``multiview`` is included because the groups of images of a multi-view network are chosen
+by their matches."""
 
 
 def shipped_configs() -> dict[str, Path]:
@@ -69,19 +70,19 @@ def load_config(
     Args:
         name_or_path: Name of a shipped configuration, or a YAML file (a slash, .yaml or .yml marks
             a file).
-        overrides: Texts ``a.b=value`` with a YAML value, applied last; list entries by index.
-        registry: Providers to check names and options against; default: ``Registry.discover()``.
+        overrides: Settings such as ``masks.0.use=sky``, which replace those of the files.
+        registry: Providers that the configuration may name, by default ``Registry.discover()``.
         complete: If false, required provider options may be missing (null in the result).
 
     Returns:
         The configuration with all defaults filled in.
 
     Raises:
-        ConfigError: a setting is wrong. The message has file, line, YAML path and, for unknown
-            keys, the nearest valid key.
+        ConfigError: a setting is wrong. The error message has the file, line and YAML path of the
+            wrong setting and, for an unknown key, the nearest valid key.
     """
     layers = _read_chain(_find_file(str(name_or_path), Path()))
-    # ``--set X.use=...`` drops options and fast pass, so it precedes overrides that set them.
+    # An override of ``X.use`` drops the options of ``X``, so overrides of options come later.
     order = sorted(overrides, key=lambda text: (text.startswith("fast_pass"), ".use=" not in text))
     layers += [_Layer(f"--set {text}", parse_assignment(text)) for text in order]
     try:
@@ -105,10 +106,10 @@ class _Layer:
     folder: Path = Path()
     """Folder of the configuration file, to resolve relative paths."""
     shipped: bool = False
-    """True for a shipped configuration."""
+    """True if the settings are those of a shipped configuration."""
 
     def has(self, path: SettingPath) -> bool:
-        """Check whether the layer has a setting at a path."""
+        """Check whether the file or override has a setting at a YAML path."""
         node: Any = self.data
         for part in path:
             if isinstance(node, list) and isinstance(part, int) and part < len(node):
@@ -135,7 +136,8 @@ def _find_file(name: str, folder: Path) -> Path:
     shipped = shipped_configs()
     if name not in shipped:
         raise ConfigError(
-            f"no configuration {name!r}{did_you_mean(name, shipped)} (a file ends in .yaml)"
+            f"no configuration {name!r}{did_you_mean(name, shipped)}; the path of a configuration "
+            "file ends in .yaml"
         )
     return shipped[name]
 
@@ -164,7 +166,7 @@ def _read_chain(path: Path, children: tuple[Path, ...] = ()) -> list[_Layer]:
     if parent is None:
         return [layer]
     if not isinstance(parent, str):
-        raise ConfigError(f"{path}: extends: must be a name or a path, is {parent!r}")
+        raise ConfigError(f"{path}: extends: must name a configuration or a file, is {parent!r}")
     try:
         parent_path = _find_file(parent, path.parent)
     except ConfigError as error:
@@ -173,7 +175,7 @@ def _read_chain(path: Path, children: tuple[Path, ...] = ()) -> list[_Layer]:
 
 
 def _merge_all(layers: Sequence[_Layer]) -> tuple[dict[str, Any], list[str]]:
-    """Merge layers of settings; return a warning if a user's file drops the fast pass."""
+    """Merge the settings of all files and overrides; warn if a user's file drops the fast pass."""
     merged: dict[str, Any] = {}
     warnings = []
     for layer in layers:
@@ -222,8 +224,9 @@ def _merge_items(base: list[Any], change: Mapping[str, Any]) -> list[Any]:
 def _check(config: Config, registry: Registry, layers: Sequence[_Layer], complete: bool) -> Config:
     """Check the options of every provider block, and fill in default options.
 
-    A block with ``fallback:`` or ``same-network`` needs one valid candidate. The options of a block
-    with ``fallback:`` stay as given.
+    In a provider block with ``fallback:``, only one of the named providers needs valid options. The
+    options of a provider block with ``fallback:`` get no defaults, because the provider is chosen
+    later.
     """
     problems: list[SettingProblem] = []
     checked = config
@@ -284,14 +287,14 @@ def check_provider_config(
     """Check a block with one provider; fill in the options of provider and wrappers.
 
     Args:
-        path: Path of the block in the configuration, for messages.
+        path: Path of the provider block in the configuration, for error messages.
         kind: Kind of the provider.
         block: Provider block without fallbacks.
         registry: Installed providers.
-        complete: If false, required options may be missing.
+        complete: If false, required provider options may be missing.
 
     Returns:
-        The block with the options of the provider and its wrappers.
+        The provider block with all options of the provider and its wrappers filled in.
 
     Raises:
         SettingsError: a provider or wrapper is not installed, or an option is wrong.
@@ -319,7 +322,7 @@ def check_provider_config(
 def _read_calibration(
     path: SettingPath, kind: Kind, block: ProviderConfig, layers: Sequence[_Layer]
 ) -> dict[str, Any] | None:
-    """Return the calibration values of a block; read the calibration file if one is named."""
+    """Return the calibrated uncertainty of a provider block; read the calibration file if named."""
     values, path = block.calibration, (*path, "calibration")
     if values is None:
         return None
@@ -337,7 +340,7 @@ def _read_calibration(
 
 
 def _missing_blocks(config: Config) -> list[SettingProblem]:
-    """Find missing blocks that other blocks require."""
+    """Find missing configuration blocks that other blocks require."""
     if config.matcher is None and config.dense_matcher is None:
         return [SettingProblem(("matcher",), "a matcher or a dense_matcher is needed")]
     problems = []
@@ -358,8 +361,9 @@ def _missing_blocks(config: Config) -> list[SettingProblem]:
 def combination_problems(config: Config, registry: Registry) -> list[SettingProblem]:
     """Find provider blocks that are valid alone but incompatible with each other.
 
-    Blocks with ``fallback:`` or ``same-network`` are ignored. The path of a problem starts with the
-    block that should change.
+    Provider blocks with ``fallback:`` or ``same-network`` are ignored, because their provider is
+    not chosen yet. The path of a returned problem starts with the configuration block that should
+    change.
     """
     problems = []
     if (fast_pass := config.fast_pass_config()) is not None:
@@ -385,7 +389,7 @@ def combination_problems(config: Config, registry: Registry) -> list[SettingProb
 
 
 def _locate(layers: Sequence[_Layer], problem: SettingProblem) -> str:
-    """Format a problem with file and line of the longest prefix of its path, last layer first."""
+    """Format the problem of a setting with file and line; later files are searched first."""
     for length in range(len(problem.path), 0, -1):
         path = problem.path[:length]
         for layer in reversed(layers):

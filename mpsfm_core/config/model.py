@@ -38,30 +38,32 @@ class RuntimeOptions(Options):
 
     workers: int | None = Field(None, ge=1)
     """Number of images or pairs that extraction and the dense stage process in parallel. More
-    workers are faster and need more memory. Null uses one worker per core, at most four in
-    extraction."""
+    workers are faster and need more memory. If ``workers`` is null, one worker per core runs, at
+    most four in extraction."""
     threads: int = expert(1, ge=1)
-    """Number of threads of a provider per worker. If ``workers`` is null, idle cores are added."""
+    """Number of threads of a provider per worker. If ``workers`` is null, providers also use the
+    cores that no worker occupies."""
     seed: int = Field(0, ge=0)
     """Seed of every random choice: providers, verification, mapper, points of ``dense.ply``."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device on which providers run; ``auto`` uses a GPU if one is available."""
+    """Device on which providers run, where ``auto`` uses a GPU if one is available."""
     cache_dir: Path | None = None
     """Folder of weights, extraction results and checkpoints; null uses the platform's cache
     folder."""
     executor: str = "threads"
-    """Where providers run: ``threads`` of this process, or the workers of an executor plugin
-    (``dask``, ``ray``), which share ``cache_dir`` and the images."""
+    """Executor that runs the providers, either in ``threads`` of this process or in the workers of
+    a plugin (``dask``, ``ray``), which share ``cache_dir`` and the images."""
     executor_options: dict[str, Any] = expert({})
     """Options of the executor plugin, such as ``address`` of a Dask scheduler."""
     on_error: Literal["fail", "skip"] = "fail"
-    """Reaction if a provider fails on an image or pair: ``fail`` ends the run, ``skip`` continues
-    without the image or pair. Failures of more than half of the images always end the run."""
+    """Reaction to a provider that fails on an image or pair, where ``fail`` ends the run and
+    ``skip`` continues without the image or pair. Failures of more than half of the images always
+    end the run."""
     timeout_s: float | None = expert(1800.0, gt=0)
     """Maximum seconds that a provider may take per image or pair; null sets no limit."""
     checkpoint_s: float | None = expert(10.0, ge=0)
-    """Minimum seconds between checkpoints of mapping. Null disables the checkpoints of mapping and
-    of the dense stage."""
+    """Minimum seconds between checkpoints of mapping. If ``checkpoint_s`` is null, mapping and the
+    dense stage write no checkpoints."""
     check_resources: bool = expert(True)
     """Use fewer workers if memory is short, and refuse a run that cannot fit into memory or onto
     the disk."""
@@ -80,10 +82,11 @@ class FastPass(Options):
     matcher: ProviderConfig
     min_points: int = expert(100, ge=1)
     """Minimum number of points with at least three observations per image. Images with fewer points
-    are matched again; a larger value matches more images again. [COLMAP init_min_num_inliers]"""
+    after the fast pass are matched again; a larger value matches more images again. [COLMAP
+    init_min_num_inliers]"""
     partners: int = expert(15, ge=1)
     """Value of ``pairs.partners`` for images that are matched again, unless all pairs are matched.
-    A larger value costs time. [tuned: benchmarks.pairs]"""
+    A larger number of partners takes more time. [tuned: benchmarks.pairs]"""
 
 
 class Config(Options):
@@ -94,7 +97,8 @@ class Config(Options):
     inputs: InputOptions = Field(default_factory=InputOptions)
     pairs: PairOptions = Field(default_factory=PairOptions)
     fast_pass: FastPass | None = None
-    """First, inexpensive pass of matching and mapping. Null matches all pairs with ``matcher``."""
+    """First, inexpensive pass of matching and mapping. If ``fast_pass`` is null, ``matcher``
+    matches all pairs."""
     features: ProviderConfig | None = None
     matcher: ProviderConfig | None = None
     """Matcher of sparse features; requires the block ``features``."""

@@ -17,7 +17,7 @@ class MemoryLimit:
 
     total: int
     free: int
-    """Bytes that the group may still allocate, with the file cache that Linux can reclaim."""
+    """Bytes that the control group may still allocate, including reclaimable file cache."""
 
 
 class ControlGroups:
@@ -73,7 +73,7 @@ def _read_cpu_quota(folder: Path) -> tuple[float, float]:
     """Return CPU quota and period in microseconds; raise ValueError without a quota."""
     if (folder / "cpu.max").is_file():
         quota, period = (folder / "cpu.max").read_text().split()
-        return float(quota), float(period)  # the quota "max" means no quota
+        return float(quota), float(period)  # a CPU quota of "max" means no quota
     quota, period = ((folder / f"cpu.cfs_{name}_us").read_text() for name in ("quota", "period"))
     return float(quota), float(period)
 

@@ -17,9 +17,9 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T", bound=np.generic)
 
 MEMORY_LIMIT = 2**29
-"""Maximum bytes of arrays in memory, about 80 images of the dense stage [ours]."""
+"""Maximum bytes of arrays in memory, enough for about 80 images of the dense stage [ours]."""
 _MIN_FILE_BYTES = 2**26
-"""Minimum size of a temporary file in bytes; a process may open only 1024 files."""
+"""Minimum size of a temporary file in bytes, because a process may open only 1024 files."""
 _ALIGNMENT = 64
 """Alignment of arrays in a file, in bytes."""
 
@@ -29,7 +29,7 @@ class DiskArrays:
 
     Files are memory-mapped, so the operating system reads pages on demand and frees them when
     memory is short. A temporary file is deleted with its last array or with the process. If the
-    disk is full, arrays stay in memory. The class is thread-safe.
+    disk is full, arrays stay in memory. Several threads may store arrays at the same time.
 
     Args:
         folder: Folder of the temporary files. The folder should be on a disk, because the system's
@@ -62,7 +62,7 @@ class DiskArrays:
         return stored
 
     def _allocate(self, size: int) -> tuple[mmap.mmap, int] | None:
-        """Reserve bytes in a mapped file; return (file, offset), or None without disk space."""
+        """Reserve bytes in a mapped file; return file and offset, None without disk space."""
         if not size or not self._usable:
             return None
         if self._chunk is None or self._used + size > len(self._chunk):

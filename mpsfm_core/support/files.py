@@ -1,7 +1,7 @@
-"""Atomic writes of files and result folders: replaced completely or not at all.
+"""Atomic writes of files and result folders, which are replaced completely or not at all.
 
 If a process is killed while writing, either the old or the complete new content is on disk. The
-next run in the same folder finishes or removes the remains of a killed run.
+next run in the same output folder finishes or removes what a killed run left incomplete.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ _TEMPORARY = ".tmp"
 _GRACE_S = 60.0
 """Age in seconds below which a temporary file may not be locked yet by its writer."""
 _READY = "ready.json"
-"""File in a scratch folder that lists the entries to replace. The existence of ``ready.json``
-commits the replacement."""
+"""File in a scratch folder that lists the output files and folders to replace. The replacement is
+committed as soon as ``ready.json`` exists."""
 FORMAT = 1
 """Version number of the format of ``ready.json``."""
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
@@ -50,11 +50,12 @@ def write_file(
 
     Args:
         path: File to write.
-        content: Bytes, a text (encoded as UTF-8), or a function that writes to an open file.
+        content: Content as bytes, as text (encoded as UTF-8), or as a function that writes to an
+        open file.
         temporary: Folder on the same disk for the incomplete file; the folder of `path` by default.
 
     Raises:
-        OSError: The file cannot be written.
+        OSError: the file cannot be written.
     """
     folder = temporary or path.parent
     for needed in (folder, path.parent):
@@ -88,12 +89,12 @@ def remove_temporary_files(folder: Path) -> None:
 def lock_output_folder(output: Path) -> Iterator[None]:
     """Create an output folder if needed, check that it is writable, and lock it.
 
-    Remains of a killed run are finished or removed. An output folder that was created and stays
-    empty is removed at the end.
+    Results that a killed run left incomplete are finished or removed. An output folder that was
+    created and stays empty is removed at the end.
 
     Raises:
-        InputError: `output` cannot be created or written, or another run has locked it.
-        OutputError: The disk is full or fails.
+        InputError: the folder `output` cannot be created or written, or another run has locked it.
+        OutputError: the disk is full or fails.
     """
     created = _create_folder(output)
     try:
@@ -118,11 +119,11 @@ def replace_entries(output: Path, entries: tuple[str, ...]) -> Iterator[Path]:
 
     Args:
         output: Output folder.
-        entries: Names in `output` that may be replaced; all others stay.
+        entries: Names of files and folders in `output` to replace; all others stay.
 
     Raises:
-        InputError: `output` cannot be created or written.
-        OutputError: The disk is full or fails.
+        InputError: the folder `output` cannot be created or written.
+        OutputError: the disk is full or fails.
     """
     created = _create_folder(output)
     try:
@@ -142,12 +143,12 @@ def replace_entries(output: Path, entries: tuple[str, ...]) -> Iterator[Path]:
 
 
 def _exchange(output: Path, scratch: Path) -> None:
-    """Replace entries by renaming; undo renames on failure, resume after a kill."""
+    """Replace the entries of an output folder by renaming; undo the renames on failure."""
     entries, new = _read_plan(scratch)
     fresh, old = scratch / "new", scratch / "old"
     remaining = sorted(entry.name for entry in fresh.iterdir())
     moves = []
-    if remaining == new:  # else all old entries are moved already, because they are moved first
+    if remaining == new:  # else all old entries have been moved, because they precede new ones
         moves = [(output / name, old / name) for name in entries]
         moves = [(source, target) for source, target in moves if source.exists()]
     moves += [(fresh / name, output / name) for name in remaining]
@@ -164,10 +165,11 @@ def _exchange(output: Path, scratch: Path) -> None:
 
 
 def _read_plan(scratch: Path) -> tuple[list[str], list[str]]:
-    """Read the names of the old and the new entries from ``ready.json``.
+    """Read the names of the old and new output files and folders from ``ready.json``.
 
     Raises:
-        InputError: ``ready.json`` was not written by `replace_entries`; it could name any path.
+        InputError: the file ``ready.json`` was not written by `replace_entries`, and its names
+        could be any path.
     """
     path = scratch / _READY
     try:
@@ -175,9 +177,9 @@ def _read_plan(scratch: Path) -> tuple[list[str], list[str]]:
         check_version(content, FORMAT, path)
         entries, new = list(content["entries"]), list(content["new"])
         if any(Path(name).name != name or name in ("", "..") for name in (*entries, *new)):
-            raise ValueError("names files outside of the folder")
+            raise ValueError("an entry names a file outside of the output folder")
         if any((scratch / part).is_symlink() for part in ("new", "old")):
-            raise ValueError("contains a symbolic link")
+            raise ValueError("the scratch folder contains a symbolic link")
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise InputError(
             f"{path}: not written by mpsfm ({error}); remove {scratch} after a check"
@@ -186,12 +188,14 @@ def _read_plan(scratch: Path) -> tuple[list[str], list[str]]:
 
 
 def _clear_up(output: Path) -> None:
-    """Finish or remove the remains of killed runs in a locked output folder."""
+    """Finish or remove the incomplete results of killed runs in a locked output folder."""
     for scratch in output.glob(f"{_SCRATCH}*"):
         if scratch.is_symlink() or not scratch.is_dir():
-            continue  # not a scratch folder
+            continue  # only a real folder can be a scratch folder
         if (scratch / _READY).is_file() and (scratch / "new").is_dir():
-            _log.warning("%s: completing the results of a killed run", output)
+            _log.warning(
+                "%s: a killed run left results incomplete, which are completed now", output
+            )
             _exchange(output, scratch)
         shutil.rmtree(scratch)
 
@@ -201,8 +205,8 @@ def _lock(folder: Path) -> Iterator[bool]:
     """Lock a folder until the end of the block; yield False if locks are unsupported.
 
     The folder itself is locked, so no lock file remains. Windows and some network disks do not
-    support folder locks. Without folder locks, concurrent runs are not detected, and remains of
-    killed runs are not removed.
+    support folder locks. Without folder locks, concurrent runs are not detected, and scratch
+    folders of killed runs are not removed.
     """
     if fcntl is None:
         yield False
@@ -250,7 +254,9 @@ def _scratch(output: Path) -> Iterator[Path]:
     try:
         yield scratch
     finally:
-        shutil.rmtree(scratch, ignore_errors=True)  # the next run removes the remains
+        shutil.rmtree(
+            scratch, ignore_errors=True
+        )  # the next run removes files that this call cannot remove
 
 
 @contextmanager
@@ -261,7 +267,7 @@ def _translate_disk_errors(output: Path) -> Iterator[None]:
     except OSError as error:
         reason = error.strerror or str(error)
         if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-            raise InputError(f"{output}: cannot be written: {reason}") from error
+            raise InputError(f"{output}: the folder cannot be written: {reason}") from error
         full = "the disk is full" if error.errno in _DISK_FULL else "the disk fails"
         raise OutputError(f"{output}: {full} ({reason}); earlier results are unchanged") from error
 

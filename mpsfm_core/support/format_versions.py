@@ -24,12 +24,12 @@ def check_version(
 
     Args:
         content: Content of the file by key.
-        known: Newest version that the caller can read.
+        known: Newest format version that the caller can read.
         path: Path of the file, for messages.
-        error: Class of the raised error.
+        error: Exception class to raise if the format version cannot be read.
 
     Raises:
-        InputError: The format version is newer than `known` or no number (raised as `error`).
+        InputError: the format version is newer than `known` or no number (raised as `error`).
     """
     value = content.get(VERSION, 1)
     try:

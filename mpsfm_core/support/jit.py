@@ -1,9 +1,9 @@
 """Numba decorators for inner loops: kernels for Python callers, helpers for kernels.
 
 Compiled kernels are cached in ``$NUMBA_CACHE_DIR``, else next to the module. If the package folder
-is not writable, kernels are cached in ``kernels`` of the user's cache (``$MPSFM_CACHE``). Helpers
-are compiled into the kernels that call them. Pass counters to helpers as ``np.int64(0)``: a literal
-0 has its own numba type, which would compile the helper twice.
+is not writable, kernels are cached in ``kernels`` of the user's cache (``$MPSFM_CACHE``). Numba
+helpers are compiled into the kernels that call them. Pass counters to helpers as ``np.int64(0)``: a
+literal 0 has its own numba type, which would compile the helper twice.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def kernel(**options: Any) -> Callable[[F], F]:
         _discard_unreadable_indices()
         try:
             return _compiled(function, cache=True, **options)
-        except RuntimeError:  # no writable cache folder
+        except RuntimeError:  # numba found no writable cache folder
             _warn_without_cache()
             return _compiled(function, **options)
 
@@ -91,7 +91,7 @@ def _choose_cache_folder() -> None:
     except OSError:
         return
     if os.access(folder, os.W_OK):
-        os.environ["NUMBA_CACHE_DIR"] = str(folder)  # inherited by worker processes
+        os.environ["NUMBA_CACHE_DIR"] = str(folder)  # worker processes inherit the variable
         numba.config.CACHE_DIR = str(folder)
 
 

@@ -25,7 +25,10 @@ class LruCache(Generic[Key, Value]):
         self._lock = threading.Lock()
 
     def get(self, key: Key, compute: Callable[[], Value]) -> Value:
-        """Return the value of a key; compute it on a miss. The newest value is never evicted."""
+        """Return the value of a key; compute the value on a miss.
+
+        The most recently computed value is never evicted, even if larger than the maximum size.
+        """
         with self._lock:
             if key in self._values:
                 self._values.move_to_end(key)

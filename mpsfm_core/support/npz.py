@@ -15,14 +15,14 @@ MAX_BYTES = 4_000_000_000
 A small compressed file could expand to any size. The limit is 16 bytes per pixel of the largest
 supported image [ours]."""
 _COMPRESSION_LEVEL = 1
-"""Compression level of zlib; level 6 takes twice the time and saves 0.5 % on depth maps."""
+"""Compression level of zlib; level 6 takes twice the time and makes depth maps 0.5 % smaller."""
 
 
 def write_npz(path: Path, **arrays: NDArray[Any]) -> None:
     """Write named arrays to a compressed NPZ file and create its folder.
 
     Raises:
-        OSError: The file cannot be written.
+        OSError: the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with zipfile.ZipFile(
@@ -37,10 +37,10 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     """Read all arrays of an NPZ file by name.
 
     Raises:
-        OSError: The file cannot be read.
-        ValueError: The file is damaged, too large, or no NPZ file.
+        OSError: the file cannot be read.
+        ValueError: the file is damaged, too large, or no NPZ file.
     """
-    with path.open("rb") as file:  # numpy does not close a damaged file
+    with path.open("rb") as file:  # numpy.load does not close a damaged file
         try:
             with zipfile.ZipFile(file) as archive:
                 size = sum(entry.file_size for entry in archive.infolist())

@@ -44,7 +44,7 @@ def count_cores(groups: ControlGroups | None = None) -> int:
 
 
 def thread_limit() -> int:
-    """Return the thread limit of the caller; without a limit, the number of cores."""
+    """Return the thread limit of the calling thread; without a limit, the number of cores."""
     return _LIMIT.get() or count_cores()
 
 
@@ -58,9 +58,9 @@ def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> l
 def limit_threads(count: int | None) -> Iterator[None]:
     """Limit the number of threads inside a ``with`` block.
 
-    The limit of :func:`thread_limit` applies to the calling thread. The limit of BLAS and OpenMP
-    applies to the whole process. OpenCV gets one thread, because several worker threads call OpenCV
-    at the same time.
+    The limit that :func:`thread_limit` returns changes only for the calling thread. The number of
+    threads of BLAS and OpenMP is limited in the whole process. OpenCV gets one thread, because
+    several worker threads call OpenCV at the same time.
 
     Args:
         count: Maximum number of threads, or None for one thread per core.

@@ -32,7 +32,7 @@ def user_cache_folder() -> Path:
 def user_data_folder() -> Path:
     """Return the platform's data folder, else ``data`` in :func:`user_cache_folder`.
 
-    The second case is an account without a home: a container's user id without a passwd entry.
+    Some accounts have no data folder, for instance a container's user id without a passwd entry.
     """
     try:
         return Path(platformdirs.user_data_dir("mpsfm"))

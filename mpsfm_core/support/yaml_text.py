@@ -1,6 +1,6 @@
 """YAML 1.2 scalars, errors for repeated keys, and line numbers.
 
-PyYAML follows YAML 1.1, where ``no`` is false, ``1e-3`` a text and ``2024-01-01`` a date.
+PyYAML itself follows YAML 1.1, where ``no`` is false, ``1e-3`` a text and ``2024-01-01`` a date.
 """
 
 from __future__ import annotations
@@ -60,10 +60,10 @@ def parse_yaml(text: str, source: str) -> Any:
 
     Args:
         text: Text of the YAML document.
-        source: File name or option of the document, for messages.
+        source: Source of the document for error messages, a file name or a command-line option.
 
     Raises:
-        ConfigError: The document is not valid YAML; the message has source and line.
+        ConfigError: the document is not valid YAML; the error message has source and line.
     """
     try:
         return yaml.load(text, Loader=_Loader)
@@ -73,20 +73,20 @@ def parse_yaml(text: str, source: str) -> Any:
     except yaml.YAMLError as error:
         raise ConfigError(f"{source}: not valid YAML: {error}") from error
     except RecursionError as error:
-        raise ConfigError(f"{source}: is nested too deeply") from error
+        raise ConfigError(f"{source}: the YAML text is nested too deeply") from error
 
 
 def parse_assignment(text: str) -> dict[str, Any]:
     """Parse ``a.b=value`` with a YAML value to ``{"a": {"b": value}}``.
 
     Raises:
-        ConfigError: The text is no assignment, or its value is not valid YAML.
+        ConfigError: the text is no assignment ``a.b=value``, or its value is not valid YAML.
     """
     key, equals, value = text.partition("=")
     parts = key.strip().split(".")
     source = f"--set {text}"
     if not (equals and all(parts)):
-        raise ConfigError(f"{source}: must look like a.b=value")
+        raise ConfigError(f"{source}: a setting must look like a.b=value")
     data: Any = parse_yaml(value, source)
     for part in reversed(parts):
         data = {part: data}

@@ -6,7 +6,8 @@ The test file of a plugin contains::
 
     test_contract = contract_tests("depth", "my-depth")
 
-docs/contract.md lists the checks. :class:`ContractSetup` declares how to test a provider.
+The page docs/contract.md lists the contract checks. :class:`ContractSetup` declares how to test a
+provider.
 """
 
 from __future__ import annotations

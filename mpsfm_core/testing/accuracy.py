@@ -18,22 +18,25 @@ from mpsfm_core.testing.map_errors import MapShift
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 DEPTH_TOLERANCE = 0.05
-"""Largest relative depth error of 80 % of the pixels. Correct providers on painted views have an
-error of 0.005. A wrong unit or the ray length instead of z has a far larger one."""
+"""Tolerance for the 80 % quantile of the relative depth error. Correct providers have a relative
+depth error of 0.005 on synthetic views. A wrong unit, or ray length instead of z-depth, causes a
+far larger depth error."""
 NORMALS_TOLERANCE_DEG = 5.0
-"""Largest angle in degrees between predicted and true normals for 80 % of the pixels. Correct
-providers on painted views have 0.7 degrees, planes fitted to true depth 1 degree."""
+"""Tolerance in degrees for the 80 % quantile of the angle between predicted and true normals. On
+synthetic views the normals of correct providers are off by 0.7 degrees, and planes fitted to true
+depth by 1 degree."""
 MASK_TOLERANCE = 0.05
-"""Largest ratio of wrong mask pixels, among pixels at least two away from the border of a
-surface."""
+"""Largest accepted ratio of wrong mask pixels, among pixels at least two pixels away from the
+border of a surface."""
 MATCH_TOLERANCE_STD = 3.0
-"""Largest median distance of a match from its true position in multiples of ``std_px``, and at
-least 3 pixels."""
+"""Largest accepted median distance of matches from their true positions, in multiples of the
+keypoint std ``std_px`` or of one pixel, whichever is larger."""
 SHIFT_TOLERANCE_PX = 0.25
-"""Largest shift of a map in pixels of the view, or of the map if its pixels are larger. Integer
-pixel centers shift a map by 0.5; correct resizing to half and a quarter stays below 0.1."""
+"""Largest accepted shift of a depth or normal map, in pixels of the view, or of the map if its
+pixels are larger. Integer pixel centers shift a map by 0.5 pixels; correct resizing to half and a
+quarter of the size shifts a map by less than 0.1."""
 MIN_MATCHES = 8
-"""Smallest number of matches for an accuracy statistic."""
+"""Smallest number of matches whose accuracy is compared with the ground truth."""
 
 
 def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str:
@@ -45,10 +48,10 @@ def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str
         answer: Validated answer.
 
     Returns:
-        Remark with the error, or that the ground truth is unknown.
+        Text with the measured error, or with the remark that the ground truth is unknown.
 
     Raises:
-        CheckFailed: The error exceeds the tolerance of the provider's kind.
+        CheckFailed: the error exceeds the tolerance of the provider's kind.
     """
     unknown = case.truth_source == "none" or case.kind in ("features", "retrieval")
     if unknown or (case.kind == "matcher" and case.truth_source == "painted"):
@@ -82,8 +85,8 @@ def require_small_shift(
     """Require that the content of a map is not shifted relative to the view.
 
     For providers with ``truth_source="image"`` only the shift at the center of the map is checked.
-    Estimates from pixel neighborhoods are biased on curved surfaces, which looks like a stretch of
-    the map.
+    Normals estimated from pixel neighborhoods are biased on curved surfaces, which has the same
+    effect as a stretched map.
 
     Args:
         case: Provider under test.
@@ -92,11 +95,11 @@ def require_small_shift(
         shape: Height and width of the depth or normal map.
 
     Returns:
-        Remark with the measured shift in pixels.
+        Text with the measured shift of the map in pixels.
 
     Raises:
-        CheckFailed: The shift exceeds :data:`SHIFT_TOLERANCE_PX`.
-        CheckSkipped: The map is too coarse to measure a shift.
+        CheckFailed: the shift exceeds :data:`SHIFT_TOLERANCE_PX`.
+        CheckSkipped: the map is too coarse to measure a shift.
     """
     width, height = example.camera.size
     map_pixel_px = max(1.0, width / shape[1], height / shape[0])
@@ -130,7 +133,7 @@ def match_points(case: ContractCase, a: Example, b: Example, answer: PairMatches
 def match_errors_px(a: Example, b: Example, matches: DenseMatches) -> Float64:
     """Return the distance (n,) in pixels of each match from its true position in view b.
 
-    The distance is infinite if view b does not show the point.
+    The error of a match is infinite if view b does not show the matched surface point.
     """
     true = a.correspondences(b, matches.points_a)
     distance = np.linalg.norm(matches.points_b - true.xy_b, axis=1)

@@ -48,7 +48,7 @@ def mask_files(folder: Path) -> ContractSetup:
 
 
 def from_depth(folder: Path) -> ContractSetup:
-    """Return a ContractSetup for normals from depth, which are correct if the given depth is."""
+    """Return a ContractSetup for normals from depth, which are correct if the depth is correct."""
     return ContractSetup(truth_source="image")
 
 

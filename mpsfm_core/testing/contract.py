@@ -1,4 +1,4 @@
-"""Contract of a provider: selects the checks of its kind and runs them one by one."""
+"""Contract of a provider, which selects the checks of its kind and runs them one by one."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ from mpsfm_core.testing.contract_case import ContractCase, ContractSetup, load_s
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 Check = Callable[[ContractCase], str | None]
-"""Contract check: a function that returns nothing or a remark. A check raises ``CheckFailed`` or
-``CheckSkipped``."""
+"""Type of a contract check, a function that returns nothing or a remark if the provider passes.
+Otherwise the function raises ``CheckFailed`` or ``CheckSkipped``."""
 
 Status = Literal["pass", "fail", "skip", "xfail"]
 SetupSource = ContractSetup | Callable[[Path], ContractSetup] | None
@@ -51,10 +51,10 @@ CHECKS_BY_KIND: Mapping[Kind, tuple[Check, ...]] = MappingProxyType(
         "wrapper": checks_wrapper.CHECKS,
     }
 )
-"""Contract checks of each provider kind, in addition to the common ones."""
+"""Contract checks of each provider kind, in addition to the checks for every kind."""
 
 REQUIRED: tuple[Check, ...] = (check_specification, check_construction, check_output_rules)
-"""Checks that all later checks rely on; if one of these checks fails, later checks are skipped."""
+"""Contract checks without which all later checks are meaningless and therefore skipped."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,8 @@ class CheckResult:
     id: str
     """Id of the check, such as ``depth-is-z``."""
     status: Status
-    """Outcome of the check; ``xfail`` is a failure that the ContractSetup declares as expected."""
+    """Outcome of the check, where ``xfail`` is a failure that the ContractSetup declares as
+    expected."""
     message: str
     """Reason of a failure or skip, or the remark of a check that passed."""
     seconds: float
@@ -113,7 +114,7 @@ class Contract:
             device: ``"cpu"`` or ``"cuda"``.
 
         Raises:
-            ProviderError: The provider does not exist or is unavailable.
+            ProviderError: the provider does not exist or is unavailable.
         """
         self.spec = registry.spec(kind, name)
         self._registry = registry
@@ -133,14 +134,14 @@ class Contract:
         return schedule_checks(self.spec)
 
     def run(self, task: CheckTask) -> CheckResult:
-        """Run one check; exceptions of the provider become failures."""
+        """Run one contract check; an exception of the provider counts as failure."""
         started = time.perf_counter()
         reason = ""
         try:
             case = self._case(task.around)
             reason = case.setup.expected_failures.get(task.id, "")
             status, message = self._outcome(case, task)
-        except ProviderError as error:  # The ContractSetup cannot be created.
+        except ProviderError as error:  # The plugin's function failed to create the ContractSetup.
             status, message = "fail", str(error)
         if reason and status == "fail":
             status, message = "xfail", f"{reason} ({message})"
@@ -161,7 +162,7 @@ class Contract:
             return "skip", str(skipped)
         except (CheckFailed, MpsfmError) as failed:
             return "fail", str(failed)
-        # The exception was raised by a provider that the check calls directly.
+        # A provider that the check calls directly raised the exception.
         except Exception as error:
             return "fail", f"{type(error).__name__}: {error}"
 
@@ -221,7 +222,7 @@ def run_checks(
         Check results in the order of the checks.
 
     Raises:
-        ProviderError: The provider does not exist or is unavailable.
+        ProviderError: the provider does not exist or is unavailable.
     """
     results = []
     with tempfile.TemporaryDirectory(prefix="mpsfm-contract-") as folder:
@@ -246,9 +247,9 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
         Kind and name of each provider that the name denotes.
 
     Raises:
-        InputError: The name denotes no provider, plugin or distribution.
-        ProviderError: The plugin failed to load or has no providers, or a provider of the
-            distribution is unavailable.
+        InputError: the name denotes no provider, plugin or distribution.
+        ProviderError: the plugin failed to load or has no providers, or one of its providers is
+            unavailable.
     """
     lines = [line for line in registry.status() if line.kind != "plugin"]
     matching = [
@@ -265,7 +266,7 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
         candidates = {n for line in registry.status() for n in (line.name, line.distribution)}
         raise InputError(f"no provider or plugin {name!r}{did_you_mean(name, candidates)}")
     for line in lines:
-        # A look-up by kind and name would find the provider of another distribution.
+        # A look-up by kind and name alone would return the provider of another distribution.
         if line.distribution == name and not line.available:
             hint = f"; {line.install_hint}" if line.install_hint else ""
             raise ProviderError(f"{line.kind} provider {line.name!r} of {name} {line.reason}{hint}")
@@ -273,14 +274,14 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
 
 
 def find_plugin(registry: Registry, name: str) -> ProviderStatus | None:
-    """Find a plugin without usable providers: one that only has hooks or failed to load.
+    """Find a plugin without usable providers, which has only hooks or failed to load.
 
     Args:
         registry: Registry to search.
-        name: Name of the entry point or of the distribution.
+        name: Name of the plugin's entry point or distribution.
 
     Returns:
-        Status of the plugin, or None.
+        Status of the plugin without usable providers, or None.
     """
     plugins = (line for line in registry.status() if line.kind == "plugin")
     return next((line for line in plugins if name in (line.name, line.distribution)), None)
@@ -293,11 +294,11 @@ def parse_setup(assignments: Sequence[str]) -> ContractSetup | None:
         assignments: Texts ``key=value`` or ``group.key=value`` with YAML values.
 
     Returns:
-        ContractSetup with these options, or None without assignments, which selects the plugin's
-        own ContractSetup.
+        ContractSetup with these options; None without assignments, so that the ContractSetup of the
+        plugin is used.
 
     Raises:
-        InputError: A text is not an assignment ``key=value``.
+        InputError: a text is not an assignment ``key=value``.
     """
     options: dict[str, Any] = {}
     for text in assignments:
@@ -325,7 +326,7 @@ def schedule_checks(spec: ProviderSpec) -> list[CheckTask]:
 
 
 def list_checks() -> list[Check]:
-    """Return the contract checks of all provider kinds, the common ones first."""
+    """Return the contract checks of all provider kinds, first those for every kind."""
     special = dict.fromkeys(check for checks in CHECKS_BY_KIND.values() for check in checks)
     return [*STANDALONE, check_output_rules, *COMMON, *special]
 
@@ -336,10 +337,10 @@ def find_check(id: str) -> Check:
 
 
 def parse_check_ids(ids: Collection[str]) -> set[str]:
-    """Return check ids as a set after verifying that each id exists.
+    """Return check ids as a set after verifying that each one is the id of a contract check.
 
     Raises:
-        InputError: An id is not the id of a contract check.
+        InputError: an id is not the id of a contract check.
     """
     known = [check_id(check) for check in list_checks()]
     for name in ids:
@@ -349,7 +350,7 @@ def parse_check_ids(ids: Collection[str]) -> set[str]:
 
 
 def check_id(check: Check) -> str:
-    """Return the id of a contract check: ``check_depth_is_z`` has the id ``depth-is-z``."""
+    """Return the id of a contract check, such as ``depth-is-z`` for ``check_depth_is_z``."""
     return check.__name__.removeprefix("check_").replace("_", "-")
 
 

@@ -1,4 +1,4 @@
-"""Provider under test: its ContractSetup, instances, and validated calls on synthetic views."""
+"""Provider under test with its ContractSetup, and validated calls of it on synthetic views."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ from mpsfm_core.testing.ground_truth_provider import GROUND_TRUTH_SPECS, GroundT
 from mpsfm_core.testing.outcome import CheckSkipped
 
 TruthSource = Literal["painted", "prepared", "image", "none"]
-"""Source from which a provider can derive the ground truth, see :class:`ContractSetup`."""
+"""Source from which a provider under test can derive the ground truth, see
+:class:`ContractSetup`."""
 
 _RUN: Mapping[Kind, Callable[..., Any]] = MappingProxyType(
     {
@@ -43,32 +44,32 @@ AUXILIARY_RELATIVE_STD = 0.02
 class ContractSetup:
     """Declaration of how to test a provider: its options and the source of the ground truth.
 
-    A plugin returns a ContractSetup from the function that ``ProviderSpec.contract`` names: ``def
-    contract(folder: Path) -> ContractSetup``. ``folder`` is an empty temporary folder for test
+    A plugin returns a ContractSetup from the function ``contract(folder: Path)`` that
+    ``ProviderSpec.contract`` names. The argument ``folder`` is an empty temporary folder for test
     weights.
 
-    The values of ``truth_source`` are:
+    The attribute ``truth_source`` has one of four values.
 
-    * ``"painted"``: A tiny test network decodes depth and normals from the colors of the views, see
-      :mod:`mpsfm_core.testing.painted_views`.
-    * ``"prepared"``: The function ``prepare`` writes the ground truth to files, for providers that
-      read files.
-    * ``"image"``: The correct output follows from a textured view, with or without real weights.
-    * ``"none"``: The ground truth is unknown, and checks that need it are skipped.
+    * If ``"painted"``, a tiny test network decodes depth and normals from the colors of the views,
+      see :mod:`mpsfm_core.testing.painted_views`.
+    * If ``"prepared"``, the function ``prepare`` writes the ground truth to files, for providers
+      that read files.
+    * If ``"image"``, the correct output follows from a textured view, with or without real weights.
+    * If ``"none"``, the ground truth is unknown, and checks that need it are skipped.
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
-    """Options of the provider under test. The options usually name weights of a tiny test network
-    that the contract function wrote to ``folder``."""
+    """Options of the provider under test. The options usually name the file with weights of a tiny
+    test network."""
     truth_source: TruthSource | None = None
-    """Source of the ground truth; None means ``"image"`` for features, matchers and retrieval, and
-    ``"none"`` for other kinds."""
+    """Source of the ground truth, by default ``"image"`` for features, matchers and retrieval, and
+    ``"none"`` for other provider kinds."""
     prepare: Callable[[Example], None] | None = None
     """Function that is called with each synthetic view before the provider runs on the view, for
     instance to write a file."""
     expected_failures: Mapping[str, str] = field(default_factory=dict)
-    """Reason of each known failure, by check id. A check that is listed as a known failure fails if
-    the provider passes the check."""
+    """Reason of each expected failure by check id. If the provider passes such a check
+    nevertheless, the check is reported as failed."""
 
     def __post_init__(self) -> None:
         if self.truth_source == "prepared" and self.prepare is None:
@@ -81,9 +82,10 @@ class ContractSetup:
 class ContractCase:
     """Provider under test, the argument of every contract check.
 
-    ``kind`` is the kind of the provider's output. A wrapper is tested once for each kind that it
-    wraps, around a provider that returns the ground truth. The provider and the synthetic views are
-    created on first use and reused by later checks.
+    The attribute ``kind`` is the provider kind of the output, which a wrapper shares with the
+    provider that it wraps. A wrapper is tested once for each kind that it wraps, around a provider
+    that returns the ground truth. The provider and the synthetic views are created on first use and
+    reused by later checks.
     """
 
     def __init__(
@@ -103,8 +105,8 @@ class ContractCase:
             spec: Specification of the provider.
             setup: ContractSetup of the provider.
             folder: Folder for the files of helper providers, such as a detector for a matcher.
-            behaves_as: Provider kind that a wrapper wraps; None for a provider that is not a
-                wrapper.
+            behaves_as: Kind of the provider inside a wrapper, or None if the provider under test is
+                not a wrapper.
             device: ``"cpu"`` or ``"cuda"``.
         """
         self.registry = registry
@@ -136,7 +138,7 @@ class ContractCase:
         """Skip the check unless the ground truth comes from one of the given sources.
 
         Raises:
-            CheckSkipped: The provider has another source of the ground truth, or none.
+            CheckSkipped: the provider derives the ground truth from another source or not at all.
         """
         if self.truth_source == "none":
             raise CheckSkipped(
@@ -173,7 +175,7 @@ class ContractCase:
 
     @property
     def provider(self) -> Any:
-        """Instance of the provider that the checks share."""
+        """Instance of the provider under test that all checks share."""
         if self._provider is None:
             self._provider = self.create_provider()
         return self._provider
@@ -184,7 +186,7 @@ class ContractCase:
         Args:
             example: The example. Matchers and multi-view providers also receive the view
                 ``example.partner``.
-            provider: Provider instance to use instead of the shared one.
+            provider: Provider instance to use instead of the one that all checks share.
         """
         uses_pair = self.kind in ("matcher", "multiview")
         self.prepare(example, *([example.partner] if uses_pair else []))
@@ -198,7 +200,7 @@ class ContractCase:
         Args:
             view: Modified view that replaces ``example.view``.
             example: Synthetic view that supplies all other inputs.
-            provider: Provider instance to use instead of the shared one.
+            provider: Provider instance to use instead of the one that all checks share.
             auxiliary: Depth or features for the provider, by default from
                 :meth:`make_auxiliary_input`.
         """
@@ -250,13 +252,13 @@ class ContractCase:
                 self.setup.prepare(example)
 
     def extract_features(self, *views: View) -> Any:
-        """Return features for a sparse matcher from a detector of its family, else None."""
+        """Detect features for a sparse matcher; return None for other providers."""
         if not self.declares("sparse"):
             return None
         return tuple(self._detect(view) for view in views)
 
     def received_depth(self) -> list[DepthPrior | None]:
-        """Return the depth that a wrapper passed to its normals provider, one entry per call."""
+        """Return the depth priors that a wrapper passed to its normals provider, one per call."""
         return [] if self._ground_truth is None else self._ground_truth.received_depth
 
     def calibration(self) -> Any:
@@ -274,10 +276,10 @@ class ContractCase:
 
     @property
     def _validated_spec(self) -> ProviderSpec:
-        """Specification from which the validator reads the capabilities.
+        """Specification of the provider, from which the validator reads the capabilities.
 
-        The specification omits the capabilities of the wrapped provider, because separate checks
-        test what a wrapper keeps.
+        For a wrapper, the specification omits the capabilities of the wrapped provider, because
+        separate checks test what a wrapper keeps.
         """
         if self._ground_truth is None:
             return self.spec
@@ -293,7 +295,7 @@ class ContractCase:
         return self._features[view]
 
     def _choose_detector(self) -> ProviderSpec:
-        """Prefer a detector of the matcher's family and plugin; without a family use SIFT."""
+        """Choose a detector of the matcher's family and plugin, or SIFT without a family."""
         family = set(self.spec.tags)
         plugin = self.registry.version(self.spec.kind, self.spec.name)
 
@@ -321,7 +323,7 @@ class ContractCase:
 
 
 def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:
-    """Return the ContractSetup that a plugin declares for its provider, or a default one.
+    """Return the ContractSetup that a plugin declares for its provider, or the default one.
 
     Args:
         spec: Specification of the provider.
@@ -331,7 +333,7 @@ def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:
         The setup.
 
     Raises:
-        ProviderError: The contract function raises an exception or returns another type.
+        ProviderError: the contract function raises an exception or returns another type.
     """
     if spec.contract is None:
         return ContractSetup()
@@ -345,7 +347,7 @@ def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:
         text = f"{spec.kind} provider {spec.name!r}: its contract {spec.contract!r} fails"
         raise ProviderError(f"{text}: {type(error).__name__}: {error}") from error
     if isinstance(setup, Mapping):
-        # A provider of another environment sends the fields of its ContractSetup as a mapping.
+        # A provider in another Python environment sends its ContractSetup as a mapping.
         names = {part.name for part in fields(ContractSetup)}
         setup = ContractSetup(**setup) if names.issuperset(setup) else setup
     if not isinstance(setup, ContractSetup):
@@ -356,7 +358,7 @@ def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:
 
 
 def first_depth(answer: Any) -> DepthPrior:
-    """Return the depth prior in a provider's output; the one of the first view for a group."""
+    """Return the depth prior in a provider's output, for a group of views the first prior."""
     prior: DepthPrior = answer.depth[0] if isinstance(answer, MultiViewPrior) else answer
     return prior
 

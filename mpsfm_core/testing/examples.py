@@ -24,14 +24,14 @@ from mpsfm_core.testing.synthetic.scenes import (
 )
 
 Appearance = Literal["painted", "textured"]
-"""Colors of a synthetic view. ``painted``: colors encode depth and normals, see
-:mod:`mpsfm_core.testing.painted_views`. ``textured``: a random texture with corners to detect and
-match."""
+"""Colors of a synthetic view, which either encode depth and normals (``painted``, see
+:mod:`mpsfm_core.testing.painted_views`) or show a random texture with corners to match
+(``textured``)."""
 
 _SKY = ((120, 170, 235), (200, 220, 245))
 """RGB of the sky at the upper and lower border of a textured synthetic view."""
 _COS_MAX_CREASE = np.cos(np.deg2rad(20.0))
-"""Smallest cosine of the angle between neighboring normals without an edge: 20 degrees."""
+"""Cosine of 20 degrees, above which an angle between neighboring normals counts as an edge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,12 +43,13 @@ class TrueMaps:
     normals: Float64
     """Unit normals (h, w, 3) in the camera frame, 0 where there is no surface."""
     valid: Bool
-    """Mask (h, w), True where there is a surface."""
+    """Validity mask (h, w), True where the pixel shows a surface."""
     smooth: Bool
-    """Mask (h, w), True where the surface continues for two pixels in all directions and is not
-    seen at a grazing angle. Interpolation of a map causes no large error in smooth pixels."""
+    """Mask (h, w) of smooth pixels, True where the surface continues for two pixels in all
+    directions and is not seen at a grazing angle. Interpolating a depth or normal map causes no
+    large error at smooth pixels."""
     edge_free: Bool
-    """Mask (h, w), True where all pixels up to two away have the same value of ``valid``."""
+    """Mask (h, w), True where all pixels up to two away are valid, or all are invalid."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +64,7 @@ class Example:
     look: Appearance
     """Colors of the view, painted or textured."""
     mirrored: bool = False
-    """True swaps left and right in the image and in the ground truth."""
+    """True if left and right are swapped in the image and in the ground truth."""
 
     @cached_property
     def view(self) -> View:
@@ -81,11 +82,11 @@ class Example:
         """Compute the ground truth of the synthetic view on a grid.
 
         Args:
-            shape: Rows and columns of the grid; by default one sample per pixel.
+            shape: Numbers of rows and columns of the grid, by default those of the image.
             offset_px: Translation of the grid in pixels of the view (x, y).
 
         Returns:
-            Ground truth at the centers of the grid cells.
+            Ground-truth depth, normals and masks at the centers of the grid cells.
         """
         rows, columns = shape or (self.camera.height, self.camera.width)
         scale = self.camera.width / columns, self.camera.height / rows
@@ -122,8 +123,8 @@ class Example:
     def sized(self, width: int, height: int) -> Example:
         """Return the synthetic view with another image size.
 
-        The pose and the ratio of focal length to height stay the same, so the view may show more or
-        less of the scene.
+        The pose and the ratio of focal length to image height stay the same, so the resized view
+        may show more or less of the scene.
 
         Args:
             width: Width in pixels.
@@ -148,7 +149,8 @@ def outdoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Exa
     """Return a synthetic view of ground, a slanted wall and two balls below an open sky.
 
     The camera is pitched, turned and rolled, so that no camera axis is parallel to a world axis and
-    nothing is symmetric. The field of view is wide: at the corners the ray length is 1.3 times z.
+    the image has no symmetry. The field of view is so wide that the ray length is 1.3 times z at
+    the corners.
 
     Args:
         look: Colors of the view, painted or textured.
@@ -203,7 +205,7 @@ def _step_aside(pose: Float64) -> Float64:
 
 
 def _is_smooth(surface: Int64, normals: Float64) -> Bool:
-    """Return where all pixels up to two away have the same surface and similar normals."""
+    """Return the pixels (h, w) without an edge of surface or normals up to two pixels away."""
     same = np.ones(surface.shape, dtype=np.bool_)
     rows, columns = surface.shape
     for axis, size in ((0, rows), (1, columns)):

@@ -33,7 +33,7 @@ _NUM_IMAGES = 4
 
 @dataclass(frozen=True)
 class _WriteMarker:
-    """Test step that writes a file per item, named after the item and the process id."""
+    """Test step that writes one file per work item, named after the item and the process id."""
 
     folder: Path
 
@@ -43,7 +43,7 @@ class _WriteMarker:
 
 @dataclass(frozen=True)
 class _KillFirstWorker(_WriteMarker):
-    """Test step whose first worker is killed in the middle of an item."""
+    """Test step that kills the first worker process in the middle of a work item."""
 
     def __call__(self, item: int) -> None:
         if item == 3:
@@ -57,13 +57,13 @@ class _KillFirstWorker(_WriteMarker):
 
 
 def _fail_on_two(item: int) -> None:
-    """Test step that raises an exception for item 2."""
+    """Test step that raises an exception for the work item with index 2."""
     if item == 2:
         raise DataError("item", "is 2")
 
 
 def check_items(executor: Executor, folder: Path) -> None:
-    """Require that several worker processes together run every item exactly once.
+    """Require that several worker processes together run every work item exactly once.
 
     Args:
         executor: Executor under test.
@@ -78,7 +78,7 @@ def check_items(executor: Executor, folder: Path) -> None:
 
 
 def check_lost_worker(executor: Executor, folder: Path) -> None:
-    """Require that another worker runs the item of a killed worker.
+    """Require that another worker process runs the work item of a killed worker process.
 
     Args:
         executor: Executor under test.
@@ -91,7 +91,7 @@ def check_lost_worker(executor: Executor, folder: Path) -> None:
 
 
 def check_errors(executor: Executor) -> None:
-    """Require that the exception of a step arrives unchanged and the executor stays usable."""
+    """Require that the exception of a worker reaches the caller and the executor stays usable."""
     try:
         with closing(executor.run(_fail_on_two, range(4))) as run:
             for _ in run:
@@ -99,12 +99,12 @@ def check_errors(executor: Executor) -> None:
     except DataError as error:
         assert (error.field, error.rule) == ("item", "is 2")
     else:
-        raise AssertionError("the error did not arrive")
+        raise AssertionError("the exception of the step did not reach the caller")
     assert sum(1 for _ in executor.run(_fail_on_two, [0, 1])) == 2
 
 
 def check_extraction(name: str, options: dict[str, Any], folder: Path) -> None:
-    """Require bitwise the same result as with threads, and that Ctrl-C keeps finished steps.
+    """Require bitwise the same extraction as with threads, also if continued after Ctrl-C.
 
     Args:
         name: Value of ``runtime.executor``.
@@ -134,10 +134,10 @@ def check_extraction(name: str, options: dict[str, Any], folder: Path) -> None:
 
 
 def check_failing_provider(name: str, options: dict[str, Any], folder: Path) -> None:
-    """Require that a provider that raises or hangs is called once per image, by a worker.
+    """Require that a worker calls a provider that raises or hangs only once per image.
 
-    As with threads, the run either stops and names the provider, or continues without the image and
-    lists the image as failed.
+    As with the executor ``threads``, the run either stops and names the provider, or continues
+    without the image and lists the image as failed.
 
     Args:
         name: Value of ``runtime.executor``.
@@ -161,7 +161,7 @@ def check_failing_provider(name: str, options: dict[str, Any], folder: Path) -> 
         for mark in folder.glob("called-*"):
             mark.unlink()
         shutil.rmtree(folder / "cache" / "extraction" / "depth", ignore_errors=True)
-        (folder / "hang").touch()  # All slow steps are in the cache now.
+        (folder / "hang").touch()  # The results of all slow extraction steps are in the cache now.
         skipping = runtime.model_copy(update={"on_error": "skip", "timeout_s": _TIMEOUT_S})
         found = _extract(folder, skipping, depth="failing")
     reasons = found.report["failed"]
@@ -224,7 +224,7 @@ def _install_failing_plugin(folder: Path) -> Iterator[None]:
 
 
 class _ProgressEvents(NullExtractionEvents):
-    """Plugin that records and verifies the progress of each pipeline stage."""
+    """Plugin that records the progress reports of each pipeline stage and verifies their counts."""
 
     def __init__(self) -> None:
         self.done: dict[str, int] = {}
@@ -298,4 +298,4 @@ def check_options(executor: Any) -> None:
     except ConfigError as error:
         assert "runtime.executor_options.adress" in str(error) and "address" in str(error)
     else:
-        raise AssertionError("a wrong option was accepted")
+        raise AssertionError("the executor accepted an unknown option")

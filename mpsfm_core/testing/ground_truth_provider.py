@@ -28,9 +28,9 @@ class GroundTruthOptions(Options):
 class GroundTruth:
     """Ground truth of synthetic views and of all painted views.
 
-    Known synthetic views and their mirror images are recognized by their pixels. For any other
-    view, for instance a crop made by a wrapper, depth and normals are decoded from the painted
-    colors.
+    Known synthetic views and their mirror images are recognized by their pixels. Depth and normals
+    of any other view, for instance a crop made by a wrapper, are decoded from colors that encode
+    them.
     """
 
     def __init__(self) -> None:

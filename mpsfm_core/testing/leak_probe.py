@@ -15,7 +15,7 @@ class ProcessUsage(NamedTuple):
     """Resources that this process uses after garbage collection."""
 
     memory_mb: float
-    """Resident memory of the process in MB (1e6 bytes); on Linux without freed memory."""
+    """Resident memory of the process in MB (1e6 bytes), on Linux without memory already freed."""
     objects: int
     """Number of objects that Python's garbage collector tracks."""
     files: int

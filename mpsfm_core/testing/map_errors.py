@@ -1,4 +1,4 @@
-"""Errors of depth and normal maps: angle, ray length instead of z, pixel shift."""
+"""Errors of depth and normal maps, such as angles, ray length instead of z, and pixel shifts."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpsfm_core.testing.examples import Example, TrueMaps
 from mpsfm_core.testing.outcome import CheckFailed
 
 _MIN_PIXELS = 40
-"""Smallest number of valid pixels for an error statistic."""
+"""Smallest number of valid pixels for which the errors of a map are computed."""
 _OUTLIER_MADS = 5.0
 _HALF_STEP_PX = 0.5
 
@@ -29,19 +29,19 @@ class MapShift(NamedTuple):
     """Shift of a map's content relative to its true position, in pixels of the view."""
 
     x: float
-    """Shift to the right at the center of the map."""
+    """Shift of the map content to the right at the center of the map, in pixels."""
     y: float
-    """Downward shift at the center of the map."""
+    """Downward shift of the map content at the center of the map, in pixels."""
     stretch_x: float
-    """Additional outward shift at the left and right border of the map."""
+    """Additional outward shift of the map content at the left and right border, in pixels."""
     stretch_y: float
-    """Additional outward shift at the upper and lower border of the map."""
+    """Additional outward shift of the map content at the upper and lower border, in pixels."""
     std: float
-    """Standard deviation in pixels of the least certain of the four shift values."""
+    """Largest standard deviation of the four estimated shift values, in pixels."""
 
     @property
     def largest(self) -> float:
-        """Largest shift in x or y, reached at the border of the view."""
+        """Largest shift of the map content in x or y, reached at the border of the view."""
         return max(abs(self.x) + abs(self.stretch_x), abs(self.y) + abs(self.stretch_y))
 
 
@@ -49,14 +49,14 @@ def select_comparable(valid: Bool, truth: TrueMaps) -> Bool:
     """Select the pixels of a map that can be compared with the ground truth.
 
     Args:
-        valid: Validity (h, w) of a provider's map.
-        truth: Ground truth on the grid of the map.
+        valid: Validity mask (h, w) of a provider's map.
+        truth: Ground-truth maps (h, w) on the pixel grid of the provider's map.
 
     Returns:
         Mask (h, w) of the valid pixels away from edges.
 
     Raises:
-        CheckFailed: The map has too few valid pixels for a comparison.
+        CheckFailed: the map has too few valid pixels for a comparison.
     """
     both = valid & truth.smooth
     if both.sum() < min(_MIN_PIXELS, truth.smooth.sum() / 2):
@@ -72,7 +72,8 @@ def log_errors(prior: DepthPrior, example: Example, *, any_scale: bool) -> Float
     Args:
         prior: Predicted depth.
         example: Synthetic view that the depth belongs to.
-        any_scale: True subtracts the median, which removes a common factor.
+        any_scale: If true, subtract the median of the logarithms, which removes a common factor of
+        all depths.
     """
     truth = example.truth(prior.shape)
     where = select_comparable(prior.valid, truth)
@@ -90,7 +91,7 @@ def angle_errors_deg(normals: NormalPrior, example: Example) -> Float64:
 def estimate_ray_exponent(prior: DepthPrior, example: Example) -> float:
     """Estimate p in ``depth = z * (ray length / z) ** p`` by least squares.
 
-    The exponent p is 0 for z-depth and 1 for the distance along the ray.
+    The exponent p is 0 for z-depth and 1 for depth measured along the viewing ray.
     """
     truth = example.truth(prior.shape)
     where = select_comparable(prior.valid, truth)
@@ -130,18 +131,18 @@ def estimate_normals_shift(prior: NormalPrior, example: Example) -> MapShift:
 
 
 def _normalized_positions(shape: tuple[int, int]) -> Float64:
-    """Return the positions (h, w, 2) of pixels in x and y, scaled to [-1, 1]."""
+    """Return the x and y positions (h, w, 2) of all pixels, scaled to [-1, 1]."""
     return pixel_centers(shape[1], shape[0]) / (shape[1] / 2, shape[0] / 2) - 1
 
 
 def _solve_shift(error: Float64, slopes: list[Float64], positions: Float64) -> MapShift:
-    """Solve ``error = constant - dot(slope, shift + stretch * position)``.
+    """Fit shift and stretch to ``error = constant - dot(slope, shift + stretch * position)``.
 
     The least-squares fit has a second pass that excludes outliers.
 
     Args:
-        error: Errors (n, k) in the k channels of a map.
-        slopes: Change of the true map per pixel in x and in y, (n, k) each.
+        error: Errors (n, k) of a map at n pixels in k channels.
+        slopes: Derivatives of the true map per pixel in x and in y, (n, k) each.
         positions: Pixel positions (n, 2), scaled to [-1, 1].
     """
     columns = [

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 
 class CheckFailed(Exception):
-    """The provider violates the contract; the message describes the violation."""
+    """The provider under test violates the contract as the message describes."""
 
 
 class CheckSkipped(Exception):
-    """The check does not apply to this provider; the message gives the reason."""
+    """The contract check does not apply to a provider for the reason in the message."""

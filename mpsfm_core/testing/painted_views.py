@@ -1,19 +1,20 @@
 """Synthetic views whose colors encode their depth and normals.
 
 Most mistakes of a plugin are in the code around its network: swapped channels, a half-pixel shift,
-an ignored focal length, a std instead of a variance. Detecting such mistakes requires the ground
-truth. The contract kit therefore encodes the ground truth in the colors of the view. A tiny test
-network replaces the real one and only decodes colors, with an affine map of the three channels or a
-1 x 1 convolution. The contract tests use all other code of the plugin unchanged.
+an ignored focal length, a std instead of a variance. Detecting mistakes of a plugin requires ground
+truth. The contract tests therefore encode true depth and normals in the colors of the test images.
+A tiny test network replaces the real network and only decodes colors, with an affine map of the
+three channels or a 1 x 1 convolution. The contract tests use all code of the plugin except the real
+network.
 
-The colors from 0 to 255 encode:
+The color channels with values from 0 to 255 encode the ground truth.
 
-* Red is depth from 0 to :data:`MAX_DEPTH` meters; 0 means no surface.
-* Green and blue are the slopes ``p = n_x / -n_z`` and ``q = n_y / -n_z`` of the normal, from
-  ``-MAX_SLOPE`` to ``MAX_SLOPE``: the normal is ``(p, q, -1)``, normalized.
+* The red channel is depth from 0 to :data:`MAX_DEPTH` meters, where 0 means no surface.
+* The green and blue channels are the slopes ``p = n_x / -n_z`` and ``q = n_y / -n_z`` of the normal
+  ``(p, q, -1)``, from ``-MAX_SLOPE`` to ``MAX_SLOPE``.
 
-A test network with an uncertainty reports :data:`RELATIVE_STD` and :data:`NORMALS_STD` at every
-pixel.
+A test network that predicts uncertainty reports the std :data:`RELATIVE_STD` or :data:`NORMALS_STD`
+at every pixel.
 """
 
 from __future__ import annotations
@@ -26,10 +27,10 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Bool, Float64, UInt8
 
 MAX_DEPTH = 10.0
-"""Largest painted depth in meters; one of 255 color steps is 4 cm."""
+"""Largest depth in meters that a color encodes; one of 255 color steps is 4 cm."""
 MAX_SLOPE = 4.0
-"""Largest painted slope, of a surface seen at 76 degrees from its normal; one color step is at most
-1.8 degrees."""
+"""Largest slope that a color encodes, of a surface seen at 76 degrees from its normal; one color
+step is at most 1.8 degrees."""
 RELATIVE_STD = 0.05
 """Relative std of depth that test networks and prepared files report."""
 NORMALS_STD = 0.1
@@ -45,10 +46,10 @@ def paint(depth: NDArray[Any], normals: NDArray[Any], valid: Bool) -> UInt8:
         depth: z-depth (h, w) in meters, clipped at :data:`MAX_DEPTH`.
         normals: Unit normals (h, w, 3) that face the camera; slopes are clipped at
             :data:`MAX_SLOPE`.
-        valid: Mask (h, w), True where there is a surface.
+        valid: Validity mask (h, w), True where the pixel shows a surface.
 
     Returns:
-        Painted image RGB (h, w, 3).
+        RGB image (h, w, 3) whose colors encode the given depth and normals.
     """
     toward = np.where(valid, np.maximum(-normals[..., 2], 1e-6), 1.0)
     slopes = np.where(valid[..., None], normals[..., :2], 0.0) / toward[..., None]

@@ -58,7 +58,7 @@ class _Provider(pytest.Collector):
     """Pytest collector that is the parent of the contract checks of one provider."""
 
     def collect(self) -> list[pytest.Item | pytest.Collector]:
-        """Return nothing, because the items are created together with this collector."""
+        """Return no pytest items, because these are created together with this collector."""
         return []
 
 

@@ -35,7 +35,7 @@ def contract_tests(
         Parametrized function for a test module.
 
     Raises:
-        ProviderError: The provider does not exist or is unavailable.
+        ProviderError: the provider does not exist or is unavailable.
     """
     import pytest
 
@@ -55,7 +55,7 @@ def contract_tests(
 
 
 def report(result: CheckResult) -> None:
-    """End a pytest test with the status of a contract check."""
+    """End the current pytest test with the status of a contract check."""
     import pytest
 
     __tracebackhide__ = True

@@ -29,7 +29,7 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> list[Path]:
         Paths of the written files.
 
     Raises:
-        InputError: The name is invalid or in use, or the package folder exists.
+        InputError: the plugin name is invalid or in use, or the package folder exists.
     """
     module = name.replace("-", "_")
     if not _NAME.fullmatch(name) or keyword.iskeyword(module):

@@ -199,7 +199,7 @@ class TestOverrides:
 
     @pytest.mark.parametrize("text", ["runtime.seed", "=3", "runtime..seed=3"])
     def test_override_without_assignment_is_an_error(self, load: Load, text: str) -> None:
-        assert f"--set {text}: must look like a.b=value" in error_of(
+        assert f"--set {text}: a setting must look like a.b=value" in error_of(
             load, "extends: fast-cpu\n", text
         )
 

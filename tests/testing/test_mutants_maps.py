@@ -195,11 +195,11 @@ class FocalRatio(PaintedDepth):
         (NothingIsSure, "depth-validity", "50% of the pixels with a surface are not valid", ()),
         (Tilted, "depth-flip", "of the mirrored view differs by .*%", ()),
         (OldIntrinsics, "depth-same-in-larger-view", "grows 2 times", ("intrinsics-aware",)),
-        (UpsideDownFocal, "depth-intrinsics", "changes by 0.67", ("intrinsics-aware",)),
+        (UpsideDownFocal, "depth-intrinsics", "changes 0.67 times", ("intrinsics-aware",)),
         (StdForVariance, "depth-variance", "equals the std", ()),
         (RelativeVariance, "depth-variance", "times the std that the test network reports", ()),
         (HugeVariance, "depth-calibration", "after calibration, variance: must be finite", ()),
-        (TinyVariance, "depth-calibration", "changes nothing after calibration", ()),
+        (TinyVariance, "depth-calibration", "does not change the calibrated variance", ()),
         (TwoOpinions, "depth-joint", "return different depth", ("joint-normals",)),
         (
             JointNormalsTurned,
@@ -313,7 +313,7 @@ class EndlessVariance(PaintedNormals):
         (Degrees, "output-rules", r"must be in rad\^2"),
         (Leaning, "normals-flip", "of the mirrored view"),
         (Stretched, "normals-same-in-larger-view", "off in an enlarged view"),
-        (EndlessVariance, "normals-calibration", "changes nothing after calibration"),
+        (EndlessVariance, "normals-calibration", "does not change the calibrated variance"),
     ],
 )
 def test_normals(caught: Callable[..., None], factory: type, check: str, message: str) -> None:

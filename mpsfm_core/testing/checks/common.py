@@ -1,12 +1,14 @@
 """Contract checks that apply to every kind of provider.
 
-A contract check is a function of a :class:`~mpsfm_core.testing.contract_case.ContractCase`. A check
-returns nothing or a remark, and raises ``CheckFailed`` or ``CheckSkipped`` with the reason. The id
-of a check is the function name without ``check_`` and with dashes. The first line of a check's
-docstring states the rule, the rest gives the reason or the limits of the check.
+A contract check is a function whose only argument, the
+:class:`~mpsfm_core.testing.contract_case.ContractCase`, contains the provider under test. A
+contract check returns nothing or a remark if the provider passes, and otherwise raises
+``CheckFailed`` or ``CheckSkipped`` with the reason. The id of a contract check is the function name
+without ``check_`` and with dashes. The first line of its docstring states what the check requires
+of the provider; the rest gives the reason or the limits of the check.
 
-Most checks use one view of 192 x 144 pixels, so that a small network needs only a fraction of a
-second. Outputs are compared bit for bit, because the cache of a run has no tolerance either.
+Most contract checks use one view of 192 x 144 pixels, so that a small network needs only a fraction
+of a second. Outputs of a provider are compared bit for bit, because a run reuses cached outputs.
 """
 
 from __future__ import annotations
@@ -41,15 +43,17 @@ HEAVY_MODULES = (
     *("torch", "torchvision", "onnxruntime", "tensorflow", "jax", "kornia", "transformers"),
     *("cv2", "scipy", "pycolmap", "pandas", "sklearn", "skimage", "matplotlib", "numba"),
 )
-"""Libraries that a plugin module must not import, because each costs seconds at every start."""
+"""Libraries that a plugin module must not import, because each import takes seconds at every
+start."""
 MAX_IMPORT_S = 2.0
-"""Time limit in seconds to import a plugin module and list its providers. Modules without heavy
-imports take milliseconds; the limit allows for a busy machine."""
+"""Time limit in seconds to import a plugin module and list its providers. A plugin module without
+slow imports takes milliseconds; the time limit allows for a busy machine."""
 
 _NUM_MEMORY_CALLS = 4
 _MAX_RETAINED_BYTES = 20_000
-"""Bytes of Python and numpy memory that a call of a provider may retain. A view has at least 83 kB,
-so a retained view is detected; caches of the interpreter grow by less than 4 kB."""
+"""Bytes of Python and numpy memory that a call of a provider may retain. The pixels of a view have
+at least 83 kB, so a retained view is detected; caches of the Python interpreter grow by less than 4
+kB."""
 
 
 def check_specification(case: ContractCase) -> str:
@@ -80,13 +84,13 @@ def check_light_import(case: ContractCase) -> str:
     """
     modules = _find_plugin_modules(case)
     if not modules:
-        raise CheckSkipped("registered in this process, not by an entry point")
+        raise CheckSkipped("the provider was registered in this process, not by an entry point")
     command = [sys.executable, "-c", _IMPORT_SCRIPT, json.dumps([sys.path, modules, HEAVY_MODULES])]
     process = subprocess.run(command, capture_output=True, text=True)
     if process.returncode:
         last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
         raise CheckFailed(f"importing the plugin module fails: {last_line}")
-    # The last line is the result; native code of a plugin may print other lines.
+    # The last output line is the result; native code of a plugin may print other lines before.
     seconds, heavy = json.loads(process.stdout.splitlines()[-1])
     if heavy:
         raise CheckFailed(f"importing {modules[0]!r} imports {' '.join(heavy)}")
@@ -132,7 +136,7 @@ def check_deterministic(case: ContractCase) -> None:
 def check_no_state(case: ContractCase) -> None:
     """Require that the output does not depend on the views of earlier calls.
 
-    A run calls providers for the images in any order.
+    A run calls a provider for the images in any order.
     """
     others = [case.example.sized(104, 120), case.example.partner]
     alone = case.run(case.example, case.create_provider())
@@ -163,8 +167,8 @@ def check_inputs_unchanged(case: ContractCase) -> None:
 def check_name_does_not_matter(case: ContractCase) -> None:
     """Require that the output does not depend on the name of the view.
 
-    The cache uses the pixels of an image as key, not its name. Providers that read files declare
-    the capability ``uncached``.
+    The cache of a run identifies an image by its pixels, not by its name. Providers that read files
+    declare the capability ``uncached``.
     """
     if case.declares("uncached"):
         raise CheckSkipped("declares 'uncached'")
@@ -178,7 +182,8 @@ def check_name_does_not_matter(case: ContractCase) -> None:
 def check_intrinsics_declared(case: ContractCase) -> None:
     """Require ``intrinsics-aware`` if the output depends on the focal length.
 
-    Without this capability the cache would return the output for another camera.
+    Without the capability ``intrinsics-aware``, the cache of a run would return the output for a
+    camera with another focal length.
     """
     if case.declares("intrinsics-aware"):
         raise CheckSkipped("declares 'intrinsics-aware'")
@@ -201,7 +206,7 @@ def check_intrinsics_declared(case: ContractCase) -> None:
 def check_threads(case: ContractCase) -> None:
     """Require that two instances in two threads give the same output as each instance alone.
 
-    A run uses one instance of a provider per thread.
+    A run creates one instance of a provider per thread.
     """
     examples = [case.example, case.example.sized(*case.example.camera.size).partner]
     alone = [case.run(example) for example in examples]
@@ -250,7 +255,7 @@ def check_pickles(case: ContractCase) -> None:
 def check_offline(case: ContractCase) -> None:
     """Require that construction and calls open no socket once the weights are local.
 
-    The check detects Python sockets, not those of native libraries.
+    The check detects sockets opened by Python code, not those of native libraries.
     """
     case.provider  # noqa: B018 - the attribute access downloads the weights if necessary
     with _forbid_sockets() as attempts:
@@ -267,7 +272,7 @@ def check_offline(case: ContractCase) -> None:
 def check_memory_released(case: ContractCase) -> str:
     """Require that allocated memory does not grow with the number of views.
 
-    The check measures memory of Python and numpy, not of native libraries.
+    The check measures memory allocated by Python and numpy, not by native libraries.
     """
     num_views = _NUM_MEMORY_CALLS + 2
     examples = [_rename_example(case.example, f"memory/{i}.png") for i in range(num_views)]
@@ -311,7 +316,7 @@ def check_speed(case: ContractCase) -> str:
 def check_odd_size(case: ContractCase) -> str:
     """Require the usual accuracy for a view of 149 x 107 pixels.
 
-    Both 149 and 107 are prime, so that no network stride divides the image size.
+    Both sizes are prime numbers, so that the stride of no network divides the image size.
     """
     return _run_and_compare(case, case.example.sized(149, 107))
 
@@ -333,7 +338,7 @@ def check_thin_view(case: ContractCase) -> None:
 
 
 def check_grayscale(case: ContractCase) -> None:
-    """Require valid output for a grayscale image, given as three equal channels."""
+    """Require valid output for a grayscale image that is passed as three equal channels."""
     gray = np.asarray(case.example.view.image).mean(axis=-1, keepdims=True)
     shape = case.example.view.image.shape
     _run_on_image(case, np.broadcast_to(gray.astype(np.uint8), shape))
@@ -342,7 +347,7 @@ def check_grayscale(case: ContractCase) -> None:
 def check_sixteen_bit(case: ContractCase) -> None:
     """Require valid output for a 16-bit grayscale image.
 
-    The core converts the image to 8 bit and three channels before the call.
+    The core converts the image to 8 bit and three channels before it calls the provider.
     """
     import cv2  # The import is local, because pytest loads this module when it collects tests.
 
@@ -429,7 +434,7 @@ def _rename_example(example: Example, name: str) -> Example:
 
 
 def _find_plugin_modules(case: ContractCase) -> list[str]:
-    """Return the entry-point modules of the distribution that contains the provider."""
+    """Return the entry-point modules of the installed distribution that contains the provider."""
     distribution = case.registry.version(case.spec.kind, case.spec.name).partition(" ")[0]
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
     return [e.module for e in entries if e.dist is not None and e.dist.name == distribution]

@@ -26,16 +26,17 @@ from mpsfm_core.testing.painted_views import RELATIVE_STD, read_depth
 
 RAY_TOLERANCE = 0.25
 """Largest exponent p in ``depth = z * (ray length / z) ** p``: 0 for z-depth, 1 for ray length.
-Correct providers on painted views have an exponent of 0.002."""
+The depth of correct providers has an exponent of 0.002 on synthetic views."""
 FLIP_TOLERANCE = 0.3
-"""Largest relative depth difference of mirrored or enlarged views if the ground truth is unknown.
-Trained networks are not exactly symmetric; rotated or cropped maps have larger differences."""
+"""Largest accepted relative depth difference between a view and the mirrored or enlarged view if
+the ground truth is unknown. Trained networks are not exactly symmetric, but wrongly rotated or
+cropped depth maps cause larger differences."""
 FOCAL_FACTOR = 1.5
 """Focal length of the second camera relative to the first in ``check_depth_intrinsics``."""
 _FOCAL_RANGE = (1.2, 1.9)
-"""Range of depth ratios that is accepted for a focal length ratio of 1.5. A network with a
-canonical camera model has a depth ratio of 1.5. A ratio of 1 means that the network ignores the
-focal length, 0.67 that the effect is inverted."""
+"""Accepted range of the depth ratio between two cameras whose focal lengths have the ratio 1.5. A
+network with a canonical camera model has a depth ratio of 1.5. A depth ratio of 1 means that the
+network ignores the focal length, and 0.67 that depth shrinks instead of growing."""
 
 _ORIENTATIONS: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
     {
@@ -50,7 +51,7 @@ _ORIENTATIONS: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
 def check_depth_is_z(case: ContractCase) -> str:
     """Require z-depth along the optical axis, not the length of the viewing ray.
 
-    The test view has a wide angle: in its corners the ray length is 1.3 times z.
+    The synthetic view has a wide angle, so that the ray length is 1.3 times z in its corners.
     """
     case.require_truth("painted", "prepared", "image")
     power = map_errors.estimate_ray_exponent(_run(case), case.example)
@@ -61,7 +62,7 @@ def check_depth_is_z(case: ContractCase) -> str:
 
 
 def check_depth_scale(case: ContractCase) -> str:
-    """Require metric depth in meters, and other depth that is proportional to z."""
+    """Require metric depth in meters, and depth that is not metric up to one factor per map."""
     case.require_truth("painted", "prepared", "image")
     prior = _run(case)
     errors = map_errors.log_errors(prior, case.example, any_scale=not prior.metric)
@@ -91,7 +92,7 @@ def check_depth_pixel_convention(case: ContractCase) -> str:
     """Require that the value at [row, col] belongs to the point (col + 0.5, row + 0.5).
 
     This check detects half-pixel shifts, corner-aligned resizing, cropped or padded borders, and
-    maps that do not cover the whole view.
+    depth maps that do not cover the whole view.
     """
     case.require_truth("painted", "prepared", "image")
     prior = _run(case)
@@ -100,9 +101,9 @@ def check_depth_pixel_convention(case: ContractCase) -> str:
 
 
 def check_depth_orientation(case: ContractCase) -> None:
-    """Require rows that go down and columns that go right.
+    """Require that rows of the map go down and columns go right in the view.
 
-    This check detects transposed, mirrored and rotated maps.
+    This check detects transposed, mirrored and rotated depth maps.
     """
     case.require_truth("painted", "prepared", "image")
     prior = _run(case)
@@ -123,12 +124,13 @@ def check_depth_validity(case: ContractCase) -> str:
 def check_depth_flip(case: ContractCase) -> str:
     """Require the mirrored depth for the mirrored view.
 
-    This check also applies if the truth is unknown, with a larger tolerance.
+    This check of mirrored depth also applies, with a larger tolerance, if the ground truth is
+    unknown.
     """
     prior, mirrored = _run(case), first_depth(case.run(case.example.mirror()))
     if prior.shape != mirrored.shape:
         raise CheckFailed(
-            f"the map of the mirrored view has shape {mirrored.shape}, not {prior.shape}"
+            f"the depth map of the mirrored view has shape {mirrored.shape}, not {prior.shape}"
         )
     both = prior.valid & mirrored.valid[:, ::-1] & case.example.truth(prior.shape).smooth
     if not both.any():
@@ -144,7 +146,7 @@ def check_depth_flip(case: ContractCase) -> str:
 
 
 def check_depth_same_in_larger_view(case: ContractCase) -> str:
-    """Require the same depth for twice the pixels and twice the focal length.
+    """Require the same depth for a view of twice the size with twice the focal length.
 
     A provider that resizes the image has to scale the intrinsics by the same factor.
     """
@@ -159,7 +161,7 @@ def check_depth_same_in_larger_view(case: ContractCase) -> str:
     factor = float(np.exp(medians[1] - medians[0]))
     if abs(np.log(factor)) > DEPTH_TOLERANCE:
         raise CheckFailed(
-            f"depth grows {factor:.3g} times if image and intrinsics are enlarged twice"
+            f"depth grows {factor:.3g} times for a view of twice the size and focal length"
         )
     return f"factor {factor:.3f}"
 
@@ -170,18 +172,18 @@ def check_depth_intrinsics(case: ContractCase) -> str:
     An object with the same image size through a longer lens is farther away.
     """
     if not case.declares("intrinsics-aware"):
-        raise CheckSkipped("does not declare 'intrinsics-aware'")
+        raise CheckSkipped("the provider does not declare 'intrinsics-aware'")
     camera = case.example.camera
     longer = replace(camera, fx=FOCAL_FACTOR * camera.fx, fy=FOCAL_FACTOR * camera.fy)
     prior = _run(case)
     changed = first_depth(case.run_on_view(replace(case.example.view, camera=longer), case.example))
     both = prior.valid & changed.valid
     if not both.any():
-        raise CheckFailed("no pixel is valid with both focal lengths")
+        raise CheckFailed("no pixel of the depth map is valid for both focal lengths")
     factor = float(np.median(changed.depth[both] / prior.depth[both]))
     if not _FOCAL_RANGE[0] < factor < _FOCAL_RANGE[1]:
         raise CheckFailed(
-            f"depth changes by {factor:.2f} if the focal length grows {FOCAL_FACTOR} times"
+            f"depth changes {factor:.2f} times if the focal length grows {FOCAL_FACTOR} times"
         )
     return f"factor {factor:.2f} for {FOCAL_FACTOR} times the focal length"
 
@@ -211,7 +213,7 @@ def check_depth_calibration(case: ContractCase) -> None:
 def check_depth_joint(case: ContractCase) -> str:
     """Require that ``predict_joint`` returns the depth of ``predict`` and true normals."""
     if not case.declares("joint-normals"):
-        raise CheckSkipped("does not declare 'joint-normals'")
+        raise CheckSkipped("the provider does not declare 'joint-normals'")
     case.prepare(case.example)
     depth, normals = validation.run_joint(case.spec, case.provider, case.example.view)
     changed = describe_difference(_run(case), depth)
@@ -223,10 +225,10 @@ def check_depth_joint(case: ContractCase) -> str:
 def check_depth_focal(case: ContractCase) -> str:
     """Require that ``estimate_focal`` returns a focal length in pixels of the view.
 
-    If the view is enlarged twice, the estimated focal length has to be about twice as long.
+    If the view has twice the size, the estimated focal length has to be about twice as long.
     """
     if not case.declares("estimates-focal"):
-        raise CheckSkipped("does not declare 'estimates-focal'")
+        raise CheckSkipped("the provider does not declare 'estimates-focal'")
     width, height = case.example.camera.size
     examples = (case.example, case.example.sized(2 * width, 2 * height))
     found = []
@@ -234,7 +236,7 @@ def check_depth_focal(case: ContractCase) -> str:
         case.prepare(example)
         focal = validation.run_focal(case.spec, case.provider, example.view)
         if focal is None:
-            raise CheckSkipped("estimates no focal length with these options")
+            raise CheckSkipped("the provider estimates no focal length with these options")
         found.append(focal)
     if not 1.5 < found[1] / found[0] < 2.7:
         raise CheckFailed(
@@ -257,7 +259,8 @@ MAP_CHECKS = (
     check_depth_variance,
     check_depth_calibration,
 )
-"""Contract checks of any depth map, which multi-view providers have to pass too."""
+"""Contract checks of depth maps, which both depth providers and multi-view providers have to
+pass."""
 
 CHECKS = (*MAP_CHECKS, check_depth_joint, check_depth_focal)
 
@@ -268,17 +271,17 @@ def _run(case: ContractCase) -> DepthPrior:
 
 
 def _compare_joint_normals(case: ContractCase, normals: NormalPrior) -> str:
-    """Require that normals agree with the ground truth, if the ground truth is known."""
+    """Require that normals of ``predict_joint`` agree with the ground truth, if it is known."""
     if case.truth_source == "none":
         return "the true normals are unknown"
     angle = map_errors.error_quantile(map_errors.angle_errors_deg(normals, case.example))
     if angle > NORMALS_TOLERANCE_DEG:
-        raise CheckFailed(f"normals of predict_joint are {angle:.0f} degrees off")
+        raise CheckFailed(f"the normals of predict_joint are {angle:.0f} degrees off")
     return f"normals off by {angle:.2g} degrees"
 
 
 def _median_deviation(prior: DepthPrior, expected: Any, where: Any) -> float:
-    """Return the median relative deviation of depth from an expected map, up to a common factor."""
+    """Return the median relative deviation of depth from expected depth, up to a common factor."""
     both = prior.valid & where
     if not both.any():
         return np.inf
@@ -287,6 +290,6 @@ def _median_deviation(prior: DepthPrior, expected: Any, where: Any) -> float:
 
 
 def _median_deviation_from_truth(prior: DepthPrior, example: Example) -> float:
-    """Return the median relative deviation from the true depth, up to a common factor."""
+    """Return the median relative deviation of depth from the true depth, up to a factor."""
     truth = example.truth(prior.shape)
     return _median_deviation(prior, truth.depth, truth.valid)

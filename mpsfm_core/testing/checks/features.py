@@ -11,29 +11,32 @@ from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 PIXEL_TOLERANCE = 0.25
-"""Largest shift of keypoints in pixels, or in multiples of ``std_px`` if larger than one. Integer
-pixel centers shift keypoints by 0.5; SIFT has a shift of 0.00 and XFeat at most 0.08."""
+"""Largest accepted shift of keypoints in pixels, or in multiples of the keypoint std if ``std_px``
+exceeds one. Integer pixel centers shift keypoints by 0.5 pixels, but the shift is 0.00 for SIFT and
+at most 0.08 for XFeat."""
 LARGE_SIZE = (4096, 3072)
-"""Width and height of a large view in pixels: 12.6 megapixels, as phone cameras record."""
+"""Width and height in pixels of a view with 12.6 megapixels, the size of phone photos."""
 _SAME_KEYPOINT_PX = 2.5
 """Largest distance in pixels at which keypoints of a view and the rotated view are the same. A
 half-pixel mistake in x and y moves such keypoints apart by 1.4 pixels."""
 _MIN_REPEATED_RATIO = 0.2
-"""Smallest ratio of keypoints that are found again in the rotated view: SIFT has 0.85, XFeat 0.28,
-DISK below 0.15."""
+"""Smallest ratio of keypoints that must be found again in the rotated view. The ratio of repeated
+keypoints is 0.85 for SIFT, 0.28 for XFeat, and below 0.15 for DISK."""
 _MIN_COUNT = 8
 _MIN_INSIDE_RATIO = 0.8
-"""Smallest ratio of keypoints on the textured part of a view. Detectors may respond to the border
-of the texture."""
+"""Smallest accepted ratio of keypoints on the textured part of a view. Some keypoints are outside
+because detectors respond to the border of the texture."""
 _MIN_CORRECT_RATIO = 0.3
-"""Smallest ratio of mutual nearest neighbors that are correct within three standard deviations.
-SIFT has a ratio of 0.6, shuffled descriptors have 0.01."""
+"""Smallest accepted ratio of correct descriptor matches (mutual nearest neighbors within three
+standard deviations of the true position). The ratio of correct matches is 0.6 for SIFT and 0.01 for
+shuffled descriptors."""
 
 
 def check_features_axes(case: ContractCase) -> str:
     """Require keypoints (x, y) in the textured part of the view.
 
-    The textured part is low and wide, in the upper right corner, so that swapped axes miss it.
+    The textured part is a low and wide area in the upper right corner, so that keypoints with
+    swapped x and y are outside.
     """
     case.require_truth("image", "prepared")
     view = case.example.view
@@ -49,16 +52,18 @@ def check_features_axes(case: ContractCase) -> str:
     if inside < _MIN_INSIDE_RATIO:
         swapped = float(((y >= left - margin) & (x <= bottom + margin)).mean())
         reason = ": x and y are swapped" if swapped > inside else ""
-        raise CheckFailed(f"only {inside:.0%} of the keypoints are on the textured part{reason}")
+        raise CheckFailed(
+            f"only {inside:.0%} of the keypoints are on the textured part of the view{reason}"
+        )
     return f"{inside:.0%} of the keypoints are on the textured part"
 
 
 def check_features_pixel_convention(case: ContractCase) -> str:
-    """Require the center of the first pixel at (0.5, 0.5).
+    """Require keypoints for which the center of the first pixel is (0.5, 0.5).
 
     If the view is rotated by 180 degrees, a keypoint (x, y) has to be found at (width - x, height -
-    y). A wrong pixel convention shifts x and y by the same amount. Some networks shift only x or
-    only y; for such networks the check is skipped.
+    y). A wrong pixel convention shifts x and y of all keypoints by the same amount. Some networks
+    shift keypoints only in x or only in y; for such networks the check is skipped.
     """
     case.require_truth("image")
     view = case.example.view
@@ -140,7 +145,7 @@ def check_features_descriptors(case: ContractCase) -> str:
 def check_features_dimension(case: ContractCase) -> str:
     """Require the same descriptor length for every view.
 
-    Views without any keypoint are included in the check.
+    Descriptors of a view without any keypoint must have this length too.
     """
     flat = replace(case.example.view, image=np.full_like(case.example.view.image, 128))
     some, none = case.run(case.example), case.run_on_view(flat, case.example)
@@ -168,7 +173,7 @@ def _require_enough(features: Features) -> None:
 
 
 def _offsets_to_nearest(found: Float64, others: Float64, radius: float) -> Float64:
-    """Return the differences (n, 2) of mutual nearest points that are closer than ``radius``."""
+    """Return the differences (n, 2) between mutual nearest keypoints closer than ``radius``."""
     distance = np.linalg.norm(found[:, None] - others[None], axis=2)
     nearest, back = distance.argmin(axis=1), distance.argmin(axis=0)
     rows = np.flatnonzero(back[nearest] == np.arange(len(found)))

@@ -16,25 +16,26 @@ from mpsfm_core.testing.examples import Example, TrueMaps
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 STD_FACTOR = 1.25
-"""Largest ratio of measured std to the std that the test network reports. A std of 0.25 m that is
-returned as a variance gives a ratio of 2."""
+"""Largest accepted ratio between the returned std and the std that the test network reports. A std
+of 0.25 m that is returned as a variance of 0.25 m^2 gives a ratio of 2."""
 VALIDITY_TOLERANCE = 0.05
-"""Largest ratio of pixels with wrong validity away from edges; padding and blur of a network cause
-some."""
+"""Largest accepted ratio of pixels, away from edges, that are wrongly valid or wrongly invalid.
+Padding and blur of a network cause some such pixels."""
 
 
 def require_reported_std(variance: Float32, expected_std: Float64) -> str:
-    """Require that a variance is the square of the std that the test network reports.
+    """Require that the output variance is the square of the std that the test network reports.
 
     Args:
         variance: Variances (n,) in the output of the provider.
         expected_std: Standard deviations (n,) that the test network reports.
 
     Returns:
-        Remark with the median ratio of the standard deviations.
+        Text with the median ratio between returned and expected standard deviations.
 
     Raises:
-        CheckFailed: The median ratio of the standard deviations is outside of :data:`STD_FACTOR`.
+        CheckFailed: the median ratio of the standard deviations is above :data:`STD_FACTOR` or
+        below its inverse.
     """
     factor = float(np.median(np.sqrt(variance.astype(np.float64)) / expected_std))
     if 1 / STD_FACTOR < factor < STD_FACTOR:
@@ -48,15 +49,16 @@ def require_true_validity(valid: Bool, truth: TrueMaps) -> str:
     """Require that pixels are valid exactly where the view shows a surface.
 
     Args:
-        valid: Validity (h, w) of a depth or normal map.
-        truth: Ground truth on the grid of the map.
+        valid: Boolean mask (h, w) of the valid pixels of a depth or normal map.
+        truth: Ground-truth maps (h, w) on the pixel grid of the map.
 
     Returns:
-        Remark with the ratios of wrongly valid and wrongly invalid pixels.
+        Text with the ratios of wrongly valid and wrongly invalid pixels.
 
     Raises:
-        CheckFailed: One of the ratios exceeds :data:`VALIDITY_TOLERANCE`.
-        CheckSkipped: The map is too coarse to separate surfaces from sky.
+        CheckFailed: the ratio of wrongly valid or of wrongly invalid pixels exceeds
+        :data:`VALIDITY_TOLERANCE`.
+        CheckSkipped: the map is too coarse to separate surfaces from sky.
     """
     empty, full = truth.edge_free & ~truth.valid, truth.smooth
     if not (empty.any() and full.any()):
@@ -70,14 +72,14 @@ def require_true_validity(valid: Bool, truth: TrueMaps) -> str:
 
 
 def require_monotonic_calibration(case: ContractCase, prior: DepthPrior | NormalPrior) -> None:
-    """Require that calibration defines a variance everywhere and keeps its order.
+    """Require that calibration gives each pixel a variance and keeps the order of the variances.
 
     Args:
         case: Provider under test.
         prior: Its answer.
 
     Raises:
-        CheckFailed: The calibrated variance is invalid, or does not grow with ``std_scale`` and
+        CheckFailed: the calibrated variance is invalid, or does not grow with ``std_scale`` and
         with
             the variance of the network.
     """
@@ -98,7 +100,9 @@ def require_monotonic_calibration(case: ContractCase, prior: DepthPrior | Normal
     if prior.variance is not None and calibration.use_network_variance and prior.valid.any():
         larger = replace(prior, variance=prior.variance * np.float32(100))
         if not (total(larger) > total(prior)).any():
-            raise CheckFailed("a ten times larger network std changes nothing after calibration")
+            raise CheckFailed(
+                "a ten times larger network std does not change the calibrated variance"
+            )
 
 
 def swap_painted_channels(example: Example, shape: tuple[int, int]) -> NDArray[Any]:

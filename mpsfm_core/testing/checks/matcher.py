@@ -22,17 +22,17 @@ from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 SHIFT_TOLERANCE = 0.2
-"""Largest shift of matches in multiples of ``std_px``, or in pixels of the larger view; integer
-pixel centers give 0.5."""
+"""Largest accepted shift of matches in pixels of the larger view, or in multiples of the keypoint
+std if ``std_px`` exceeds one. Integer pixel centers shift matches by 0.5 pixels."""
 NUM_MANY_FEATURES = 4096
 """Number of features per view that every sparse matcher has to accept."""
 _MIN_CORRECT_RATIO = 0.5
-"""Smallest ratio of correct matches for an easy image pair: SIFT nearest neighbors have 0.99,
-LighterGlue has 0.96."""
+"""Smallest accepted ratio of correct matches for an image pair with a small baseline. The ratio of
+correct matches is 0.99 for nearest neighbors of SIFT and 0.96 for LighterGlue."""
 
 
 def check_matcher_sides(case: ContractCase) -> str:
-    """Require match columns in the order of the views."""
+    """Require that the first column of the matches belongs to the first view."""
     case.require_truth("image", "prepared")
     return _require_correct(case, case.example, case.example.partner)
 
@@ -47,7 +47,7 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
     """Require dense matches in COLMAP's pixel convention.
 
     If a view is matched with its copy at half the size, matched coordinates are halved exactly.
-    Matches with integer pixel centers are shifted.
+    Matched coordinates with integer pixel centers are shifted instead.
     """
     if not case.declares("dense"):
         raise CheckSkipped("sparse matches have the positions of the keypoints")
@@ -86,7 +86,7 @@ def check_matcher_no_features(case: ContractCase) -> None:
 
 
 def check_matcher_few_features(case: ContractCase) -> None:
-    """Require valid output for one or two features."""
+    """Require valid output for views with one or two features."""
     if not case.declares("sparse"):
         raise CheckSkipped("the matcher needs no features")
     a, b = case.example, case.example.partner
@@ -99,7 +99,7 @@ def check_matcher_few_features(case: ContractCase) -> None:
 def check_matcher_many_features(case: ContractCase) -> str:
     """Require valid output for 4096 features per view.
 
-    Real images have as many features as this view. A fixed buffer or a size limit of the network
+    Real images have about 4096 features. A fixed buffer or a size limit of the matching network
     must not end a run.
     """
     if not case.declares("sparse"):
@@ -135,7 +135,7 @@ def check_matcher_scores(case: ContractCase) -> str:
 def check_matcher_pair_depth(case: ContractCase) -> str:
     """Require z-depth of the first view in ``depth_a`` and of the second in ``depth_b``."""
     if not case.declares("pair-depth"):
-        raise CheckSkipped("does not declare 'pair-depth'")
+        raise CheckSkipped("the matcher does not declare 'pair-depth'")
     case.require_truth("painted", "prepared")
     a, b = case.example, case.example.partner
     depth = case.run(a).depth
@@ -186,7 +186,7 @@ def _require_enough(count: int) -> None:
 
 
 def _depth_error(prior: DepthPrior, example: Example) -> float:
-    """Return the 80 % quantile of the relative depth error, up to a factor if not metric."""
+    """Return the 80 % quantile of relative depth errors, up to a factor if depth is not metric."""
     return map_errors.error_quantile(
         map_errors.log_errors(prior, example, any_scale=not prior.metric)
     )

@@ -1,4 +1,4 @@
-"""Contract checks of multi-view providers, which also have to pass the checks of depth maps."""
+"""Contract checks of multi-view providers, in addition to the checks of depth maps."""
 
 from __future__ import annotations
 
@@ -22,20 +22,21 @@ from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 ROTATION_TOLERANCE_DEG = 1.0
-"""Largest error of a relative rotation in degrees. The synthetic views are 4 and 8 degrees apart,
-so an inverted or mirrored pose has an error of 8 degrees or more."""
+"""Largest accepted error of a predicted relative rotation in degrees. The synthetic views are
+rotated by 4 and 8 degrees relative to the first one, so an inverted or mirrored pose has an error
+of at least 8 degrees."""
 BASELINE_TOLERANCE = 0.1
-"""Largest relative error of the baseline between two views: twice the depth tolerance."""
+"""Largest accepted relative error of the baseline between two views, twice the depth tolerance."""
 FOCAL_TOLERANCE = 0.1
-"""Largest relative error of a focal length whose ground truth is known. A wrong pixel grid or
-swapped axes cause an error of at least 0.25."""
+"""Largest accepted relative error of a focal length or principal point whose ground truth is known.
+A wrong pixel grid or swapped axes cause a relative error of at least 0.25."""
 _FOCAL_RATIO_RANGE = (1.5, 2.7)
-"""Accepted range for the ratio of the focal lengths that are estimated at twice the size and at the
-original size."""
+"""Accepted range for the ratio of the focal lengths that a provider estimates for a view of twice
+the size and for the original view."""
 
 
 def check_multiview_order(case: ContractCase) -> None:
-    """Require that the depth maps have the order of the input views."""
+    """Require that the output depth maps have the order of the input views."""
     case.require_truth("painted", "prepared", "image")
     examples = _make_group(case)[::-1]
     group = case.run_on_group(*examples)
@@ -58,7 +59,7 @@ def check_multiview_own_axis(case: ContractCase) -> str:
         reason = ": it is z of the first view" if max(first) < 0.5 * max(errors) else ""
         raise CheckFailed(
             f"the depth of view {int(np.argmax(errors)) + 1} of {len(errors)} is not proportional "
-            f"to its z, relative error {max(errors):.2g}{reason}"
+            f"to its z-depth, relative error {max(errors):.2g}{reason}"
         )
     return f"relative error {max(errors):.2g}"
 
@@ -66,7 +67,7 @@ def check_multiview_own_axis(case: ContractCase) -> str:
 def check_multiview_one_unit(case: ContractCase) -> str:
     """Require one common unit for all depth maps of a group.
 
-    The mapper estimates one scale for the whole group.
+    The mapper estimates only one metric scale for all depth maps of a group of views.
     """
     case.require_truth("painted", "prepared", "image")
     examples = _make_group(case)
@@ -113,12 +114,12 @@ def check_multiview_pose_unit(case: ContractCase) -> str:
 
 
 def check_multiview_intrinsics(case: ContractCase) -> str:
-    """Require intrinsics in pixels of each view.
+    """Require predicted intrinsics in pixels of each view.
 
     This check detects intrinsics in pixels of the network's grid or of another view.
     """
     if not case.declares("proposes-intrinsics"):
-        raise CheckSkipped("does not declare 'proposes-intrinsics'")
+        raise CheckSkipped("the provider does not declare 'proposes-intrinsics'")
     width, height = case.example.camera.size
     examples = (case.example, case.example.sized(2 * width, 2 * height))
     found = case.run_on_group(*examples).intrinsics
@@ -139,7 +140,7 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
 def check_multiview_alone(case: ContractCase) -> None:
     """Require valid output for a group of one view.
 
-    A run passes an image that overlaps no other image as a group of one view.
+    A run calls the multi-view network with one view if an image overlaps no other image.
     """
     case.run_on_group(case.example)
 
@@ -189,24 +190,24 @@ def _make_group(case: ContractCase) -> tuple[Example, ...]:
 def _pairs(
     group: MultiViewPrior, examples: tuple[Example, ...]
 ) -> list[tuple[DepthPrior, Example]]:
-    """Pair each depth prior with the synthetic view of its image."""
+    """Pair each predicted depth map with the synthetic view that it belongs to."""
     return list(zip(group.depth, examples, strict=True))
 
 
 def _scale_free_error(prior: DepthPrior, example: Example) -> float:
-    """Return the 80 % quantile of the relative depth error, up to a common factor."""
+    """Return the 80 % quantile of relative depth errors after removing a common factor."""
     return map_errors.error_quantile(map_errors.log_errors(prior, example, any_scale=True))
 
 
 def _median_free_error(prior: DepthPrior, example: Example, expected: Float64) -> float:
-    """Return the 80 % quantile of the relative error for an expected depth map (h, w)."""
+    """Return the 80 % quantile of relative errors of depth compared with expected depth (h, w)."""
     where = map_errors.select_comparable(prior.valid, example.truth(prior.shape)) & (expected > 0)
     error = np.log(prior.depth[where] / expected[where])
     return map_errors.error_quantile(error - np.median(error))
 
 
 def _depth_from_first_view(example: Example, first: Example, shape: tuple[int, int]) -> Float64:
-    """Return the depth (h, w) in the first view of the points that another view sees."""
+    """Return z-depths (h, w) in the first view of the surface points seen by another view."""
     rows, columns = shape
     grid = rays(example.camera.resized(columns, rows), pixel_centers(columns, rows))
     points = grid * example.truth(shape).depth[..., None]
@@ -216,7 +217,7 @@ def _depth_from_first_view(example: Example, first: Example, shape: tuple[int, i
 
 
 def _log_factors(group: MultiViewPrior, examples: tuple[Example, ...]) -> list[float]:
-    """Return the logarithm of the unit of each depth map in meters."""
+    """Return the logarithm of the unit of each predicted depth map in meters."""
     errors = [map_errors.log_errors(p, e, any_scale=False) for p, e in _pairs(group, examples)]
     return [float(np.median(error)) for error in errors]
 
@@ -224,7 +225,7 @@ def _log_factors(group: MultiViewPrior, examples: tuple[Example, ...]) -> list[f
 def _predict_poses(case: ContractCase) -> tuple[Float64, tuple[Example, ...]]:
     """Return the predicted poses (n, 3, 4) of a group and its synthetic views."""
     if not case.declares("proposes-poses"):
-        raise CheckSkipped("does not declare 'proposes-poses'")
+        raise CheckSkipped("the provider does not declare 'proposes-poses'")
     case.require_truth("prepared", "image")
     examples = _make_group(case)
     poses = case.run_on_group(*examples).poses

@@ -23,8 +23,8 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.painted_views import NORMALS_STD, read_normals
 
 FLIP_TOLERANCE_DEG = 15.0
-"""Largest angle in degrees if the ground truth is unknown, because trained networks are not exactly
-symmetric."""
+"""Largest accepted angle in degrees between normals of a view and of the mirrored view if the
+ground truth is unknown. Trained networks are not exactly symmetric."""
 
 _AXES: Mapping[str, tuple[int, int, int]] = MappingProxyType(
     {
@@ -78,8 +78,8 @@ def check_normals_pixel_convention(case: ContractCase) -> str:
 def check_normals_validity(case: ContractCase) -> str:
     """Require that pixels with a surface are valid and pixels of the sky are not.
 
-    Painted views encode a normal at every pixel, so this check needs a provider whose true output
-    is prepared.
+    The check needs a provider with ``truth_source="prepared"``, because views whose colors encode
+    normals have a normal at every pixel.
     """
     case.require_truth("prepared")
     prior = _run(case)
@@ -89,12 +89,13 @@ def check_normals_validity(case: ContractCase) -> str:
 def check_normals_flip(case: ContractCase) -> str:
     """Require mirrored normals with negated x for the mirrored view.
 
-    This check also applies if the truth is unknown, with a larger tolerance.
+    This check of mirrored normals also applies, with a larger tolerance, if the ground truth is
+    unknown.
     """
     prior, mirrored = _run(case), case.run(case.example.mirror())
     if prior.shape != mirrored.shape:
         raise CheckFailed(
-            f"the map of the mirrored view has shape {mirrored.shape}, not {prior.shape}"
+            f"the normal map of the mirrored view has shape {mirrored.shape}, not {prior.shape}"
         )
     both = prior.valid & mirrored.valid[:, ::-1] & case.example.truth(prior.shape).smooth
     if not both.any():
@@ -108,7 +109,7 @@ def check_normals_flip(case: ContractCase) -> str:
 
 
 def check_normals_same_in_larger_view(case: ContractCase) -> str:
-    """Require the same normals for twice the pixels and twice the focal length."""
+    """Require the same normals for a view of twice the size with twice the focal length."""
     case.require_truth("painted", "prepared", "image")
     width, height = case.example.camera.size
     large = case.example.sized(2 * width, 2 * height)
@@ -158,12 +159,12 @@ def _run(case: ContractCase) -> NormalPrior:
 def _angle_error_deg(found: Any, expected: Any) -> float:
     """Return the 80 % quantile of the angle in degrees between predicted and true normals."""
     if not len(found):
-        raise CheckFailed("has no valid normals where the truth is known")
+        raise CheckFailed("the normal map is invalid wherever the true normals are known")
     return map_errors.error_quantile(angle_between_deg(found.astype(np.float64), expected))
 
 
 def _explain_error(prior: NormalPrior, case: ContractCase) -> str:
-    """Name the known mistake that explains the error of the normals, or return ""."""
+    """Describe the mistake that explains the error of the normals, or return ""."""
     truth = case.example.truth(prior.shape)
     where = prior.valid & truth.smooth
     found, expected = prior.normals[where].astype(np.float64), truth.normals[where]

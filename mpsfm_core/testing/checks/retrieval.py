@@ -12,7 +12,7 @@ from mpsfm_core.testing.outcome import CheckFailed
 
 
 def check_retrieval_dimension(case: ContractCase) -> str:
-    """Require the same descriptor length for every view."""
+    """Require the same length of the image descriptor for every view."""
     others = (case.example.sized(104, 120), outdoor_example("textured"))
     lengths = {len(case.run(example)) for example in (case.example, *others)}
     if len(lengths) > 1:
@@ -23,8 +23,8 @@ def check_retrieval_dimension(case: ContractCase) -> str:
 def check_retrieval_self_similarity(case: ContractCase) -> str:
     """Require that no view is more similar to another view than to itself.
 
-    Descriptors of unit length satisfy this rule. If descriptors have different lengths, bright or
-    detailed views can be similar to all views.
+    Descriptors of unit norm satisfy this rule. If descriptors have different norms, the
+    descriptors of bright or detailed views can be similar to those of all views.
     """
     flat = replace(case.example.view, image=np.full_like(case.example.view.image, 200))
     descriptors = np.stack(
@@ -40,14 +40,14 @@ def check_retrieval_self_similarity(case: ContractCase) -> str:
     if excess > 1e-3 * abs(similarity.diagonal()).max():
         lengths = np.linalg.norm(descriptors, axis=1)
         text = f"lengths of descriptors are {lengths.min():.3g} to {lengths.max():.3g}"
-        raise CheckFailed(f"a view is more similar to another than to itself: {text}")
+        raise CheckFailed(f"a view is more similar to another view than to itself: {text}")
     return "no view is more similar to another than to itself"
 
 
 def check_retrieval_overlap(case: ContractCase) -> str:
     """Require a higher similarity to neighboring views than to another scene.
 
-    The neighboring views are one and two steps to the side in the same scene.
+    The neighboring views show the same scene from one and two steps to the side.
     """
     case.require_truth("image", "prepared")
     example, other = case.example, outdoor_example("textured", case.example.camera.size)

@@ -1,6 +1,6 @@
 """Contract checks of wrappers around a provider that returns the ground truth.
 
-A wrapper has to pass the checks of this module and all checks of the kind that it wraps.
+A wrapper has to pass the checks of this module and all checks of the provider kind that it wraps.
 """
 
 from __future__ import annotations
@@ -14,30 +14,30 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 def check_wrapper_keeps_variance(case: ContractCase) -> None:
     """Require a variance if the wrapped provider returns a variance.
 
-    The calibration of the wrapped provider expects a variance.
+    The uncertainty calibration of the wrapped provider needs a variance.
     """
     if case.run(case.example).variance is None:
         raise CheckFailed("the wrapper drops the variance of the wrapped provider")
 
 
 def check_wrapper_without_variance(case: ContractCase) -> None:
-    """Require valid output if the wrapped provider returns no variance."""
+    """Require valid output of the wrapper if the wrapped provider returns no variance."""
     case.run(case.example, case.create_provider(variance=False))
 
 
 def check_wrapper_keeps_unit(case: ContractCase) -> None:
-    """Require that the wrapper keeps ``metric`` as the wrapped provider declares it."""
+    """Require that the wrapper keeps the flag ``metric`` of the wrapped provider's depth."""
     if case.kind != "depth":
         raise CheckSkipped("applies to depth only")
     for metric in (True, False):
         if case.run(case.example, case.create_provider(metric=metric)).metric != metric:
             raise CheckFailed(
-                f"returns depth with metric={not metric}, the wrapped provider with {metric}"
+                f"the wrapper returns depth with metric={not metric}, its provider with {metric}"
             )
 
 
 def check_wrapper_uses_the_provider(case: ContractCase) -> str:
-    """Require that the wrapper's depth follows the depth of the wrapped provider.
+    """Require that the wrapper's depth is computed from the depth of the wrapped provider.
 
     If the wrapped provider returns twice the depth, the wrapper has to return twice the depth.
     """
@@ -46,7 +46,7 @@ def check_wrapper_uses_the_provider(case: ContractCase) -> str:
     once, twice = case.run(case.example), case.run(case.example, case.create_provider(scale=2.0))
     both = once.valid & twice.valid
     if not both.any():
-        raise CheckFailed("no pixel is valid in both outputs")
+        raise CheckFailed("no pixel is valid both for the original and for the doubled depth")
     factor = float(np.median(twice.depth[both] / once.depth[both]))
     if abs(factor - 2) > 0.05:
         raise CheckFailed(
@@ -58,7 +58,7 @@ def check_wrapper_uses_the_provider(case: ContractCase) -> str:
 def check_wrapper_hands_on_depth(case: ContractCase) -> None:
     """Require that a wrapper of normals passes on the depth prior.
 
-    The wrapped normals provider may declare ``needs-depth``.
+    The wrapped normals provider may need the depth prior, which it declares with ``needs-depth``.
     """
     if case.kind != "normals":
         raise CheckSkipped("applies to normals only")

@@ -1,9 +1,9 @@
 """Synthetic monocular depth: true depth with smooth, seeded errors.
 
-The errors of depth networks are not pixel noise. The whole map has a wrong scale, and smooth errors
-bend and shift whole surfaces. This module simulates a scale error of the whole map and smooth
-errors of its surfaces. The errors of an image depend only on its name and the seed, so that all
-tests and benchmarks use the same errors.
+The errors of depth networks are not independent between pixels. The predicted depth map has a wrong
+scale, and smooth errors bend and shift whole surfaces. This module simulates a scale error of the
+whole map and smooth errors of its surfaces. The errors of an image depend only on its name and the
+seed, so that all tests and benchmarks use the same depth errors.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from mpsfm_core.data import Float32, Float64
 from mpsfm_core.geometry import resize_map
 
 _GRID = 120
-"""Number of columns of the grid of the noise field; the shorter blur has a std of 4 columns."""
+"""Number of columns of the grid on which the two depth noise fields are drawn."""
 
 
 @dataclass(frozen=True)
 class DepthErrors:
-    """Model of relative depth errors: the depth is ``depth * exp(scale * n + field * f(x, y))``.
+    """Model of relative depth errors, ``depth * exp(scale * n + field * f(x, y))``.
 
-    In this formula ``n`` is standard normal, and ``f`` is the sum of two blurred Gaussian noise
-    fields.
+    The random number ``n`` of each image is standard normal, and ``f`` is the sum of two blurred
+    Gaussian noise fields.
     """
 
     scale: float = 0.05
-    """Std of the relative error that a whole image shares. :attr:`std` excludes it, because the
-    mapper estimates a scale per image (``s_i`` in the paper)."""
+    """Std of the relative depth error that a whole image shares. The property ``std`` excludes this
+    scale error, because the mapper estimates a scale per image (``s_i`` in the paper)."""
     field: float = 0.05
     """Std of the noise field ``f``, which is a relative depth error."""
     lengths: tuple[float, float] = (1 / 8, 1 / 30)
-    """Std of the Gaussian blur of both noise fields relative to the width of the map."""
+    """Std of the Gaussian blur of each noise field relative to the width of the depth map."""
     weights: tuple[float, float] = (0.8, 0.6)
-    """Weights of both noise fields; the squares of the weights sum to one."""
+    """Weights of the two noise fields, whose squares sum to one."""
 
     @property
     def std(self) -> float:
@@ -56,10 +56,10 @@ def degrade_depth(
     """Add the errors of a monocular depth network to a true depth map.
 
     Args:
-        depth: True z-depth (h, w). Zeros in the true depth are invalid and remain zero.
+        depth: True z-depth (h, w). Pixels with zero depth are invalid and remain zero.
         name: Name of the image, which seeds the errors.
         errors: Model of the errors, by default :class:`DepthErrors`.
-        seed: Seed in addition to the image name.
+        seed: Number that seeds the errors in addition to the image name.
 
     Returns:
         z-depth (h, w) with simulated errors.
@@ -79,11 +79,11 @@ def degrade_depth(
 def _smooth_noise(rng: np.random.Generator, rows: int, blur: float) -> Float64:
     """Return blurred Gaussian noise of std 1.
 
-    The noise is generated with a margin, so that blurring has no border effect.
+    The noise is generated with a margin around the map, so that blurring has no border effect.
     """
     margin = math.ceil(3 * blur)
     noise = rng.normal(size=(rows + 2 * margin, _GRID + 2 * margin))
     blurred = cv2.GaussianBlur(noise, (0, 0), blur)[margin:-margin, margin:-margin]
-    # This is the theoretical std of blurred white noise. Dividing by the sample std would remove
-    # errors longer than the map.
+    # The theoretical std of blurred white noise normalizes the noise, because dividing by the
+    # sample std would remove errors longer than the map.
     return np.asarray(blurred * (2 * blur * math.sqrt(math.pi)))

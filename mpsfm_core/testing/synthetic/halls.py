@@ -1,7 +1,8 @@
-"""Synthetic halls with boxes: mapping problems of any size with many matches.
+"""Synthetic mapping problems of any size, in which cameras observe a hall with boxes.
 
-The cameras are on a grid and rotate slowly from one to the next, so that neighboring views overlap
-well. Keypoints are noisy and some matches are wrong, as after geometric verification.
+The cameras stand on a grid and differ by small rotations from their neighbors, so that neighboring
+views overlap well. Keypoints are noisy and some matches are wrong, as in real images after
+geometric verification.
 """
 
 from __future__ import annotations
@@ -42,28 +43,28 @@ TURN_DEG = 20.0
 REACH = 2.6
 """Largest distance in meters between the cameras of a matched image pair."""
 MAX_MATCH_TURN_DEG, MAX_MATCH_ZOOM = 40.0, 1.8
-"""Largest angle between the two rays of a matched point, and largest ratio of its two distances
-from the cameras."""
+"""Largest angle in degrees between the two viewing rays of a matched point, and largest ratio of
+the point's distances from the two cameras."""
 MIN_MATCHES = 30
-"""Smallest number of common points of an image pair."""
+"""Smallest number of surface points that two matched images have in common."""
 
 
 @dataclass(frozen=True)
 class PriorErrors:
-    """Depth error model of a hall: ``depth * exp(scale * n + f(x, y) + patch)``."""
+    """Model of depth errors in a hall, ``depth * exp(scale * n + f(x, y) + patch)``."""
 
     scale: float = 0.0
-    """Std of the relative error that a whole image shares."""
+    """Std of the relative depth error that a whole image shares."""
     field: float = 0.0
-    """Std of independent errors at the nodes of a grid, interpolated by cubic splines."""
+    """Std of relative depth errors at the nodes of a grid, interpolated by cubic splines."""
     grid: tuple[int, int] = (8, 6)
-    """Columns and rows of the grid of independent errors."""
+    """Numbers of columns and rows of the grid of independent depth errors."""
     patch: float = 0.0
-    """Relative depth error, of either sign, in one ellipse of the map."""
+    """Relative depth error, of either sign, inside one ellipse of the depth map."""
     patch_area: float = 0.1
-    """Area of the ellipse relative to the map."""
+    """Area of the ellipse with this depth error relative to the area of the map."""
     declared: float = 0.01
-    """Relative std that the depth prior declares."""
+    """Relative std that the depth prior reports."""
 
 
 EXACT_PRIORS = PriorErrors()
@@ -81,9 +82,9 @@ class HallProblem(NamedTuple):
 
     problem: MappingProblem
     truth: dict[str, Pose]
-    """True ``cam_from_world`` by image name."""
+    """True camera pose ``cam_from_world`` by image name."""
     points: tuple[Int64, ...]
-    """Index of the surface point that each keypoint observes, (n,) per image."""
+    """Indices (n,) of the surface points that the keypoints of each image observe."""
 
 
 def make_hall_problem(
@@ -101,11 +102,11 @@ def make_hall_problem(
     Args:
         views: Number of views.
         errors: Model of the errors of the depth priors.
-        points_per_view: Number of surface points that each view adds. Every point that a view sees
-            becomes a keypoint of this view.
-        map_width: Width of the prior maps in pixels.
-        keypoint_noise_px: Std of the keypoints in pixels.
-        wrong_matches: Ratio of wrong matches of each pair, which join keypoints at random.
+        points_per_view: Number of surface points that are sampled in each view. Every sampled point
+            that a view sees becomes a keypoint of this view.
+        map_width: Width of the depth and normal prior maps in pixels.
+        keypoint_noise_px: Std of the errors of keypoint positions in pixels.
+        wrong_matches: Ratio of wrong matches of each image pair, which connect random keypoints.
         seed: Seed of scene, points and errors.
 
     Returns:
@@ -172,7 +173,7 @@ def make_hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], Anal
 
 
 def _remove_hidden_boxes(scene: AnalyticScene, pose: Float64) -> AnalyticScene:
-    """Remove the boxes outside of the view frustum, which the view cannot see."""
+    """Remove the boxes outside of the view frustum, which the camera cannot see."""
     shell, *boxes = scene.surfaces
     centers = np.array([box.center for box in boxes if isinstance(box, Box)]).reshape(-1, 3)
     radii = np.array([np.linalg.norm(box.half_size) for box in boxes if isinstance(box, Box)])
@@ -191,7 +192,7 @@ def _keypoints(
     points_per_view: int,
     rng: np.random.Generator,
 ) -> tuple[list[Int64], list[Float64]]:
-    """Return the indices of the points that each view sees, and their pixels."""
+    """Return the indices and the pixels of the surface points that each view sees."""
     size = np.array(CAMERA.size, dtype=np.float64)
     numbers: list[list[Int64]] = [[] for _ in poses]
     pixels: list[list[Float64]] = [[] for _ in poses]
@@ -210,7 +211,7 @@ def _keypoints(
 
 
 def _can_match(rays_a: Float64, rays_b: Float64) -> Bool:
-    """Return which points look similar along the rays (m, 3) of two views."""
+    """Return which points can be matched, given their viewing rays (m, 3) from two views."""
     a, b = np.linalg.norm(rays_a, axis=1), np.linalg.norm(rays_b, axis=1)
     cosine = (rays_a * rays_b).sum(axis=1) / (a * b)
     alike: Bool = (cosine > np.cos(np.radians(MAX_MATCH_TURN_DEG))) & (
@@ -220,7 +221,7 @@ def _can_match(rays_a: Float64, rays_b: Float64) -> Bool:
 
 
 def _corrupt_matches(pair: VerifiedPair, share: float, rng: np.random.Generator) -> VerifiedPair:
-    """Permute the keypoints in the second image of a given ratio of the matches."""
+    """Make a given ratio of the matches wrong by permuting keypoints of the second image."""
     matches = pair.matches.copy()
     wrong = rng.choice(len(matches), round(share * len(matches)), replace=False)
     matches[wrong, 1] = np.roll(matches[wrong, 1], 1)
@@ -228,7 +229,7 @@ def _corrupt_matches(pair: VerifiedPair, share: float, rng: np.random.Generator)
 
 
 def _estimate_pose(pair: VerifiedPair, keypoints_a: Float64, keypoints_b: Float64) -> VerifiedPair:
-    """Replace the relative pose of a pair by the estimate from the noisy matches."""
+    """Replace the relative pose of an image pair by the estimate from its noisy matches."""
     camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=CAMERA.params)
     found = pycolmap.estimate_essential_matrix(
         keypoints_a[pair.matches[:, 0]],
@@ -262,7 +263,7 @@ def _add_depth_errors(depth: Float32, errors: PriorErrors, rng: np.random.Genera
 def _draw_error_field(
     shape: tuple[int, ...], errors: PriorErrors, rng: np.random.Generator
 ) -> Float64:
-    """Interpolate independent errors of std 1 from the nodes of a grid to a map (h, w)."""
+    """Interpolate independent errors of std 1 from the nodes of a grid to a depth map (h, w)."""
     nodes = rng.normal(size=errors.grid[::-1])
     field: Float64 = cv2.resize(nodes, shape[::-1], interpolation=cv2.INTER_CUBIC)
     return field

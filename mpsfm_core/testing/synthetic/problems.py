@@ -25,7 +25,7 @@ class SyntheticNoise(NamedTuple):
     """Standard deviations of the errors in a synthetic mapping problem."""
 
     keypoints_px: float = 0.0
-    """Std of the keypoints in pixels."""
+    """Std of the errors of keypoint positions in pixels."""
     scale: float = 0.0
     """Std of the relative depth error that a whole image shares."""
     depth: float = 0.0
@@ -52,15 +52,15 @@ def make_mapping_problem(
         scene: Scene to render.
         camera: Camera of all views.
         poses: Pose ``cam_from_world`` (3, 4) of each view.
-        points_per_view: Number of surface points that each view adds. Every point that a view sees
-            becomes a keypoint of this view.
+        points_per_view: Number of surface points that are sampled in each view. Every sampled point
+            that a view sees becomes a keypoint of this view.
         map_width: Width of the prior maps in pixels.
         declared_depth_std: Relative std that the depth priors declare.
         declared_normal_std_deg: Angular std that the normal priors declare.
-        noise: Standard deviations of the errors of keypoints and depth, by default none.
-        links: Image pairs to match, by default all. Pairs with fewer than 15 common points are
-            dropped.
-        two_view_tracks: True matches each surface point in at most one pair.
+        noise: Standard deviations of the errors of keypoints and depth, by default zero.
+        links: Image pairs to match, by default all. Image pairs with fewer than 15 common points
+            are dropped.
+        two_view_tracks: If true, match each surface point in at most one image pair.
         seed: Seed of points and noise.
 
     Returns:
@@ -155,8 +155,8 @@ def make_verified_pair(a: int, b: int, matches: Int64, poses: Sequence[Float64])
     """Return matches (m, 2) of two views as a verified pair with the true relative pose.
 
     Args:
-        a: Index of the first view.
-        b: Index of the second view.
+        a: Index of the first view of the image pair.
+        b: Index of the second view of the image pair.
         matches: Matches as keypoint indices (m, 2) in both images.
         poses: Pose ``cam_from_world`` (3, 4) of each view.
     """

@@ -1,7 +1,7 @@
 """Analytic scenes rendered by ray casting: exact depth, normals, colors and correspondences.
 
-The world frame is metric with z up. Cameras follow COLMAP: x right, y down, z forward, pixel
-centers at half integers. A camera pose is a (3, 4) matrix ``cam_from_world``.
+The world frame of a scene is metric with z up. Cameras follow COLMAP: x right, y down, z forward,
+pixel centers at half integers. A camera pose is a (3, 4) matrix ``cam_from_world``.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from mpsfm_core import geometry
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
 
 _EPSILON = 1e-9
-"""Smallest distance in meters of a hit from the origin of a ray. Closer hits are on the surface
-that the ray leaves."""
+"""Smallest distance in meters between the origin of a ray and an intersection. Closer intersections
+are on the surface at which the ray starts."""
 
 
 class Surface(Protocol):
@@ -33,15 +33,16 @@ class Surface(Protocol):
             directions: Ray directions (n, 3) in the world frame, of any length.
 
         Returns:
-            Parameters t (n,) of the first hits, inf without a hit, and unit normals (n, 3) that
-            face the origin of the ray. Normals of rays without a hit are arbitrary.
+            Parameters t (n,) of the first intersections, inf without an intersection, and unit
+            normals (n, 3) that face the origin of the ray. Normals of rays without an intersection
+            are arbitrary.
         """
         ...
 
 
 @dataclass(frozen=True)
 class Plane:
-    """Infinite plane through ``point``; ``normal`` has any non-zero length."""
+    """Infinite plane through ``point`` with a ``normal`` of any non-zero length."""
 
     point: tuple[float, float, float]
     normal: tuple[float, float, float]
@@ -56,7 +57,7 @@ class Plane:
 
 @dataclass(frozen=True)
 class Box:
-    """Box that is rotated about the world's z axis. The inside of a box is a room."""
+    """Box rotated about the world's z axis, or a room for cameras inside of the box."""
 
     center: tuple[float, float, float]
     half_size: tuple[float, float, float]
@@ -118,18 +119,21 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Texture:
-    """Random color texture in 3D: octaves of plane waves with random direction and phase.
+    """Random 3D color texture, a sum of plane waves with random direction and phase.
 
-    The texture does not repeat in practice. The argument ``footprint``, the size of a pixel on the
-    surface in meters, limits the frequencies of the texture. Rendered images therefore have no
-    aliasing.
+    The color texture has no visible repetitions. The argument ``footprint``, the size of a pixel on
+    the surface in meters, limits the frequencies of the texture. Images rendered with this texture
+    therefore have no aliasing.
     """
 
-    longest_wave: float = 1.2  # meters
+    longest_wave: float = 1.2
+    """Longest wavelength of the texture in meters."""
     octaves: int = 6
     waves_per_octave: int = 24
-    decay: float = 0.85  # amplitude of an octave relative to the one before
-    contrast: float = 0.7  # standard deviation before the soft clipping to [-1, 1]
+    decay: float = 0.85
+    """Amplitude ratio between an octave of the texture and the previous, coarser octave."""
+    contrast: float = 0.7
+    """Standard deviation of texture values before these are softly clipped to [-1, 1]."""
     seed: int = 0
 
     def colors(self, points: Float64, surface: Int64, footprint: Float64) -> UInt8:
@@ -156,7 +160,7 @@ class Texture:
             phase = rng.uniform(0, 2 * np.pi, self.waves_per_octave)
             mix = rng.normal(1.0, 0.5, (self.waves_per_octave, 3))
             waves = np.sin(where @ vectors.astype(np.float32) + phase.astype(np.float32))
-            # A pixel is a Gaussian with a std of half a footprint, applied exactly to each wave.
+            # Each wave is filtered by a Gaussian pixel with a std of half a footprint.
             attenuated = amplitude * np.exp(-0.5 * (np.pi * frequency * footprint) ** 2)
             value += attenuated[:, None] * (waves @ mix.astype(np.float32))
         return np.round(127.5 + 127.5 * np.tanh(value)).astype(np.uint8)
@@ -164,13 +168,15 @@ class Texture:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """Rendered depth, normals and colors of a pinhole camera; zero where there is no surface.
+    """Rendered depth, normals and colors of a pinhole camera, zero at pixels without a surface.
 
     Normals face the camera along the ray, so n_z can be positive at grazing angles off the axis.
     """
 
-    depth: Float32  # (h, w), z-depth in meters
-    normals: Float32  # (h, w, 3), unit normals in the camera frame
+    depth: Float32
+    """Depth (h, w) along the optical axis in meters."""
+    normals: Float32
+    """Unit normals (h, w, 3) in the camera frame."""
     _colors: Callable[[], UInt8]
 
     @cached_property
@@ -180,21 +186,29 @@ class Rendering:
 
 
 class SurfaceSamples(NamedTuple):
-    """Surface points seen at given pixels; entries are 0 where ``valid`` is false."""
+    """Surface points seen at given pixels, with zeros where ``valid`` is false."""
 
-    points: Float64  # (n, 3), points in the world frame, in meters
-    depth: Float64  # (n,), z-depth in meters
-    normals: Float64  # (n, 3), unit normals in the camera frame that face the camera
-    surface: Int64  # (n,), indices of the surfaces of the scene
-    valid: Bool  # (n,), True where the pixel shows a surface
+    points: Float64
+    """Surface points (n, 3) in the world frame in meters."""
+    depth: Float64
+    """Depths (n,) of the surface points along the optical axis in meters."""
+    normals: Float64
+    """Unit normals (n, 3) in the camera frame that face the camera."""
+    surface: Int64
+    """Indices (n,) of the surfaces of the scene on which the points lie."""
+    valid: Bool
+    """Validity (n,) of the samples, True where the pixel shows a surface."""
 
 
 class TrueCorrespondences(NamedTuple):
     """Exact positions in view b of surface points that are seen in view a."""
 
-    xy_b: Float64  # (n, 2), pixels in view b; 0 where view b does not see the point
-    points: Float64  # (n, 3), points in the world frame, in meters
-    visible: Bool  # (n,), True where view b sees the point without occlusion
+    xy_b: Float64
+    """Pixel positions (n, 2) of the points in view b, 0 where view b does not see the point."""
+    points: Float64
+    """Surface points (n, 3) in the world frame in meters."""
+    visible: Bool
+    """Visibility (n,) of the points, True where view b sees the point without occlusion."""
 
 
 @dataclass(frozen=True)
@@ -208,8 +222,8 @@ class AnalyticScene:
         """Intersect rays (n, 3) with all surfaces of the scene.
 
         Returns:
-            Parameters t (n,) of the nearest hits, inf without a hit; normals (n, 3); indices (n,)
-            of the surfaces.
+            Ray parameters t (n,) of the nearest intersections, inf without an intersection, normals
+            (n, 3), and indices (n,) of the intersected surfaces.
         """
         t = np.full(len(directions), np.inf)
         normals = np.zeros((len(directions), 3))
@@ -272,7 +286,7 @@ class AnalyticScene:
 def project(
     camera: PinholeCamera, cam_from_world: ArrayLike, points: Float64
 ) -> tuple[Float64, Float64]:
-    """Project world points (n, 3) to pixels (n, 2), 0 behind the camera, and depths (n,)."""
+    """Project world points (n, 3); return pixels (n, 2), 0 behind the camera, and depths (n,)."""
     pose = np.asarray(cam_from_world, np.float64)
     local = geometry.transform(pose[:3, :3], pose[:3, 3], points)
     return np.nan_to_num(geometry.project(camera, local), nan=0.0), local[:, 2]

@@ -1,8 +1,8 @@
-"""Synthetic mapping problem of two similar rooms and a corridor, which mislead all matchers.
+"""Synthetic mapping problem of two similar rooms, whose views match each other wrongly.
 
-The rooms are next to each other with the same walls, door and furniture, except for one or two
-pieces of furniture. Each view of one room also matches views of the other room. Only the corridor
-and the differing furniture resolve the ambiguity.
+The two rooms are next to each other with the same walls, door and furniture, except for one or two
+pieces of furniture. Each view of one room also matches views of the other room. Only views of the
+corridor and of the differing furniture tell the two rooms apart.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ CAMERA = PinholeCamera(640, 480, 400.0, 400.0, 320.0, 240.0)
 MIN_MATCHES = 15
 """Smallest number of verified matches of an image pair [COLMAP min_num_inliers]."""
 MIN_SIGHT = 0.3
-"""Smallest free distance in meters in front of a camera; excludes cameras inside of furniture."""
+"""Smallest free distance in meters in front of a camera, which excludes cameras inside of
+furniture."""
 
 
 class SymmetricProblem(NamedTuple):
@@ -47,9 +48,9 @@ class SymmetricProblem(NamedTuple):
     poses: list[Float64]
     """True pose ``cam_from_world`` (3, 4) of each view."""
     room: list[int]
-    """Room of each view: 0, 1, or -1 in the corridor."""
+    """Index of the room of each view, which is 0, 1, or -1 in the corridor."""
     false: list[bool]
-    """True for each pair whose matches join a point with its copy in the other room."""
+    """True for each image pair whose matches connect points with their copies in the other room."""
 
 
 def make_twin_rooms() -> AnalyticScene:
@@ -81,7 +82,7 @@ def make_twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], l
     """Create camera poses in both rooms and along the corridor.
 
     The camera positions vary with the seed. Cameras that would be inside of furniture are moved in
-    front of it.
+    front of the furniture.
 
     Args:
         seed: Seed of the camera positions.
@@ -122,7 +123,7 @@ def make_twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], l
 
 
 def _move_to_free_space(scene: AnalyticScene, eye: Float64, target: Float64) -> Float64:
-    """Move a camera towards its target until the free distance exceeds MIN_SIGHT."""
+    """Move a camera towards its target until the free distance in front exceeds MIN_SIGHT."""
     pixels = pixel_centers(*CAMERA.size)[::80, ::80].reshape(-1, 2)
     step = 0.1 * (target - eye) / np.linalg.norm(target - eye)
     while True:
@@ -145,17 +146,17 @@ def make_twin_room_problem(
     """Create a synthetic mapping problem of two similar rooms.
 
     A keypoint matches the same point in another view as well as the copy of the point in the other
-    room. Geometric verification keeps the more frequent alternative: the same points, or their
-    copies.
+    room. Geometric verification keeps either the matches of equal points or those of copies,
+    whichever are more frequent.
 
     Args:
         seed: Seed of poses, points and errors.
-        errors: Model of the errors of the depth priors, which declare the std of the errors. With
-            None the depth is exact and declares a relative std of 1 %.
+        errors: Model of the errors of the depth priors, which report the std of these errors. If
+            None, the depth priors are exact and report a relative std of 1 %.
         per_room: Number of views per room.
-        points_per_view: Number of surface points that each view adds.
-        map_width: Width of the prior maps in pixels.
-        keypoint_noise_px: Std of the keypoints in pixels.
+        points_per_view: Number of surface points that are sampled in each view.
+        map_width: Width of the depth and normal prior maps in pixels.
+        keypoint_noise_px: Std of the errors of keypoint positions in pixels.
 
     Returns:
         The mapping problem with its true solution.
@@ -177,7 +178,7 @@ def make_twin_room_problem(
         images.append(image)
     pairs, false = [], []
     for a, b in combinations(range(len(poses)), 2):
-        # Points seen in b may be those seen in a (shift 0) or their copies, in either direction.
+        # View b may see the points of view a (shift 0) or their copies, in either direction.
         found = [
             (len(matches), abs(shift), shift, matches)
             for shift in (0, 1, -1)
@@ -231,7 +232,7 @@ def _find_visible(scene: AnalyticScene, pose: Float64, points: Float64) -> tuple
 
 
 def _matches(numbers_a: Int64, numbers_b: Int64, shift: int) -> Int64:
-    """Return matches (m, 2) of equal points, or of points and their copies ``shift`` rooms on."""
+    """Return matches (m, 2) of equal points, or of points with their copies in another room."""
     code_a = numbers_a[:, 0] * 8 + numbers_a[:, 1]
     code_b = numbers_b[:, 0] * 8 + numbers_b[:, 1] - shift
     _, rows_a, rows_b = np.intersect1d(code_a, code_b, return_indices=True)
