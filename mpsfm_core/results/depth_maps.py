@@ -22,10 +22,10 @@ FORMAT = 1
 def write_depth_maps(folder: Path, reconstruction: Reconstruction) -> None:
     """Write ``folder/NAME.npz`` for each registered image (NAME includes its extension).
 
-    The arrays are ``depth`` (h, w) float32, the z-depth in units of the model, ``variance`` (h, w)
-    float32 of the depth, the mask ``valid`` (h, w) bool, ``camera`` (4,) float64, the fx, fy, cx,
-    cy of the undistorted depth grid in COLMAP pixels, the pose ``cam_from_world`` (3, 4) float64,
-    and ``format_version``.
+    ``depth`` (h, w) float32 is the z-depth in units of the COLMAP model, and ``variance`` (h, w)
+    float32 the depth variance in squared units. ``valid`` (h, w) bool is the mask of valid depth.
+    ``camera`` (4,) float64 is fx, fy, cx, cy of the undistorted depth grid in COLMAP pixels.
+    ``cam_from_world`` (3, 4) float64 is the camera pose.
     """
 
     def write(image: RegisteredImage) -> None:

@@ -1,4 +1,4 @@
-"""Georeferencing: alignment of a reconstruction with GPS positions of its images."""
+"""Georeference a reconstruction by alignment with the GPS positions of its images."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from mpsfm_core.mapping.scene.reconstruction import (
 from mpsfm_core.results.gravity import estimate_gravity, rotation_to_z
 
 _MIN_POSITIONS = 4
-"""Minimum number of positions: three determine a similarity, a fourth validates it."""
+"""Minimum number of GPS positions; three determine a similarity, a fourth validates it."""
 _MIN_SPREAD_STDS = 5.0
-"""Minimum spread of the positions in standard deviations of their noise."""
+"""Minimum spread of the GPS positions in standard deviations of GPS noise."""
 _MAX_TILT_STD_DEG = 2.0
-"""Maximum std of gravity from altitudes; above it gravity comes from camera orientations."""
+"""Maximum std in degrees of gravity from GPS altitudes, before camera orientations are used."""
 _ALTITUDE_STD_RATIO = 2.0
-"""Vertical over horizontal GPS noise [GPS.gov: 1.5 to 3]."""
+"""Ratio of vertical to horizontal GPS noise [GPS.gov, 1.5 to 3]."""
 _MAX_ERROR_STDS = 3.0
-"""Maximum error of an inlier in standard deviations."""
+"""Maximum error of an inlier GPS position in standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -37,20 +37,20 @@ class Georeference:
     """Alignment of a reconstruction with GPS positions."""
 
     origin: GpsPosition
-    """Origin of east, north, up."""
+    """Origin of the east-north-up world frame."""
     images: int
-    """Number of registered images with a position."""
+    """Number of registered images with a GPS position."""
     inliers: int
-    """Number of positions that agree with the alignment."""
+    """Number of GPS positions that are inliers of the alignment."""
     rms_m: float
     """Root mean square horizontal error of the inliers in meters."""
     metres_per_unit: float
-    """Scale that was applied."""
+    """Scale factor that was applied to the reconstruction."""
     up: str
-    """Source of the gravity direction."""
+    """Source of the gravity direction, for users."""
 
     def describe(self) -> dict[str, object]:
-        """Return plain data for the summary."""
+        """Return the georeference as plain data for ``summary.json``."""
         return asdict(self)
 
 
@@ -59,17 +59,17 @@ def georeference(
 ) -> tuple[Reconstruction, Georeference] | Reason:
     """Align a reconstruction with the GPS positions of its images.
 
-    Estimates a similarity with RANSAC. If altitudes do not determine gravity, gravity comes from
-    the camera orientations, and the positions determine heading, scale and translation.
+    The similarity is estimated with RANSAC. If GPS altitudes do not determine gravity, camera
+    orientations determine gravity, and GPS positions determine heading, scale and translation.
 
     Args:
-        reconstruction: reconstruction in any frame.
+        reconstruction: reconstruction in an arbitrary world frame and scale.
         positions: GPS positions by image name.
 
     Returns:
-        The reconstruction in meters east, north, up of the median position, and the alignment. A
-        reason instead if there are too few positions, they spread too little for their noise, or
-        most of them disagree.
+        The reconstruction in meters east, north, up of the median GPS position, and the alignment.
+        Instead, a reason if the GPS positions are too few, spread too little for their noise, or
+        mostly disagree.
     """
     by_name = {image.name: image for image in reconstruction.confirmed_images}
     located = [name for name in by_name if name in positions]
@@ -122,7 +122,7 @@ def _median_position(positions: list[GpsPosition]) -> GpsPosition:
 
 
 def _tilt_deg(enu: Float64, std_m: float) -> float:
-    """Return the std in degrees of gravity from altitudes, about the axis of least spread."""
+    """Return the std in degrees of gravity from GPS altitudes, about the axis of least spread."""
     with_altitude = enu[np.isfinite(enu).all(axis=1)]
     if len(with_altitude) < _MIN_POSITIONS:
         return 90.0
@@ -132,7 +132,7 @@ def _tilt_deg(enu: Float64, std_m: float) -> float:
 
 
 def _fit_similarity(centers: Float64, enu: Float64, std_m: float) -> pycolmap.Sim3d | None:
-    """Estimate ``enu_from_world`` from all coordinates with RANSAC."""
+    """Estimate ``enu_from_world`` from all GPS coordinates with RANSAC."""
     with_altitude = np.isfinite(enu).all(axis=1)
     options = pycolmap.RANSACOptions(
         max_error=_MAX_ERROR_STDS * _ALTITUDE_STD_RATIO * std_m, random_seed=0
@@ -144,7 +144,7 @@ def _fit_similarity(centers: Float64, enu: Float64, std_m: float) -> pycolmap.Si
 def _fit_level_similarity(
     poses: list[Pose], centers: Float64, enu: Float64, std_m: float
 ) -> pycolmap.Sim3d | None:
-    """Estimate ``enu_from_world`` with gravity from the cameras and the rest from positions."""
+    """Estimate ``enu_from_world`` with gravity from camera orientations and the rest from GPS."""
     rotations = np.stack([rotation for rotation, _ in poses])
     gravity = estimate_gravity(rotations, np.zeros((0, 3)))
     level = rotation_to_z(gravity.up, rotations[0, 0])

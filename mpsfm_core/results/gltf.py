@@ -1,4 +1,4 @@
-"""Writer of binary glTF 2.0 files (y up, meters)."""
+"""Write binary glTF 2.0 files (y up, units in meters)."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Float64, Int64, UInt8
 
 POINTS, LINES, TRIANGLES = 0, 1, 4
-"""Modes of glTF primitives."""
+"""Topology codes (``mode``) of glTF primitives."""
 Y_UP_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 FLIP = np.diag([1.0, -1.0, -1.0])
-"""Converts camera axes from OpenCV to glTF; also for a world without known gravity."""
+"""Matrix between OpenCV axes (y down, z forward) and glTF axes (y up, z backward)."""
 _FLOAT, _BYTE, _UINT = 5126, 5121, 5125
 _LISTS = ("nodes", "meshes", "cameras", "accessors", "bufferViews")
 
 
 class GltfScene:
-    """Scene to which nodes, meshes and cameras are added by number."""
+    """Builder of a glTF scene, whose nodes, meshes and cameras are identified by number."""
 
     def __init__(self) -> None:
         self._data = bytearray()
@@ -33,7 +33,7 @@ class GltfScene:
         }
 
     def add(self, node: dict[str, Any], root: bool = True) -> int:
-        """Add a node to the scene, or a child node if ``root`` is False; return its number."""
+        """Add a node, as a root of the scene unless ``root`` is False; return the node number."""
         number = len(self._json["nodes"])
         self._json["nodes"].append(node)
         if root:
@@ -48,14 +48,14 @@ class GltfScene:
         colors: UInt8 | None,
         triangles: Int64 | None = None,
     ) -> int:
-        """Add a mesh; return its number.
+        """Add a mesh to the scene; return the mesh number.
 
         Args:
             name: name of the mesh.
-            mode: :data:`POINTS`, :data:`LINES` or :data:`TRIANGLES`.
-            points: (n, 3) vertices; two per line.
-            colors: (n, 3) RGB, or None.
-            triangles: (m, 3) rows of the points.
+            mode: primitive type :data:`POINTS`, :data:`LINES` or :data:`TRIANGLES`.
+            points: (n, 3) vertices; a line has two vertices.
+            colors: (n, 3) RGB colors of the vertices, or None.
+            triangles: (m, 3) vertex indices of the triangles.
         """
         positions = points.astype("<f4")
         bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
@@ -73,7 +73,7 @@ class GltfScene:
         return len(self._json["meshes"]) - 1
 
     def _unlit_material(self) -> int:
-        """Return the unlit, double-sided material; add it on first use."""
+        """Return the number of the unlit, double-sided material; add the material once."""
         if not self._json["materials"]:
             unlit = "KHR_materials_unlit"
             self._json["extensionsUsed"].append(unlit)
@@ -81,7 +81,7 @@ class GltfScene:
         return 0
 
     def camera(self, name: str, half: Float64) -> int:
-        """Add a camera with half width and half height ``half`` at z = -1; return its number."""
+        """Add a camera with half image size ``half`` at z = -1; return the camera number."""
         described = {
             "aspectRatio": float(half[0] / half[1]),
             "yfov": float(2 * np.arctan(half[1])),
@@ -92,7 +92,7 @@ class GltfScene:
         return len(self._json["cameras"]) - 1
 
     def encode(self) -> bytes:
-        """Return the content of the file."""
+        """Return the bytes of the binary glTF file."""
         self._json["buffers"] = [{"byteLength": len(self._data)}]
         parts = {name: value for name, value in self._json.items() if value != []}
         text = json.dumps(parts, separators=(",", ":")).encode("utf-8")

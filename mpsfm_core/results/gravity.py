@@ -1,4 +1,4 @@
-"""Estimation of the gravity direction from camera orientations and surface normals."""
+"""Estimate the gravity direction from camera orientations and surface normals."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from mpsfm_core.data import Float64
 from mpsfm_core.geometry import angle_between_deg
 
 _ROLL_DEG = 10.0
-"""Std of the roll of hand-held cameras in degrees."""
+"""Standard deviation in degrees of the roll of hand-held cameras."""
 _PITCH_DEG = 30.0
-"""Std of the mean pitch of hand-held cameras in degrees. Candidates from surfaces may differ from
-the cameras by twice this angle."""
+"""Standard deviation in degrees of the mean pitch of hand-held cameras. Gravity candidates from
+surface normals may deviate from camera orientations by twice this angle."""
 _SURFACE_DEG = 5.0
-"""Angle in degrees within which a surface counts as horizontal or vertical."""
+"""Maximum deviation in degrees of a surface that counts as horizontal or vertical."""
 _CANDIDATES = 500
-"""Number of normals that are tested as gravity direction."""
+"""Number of surface normals that are tested as gravity direction."""
 _REFINEMENTS = 5
-"""Number of least-squares iterations."""
+"""Number of least-squares iterations that refine the gravity direction."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,12 +27,12 @@ class Gravity:
     """Gravity direction of a reconstruction."""
 
     up: Float64
-    """(3,) float64, unit vector away from the ground in world coordinates."""
+    """(3,) float64 unit vector opposite to gravity in world coordinates."""
     surfaces: float | None
-    """Share of normals that are parallel or perpendicular to ``up``, None without normals."""
+    """Share of surface normals parallel or perpendicular to ``up``, None without normals."""
 
     def __str__(self) -> str:
-        """Describe the source for users."""
+        """Describe the source of the gravity direction for users."""
         if self.surfaces is None:
             return "gravity from how the cameras are held"
         return (
@@ -41,15 +41,15 @@ class Gravity:
 
 
 def estimate_gravity(rotations: Float64, normals: Float64) -> Gravity:
-    """Estimate gravity: cameras are about level, surfaces are horizontal or vertical.
+    """Estimate gravity from nearly level cameras and horizontal or vertical surfaces.
 
-    Scores candidate directions by a Gaussian prior on roll and pitch and by the support of the
-    normals, then refines the best one by least squares. Without normals, images that all look
-    steeply down or up give a wrong direction.
+    Candidate directions are scored by a Gaussian prior on camera roll and pitch and by supporting
+    surface normals. The best candidate is refined by least squares. Without surface normals, the
+    direction is wrong if all cameras look steeply down or up.
 
     Args:
-        rotations: (n, 3, 3) ``cam_from_world``.
-        normals: (m, 3) unit normals in the world, may be empty.
+        rotations: (n, 3, 3) camera rotations ``cam_from_world``.
+        normals: (m, 3) unit surface normals in the world frame, may be empty.
     """
     level = _estimate_up_from_cameras(rotations)
     if not len(normals):
@@ -73,7 +73,7 @@ def estimate_gravity(rotations: Float64, normals: Float64) -> Gravity:
 
 
 def rotation_to_z(up: Float64, right: Float64) -> Float64:
-    """Return the rotation (3, 3) of ``up`` to +z and of the level part of ``right`` to +x."""
+    """Return the rotation (3, 3) that maps ``up`` to +z and the level part of ``right`` to +x."""
     x = right - (right @ up) * up
     if np.linalg.norm(x) < 1e-6:
         x = np.eye(3)[np.argmin(np.abs(up))]
@@ -83,7 +83,7 @@ def rotation_to_z(up: Float64, right: Float64) -> Float64:
 
 
 def _estimate_up_from_cameras(rotations: Float64) -> Float64:
-    """Return the direction most perpendicular to all right axes; the mean up axis regularizes."""
+    """Return the direction most perpendicular to the right axes of all cameras, regularized."""
     rights, ups = rotations[:, 0], -rotations[:, 1]
     mean = ups.mean(axis=0)
     mean = mean / max(float(np.linalg.norm(mean)), 1e-12)
@@ -94,7 +94,7 @@ def _estimate_up_from_cameras(rotations: Float64) -> Float64:
 
 
 def _refine_up(up: Float64, normals: Float64) -> Float64:
-    """Refine ``up`` by least squares over normals of horizontal and vertical surfaces."""
+    """Refine the up direction by least squares over normals of level and vertical surfaces."""
     cosines = np.abs(normals @ up)
     along, across = _weigh_horizontal(cosines), _weigh_vertical(cosines)
     scatter = (normals * (across - along)[:, None]).T @ normals
@@ -104,14 +104,14 @@ def _refine_up(up: Float64, normals: Float64) -> Float64:
 
 
 def _weigh_horizontal(cosines: Float64) -> Float64:
-    """Return Gaussian weights of normals that are parallel to a direction."""
+    """Return Gaussian weights of surface normals that are parallel to a direction."""
     angle = np.degrees(np.arccos(np.clip(cosines, 0, 1)))
     weight: Float64 = np.exp(-0.5 * (angle / _SURFACE_DEG) ** 2)
     return weight
 
 
 def _weigh_vertical(cosines: Float64) -> Float64:
-    """Return Gaussian weights of normals that are perpendicular to a direction."""
+    """Return Gaussian weights of surface normals that are perpendicular to a direction."""
     angle = np.degrees(np.arcsin(np.clip(cosines, 0, 1)))
     weight: Float64 = np.exp(-0.5 * (angle / _SURFACE_DEG) ** 2)
     return weight

@@ -1,4 +1,4 @@
-"""Files of a surface mesh."""
+"""Write the files of a surface mesh."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mpsfm_core.results.ply import write_ply
 
 
 def write_mesh(folder: Path, mesh: TriangleMesh, source: ExportSource) -> None:
-    """Write ``mesh.ply`` in the frame of the model and ``mesh.glb`` with y up."""
+    """Write ``mesh.ply`` in the world frame of the COLMAP model and ``mesh.glb`` with y up."""
     ply, glb = MESH
     write_ply(folder / ply, mesh.vertices, mesh.colors, triangles=mesh.triangles)
     turned = source if source.is_georeferenced else source.turned()

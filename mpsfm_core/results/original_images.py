@@ -1,4 +1,4 @@
-"""Access from the mapper's undistorted views to the original images, and export of views."""
+"""Map registered images to their original files, and export undistorted images."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from mpsfm_core.inputs.undistortion import is_pinhole
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 _PORTABLE = frozenset((".jpg", ".jpeg", ".png"))
-"""Extensions of formats that all programs read."""
+"""Extensions of image formats that all programs read."""
 _SIGNATURES = {
     ".jpg": b"\xff\xd8\xff",
     ".jpeg": b"\xff\xd8\xff",
     ".png": b"\x89PNG\r\n\x1a\n",
 }
-"""First bytes of these formats: a name may have the extension of another one."""
+"""First bytes of JPEG and PNG files, because file extensions can be wrong."""
 
 
 class OriginalImages:
-    """Original images of a mapping problem, by name."""
+    """Access to the original images of the images of a mapping problem."""
 
     def __init__(self, images: ImageSet, problem: MappingProblem) -> None:
         self.problem = problem
@@ -33,40 +33,41 @@ class OriginalImages:
         self._rows = {name: row for row, name in enumerate(images.names)}
 
     def source(self, image: RegisteredImage) -> SourceImage:
-        """Return the image file of a registered image."""
+        """Return the path of the original file of a registered image."""
         return self._images[self._rows[image.name]]
 
     def key(self, image: RegisteredImage) -> str:
-        """Return the cache key of the view of a registered image."""
+        """Return the hash of the undistorted view of a registered image."""
         return self._images.pixel_key(self._rows[image.name])
 
     def view(self, name: str) -> View:
-        """Return the undistorted view of an image."""
+        """Return the undistorted view of an image by name."""
         return self._images.view(self._rows[name])
 
     def keypoints(self, reconstruction: Reconstruction) -> list[Float64]:
-        """Return the keypoints (n, 2) of each registered image in pixels of its view."""
+        """Return keypoints (n, 2) of each registered image in pixels of the undistorted image."""
         return [self.problem.images[image.index].keypoints for image in reconstruction.images]
 
     def original_keypoints(self, reconstruction: Reconstruction) -> list[Float64]:
-        """Return the keypoints (n, 2) of each registered image in pixels of the original."""
+        """Return the keypoints (n, 2) of each registered image in pixels of the original image."""
         return [
             self.source(image).original_pixels(xy)
             for image, xy in zip(reconstruction.images, self.keypoints(reconstruction), strict=True)
         ]
 
     def original_camera(self, image: RegisteredImage) -> pycolmap.Camera:
-        """Return the camera of the upright original with the refined focal length."""
+        """Return the camera of the upright original image with the refined focal length."""
         return self.source(image).refined_camera(image.camera)
 
     def any_distorted(self, reconstruction: Reconstruction) -> bool:
-        """Return whether a registered image has lens distortion."""
+        """Return whether any registered image has lens distortion."""
         return any(not is_pinhole(self.source(image).camera) for image in reconstruction.images)
 
     def any_rotated(self, reconstruction: Reconstruction) -> bool:
-        """Return whether the stored pixels of a registered image are not upright.
+        """Return whether any registered image has an EXIF rotation.
 
-        The model belongs to upright images, and other programs often ignore EXIF orientation.
+        The COLMAP model belongs to upright images, and other programs often ignore EXIF
+        orientation.
         """
         return any(self.source(image).orientation != 1 for image in reconstruction.images)
 
@@ -76,14 +77,14 @@ class OriginalImages:
 
 
 def exported_image_name(name: str) -> str:
-    """Return the file name of an undistorted view: ``.jpg`` is appended to uncommon formats."""
+    """Return the file name of an undistorted image, with ``.jpg`` appended to uncommon formats."""
     return name if PurePosixPath(name).suffix.lower() in _PORTABLE else f"{name}.jpg"
 
 
 def export_view(images: ImageSet, index: int, path: Path) -> None:
-    """Write the upright, undistorted view of an image; the extension sets the format.
+    """Write the upright, undistorted image in the format of the file extension.
 
-    Copies the file if it is an upright and undistorted 8-bit RGB image of this format.
+    An upright, undistorted 8-bit RGB file of this format is copied without decoding.
     """
     image = images[index]
     path.parent.mkdir(parents=True, exist_ok=True)

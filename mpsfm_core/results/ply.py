@@ -36,11 +36,11 @@ def write_ply(
 
     Args:
         path: file to write.
-        points: (n, 3), written as float32.
-        colors: (n, 3) uint8 RGB.
+        points: (n, 3) vertex positions, written as float32.
+        colors: (n, 3) uint8 RGB colors of the vertices.
         normals: (n, 3), optional.
-        extra: further properties (n,) by name, float32 or uint8.
-        triangles: (m, 3) rows of the points, optional.
+        extra: further vertex properties (n,) by name, float32 or uint8.
+        triangles: (m, 3) vertex indices of the triangles of a mesh, optional.
     """
     columns: dict[str, NDArray[Any]] = dict(zip("xyz", points.T.astype("<f4"), strict=True))
     if normals is not None:
@@ -76,10 +76,10 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
     """Read the vertices of a text or binary PLY file.
 
     Returns:
-        Points (n, 3) float64 and RGB colors (n, 3) uint8, gray if the file has none.
+        Points (n, 3) float64 and RGB colors (n, 3) uint8, gray if the file has no colors.
 
     Raises:
-        InputError: the file is not PLY, is cut off, or has points that are not finite.
+        InputError: the file is not a PLY file, is cut off, or has points that are not finite.
     """
     try:
         data = path.read_bytes()
@@ -110,7 +110,7 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
 
 
 def _layout(path: Path, header: list[str], order: str) -> tuple[np.dtype[Any], int]:
-    """Parse the header: dtype of a vertex and number of vertices."""
+    """Parse the PLY header; return the dtype and the number of the vertices."""
     layout: list[tuple[str, str]] = []
     count: int | None = None
     for line in header:

@@ -25,14 +25,14 @@ from mpsfm_core.results.evidence import count_explained_matches, describe_eviden
 from mpsfm_core.support.format_versions import check_version
 
 FORMAT = 1
-"""Version of ``summary.json`` and of ``views/`` in the same folder."""
+"""Format version of ``summary.json`` and of the files in ``views/``."""
 
 
 def read_summary(path: Path) -> dict[str, Any]:
     """Read a ``summary.json``.
 
     Raises:
-        InputError: the file is missing, damaged, of a newer version or not a summary.
+        InputError: the file is missing, damaged, from a newer MP-SfM or not the summary of a run.
     """
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
@@ -51,7 +51,7 @@ def read_summary(path: Path) -> dict[str, Any]:
 def describe_images(
     images: ImageSet, extraction: Mapping[str, Any], mapping: MappingResult
 ) -> dict[str, Any]:
-    """Describe all images: registered or not, with the reason, and their statistics.
+    """Describe status and statistics of all images, with reasons for unregistered images.
 
     Args:
         images: images of the run.
@@ -91,7 +91,7 @@ def describe_images(
 
 
 def _focal_length(image: SourceImage, registered: RegisteredImage | None) -> dict[str, Any]:
-    """Describe the focal length of the upright original: initial, refined, std or why not."""
+    """Describe initial and refined focal length of an image, with std or the reason of no std."""
     described: dict[str, Any] = {
         "focal_length_from": image.focal_source,
         "focal_length_px": image.camera.mean_focal_length(),
@@ -111,9 +111,10 @@ def _focal_length(image: SourceImage, registered: RegisteredImage | None) -> dic
 def describe_pairs(
     extraction: Mapping[str, Any], mapping: MappingResult, problem: MappingProblem
 ) -> dict[str, Any]:
-    """Describe all matched pairs: matches, inliers, and why a pair was dropped or cannot start.
+    """Describe matches and inliers of all image pairs, and why pairs were dropped.
 
-    ``explained`` counts the inliers of a pair whose keypoints see one point of the first model.
+    The entry ``explained`` counts the inliers of a pair whose keypoints share a 3D point of the
+    first model. The entry ``cannot_start`` explains why a pair cannot initialize a component.
 
     Args:
         extraction: report of the extraction.
@@ -142,13 +143,14 @@ def describe_pairs(
 def describe_reconstructions(
     mapping: MappingResult, models: Sequence[pycolmap.Reconstruction], problem: MappingProblem
 ) -> list[dict[str, Any]]:
-    """Describe size and errors of each reconstruction: ``sparse``, then ``components/``.
+    """Describe size and errors of each reconstruction, the model in ``sparse`` first.
 
-    ``mean_reprojection_error_px`` is the mean over the points, in pixels of the original images.
+    The entry ``mean_reprojection_error_px`` is the mean over the 3D points in pixels of the
+    original images.
 
     Args:
         mapping: result of the mapper.
-        models: COLMAP model of each reconstruction.
+        models: COLMAP models of the reconstructions.
         problem: input of the mapper.
     """
     return [

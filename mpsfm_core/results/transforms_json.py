@@ -1,4 +1,4 @@
-"""``transforms.json`` of nerfstudio, written from a COLMAP model."""
+"""Write nerfstudio's ``transforms.json`` from a COLMAP model."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from mpsfm_core.inputs.nerfstudio import DISTORTION_KEYS, OPENGL_FROM_OPENCV
 
 
 def supports_camera(camera: pycolmap.Camera) -> bool:
-    """Return whether the format has this camera model; images of others must be undistorted."""
+    """Return whether ``transforms.json`` supports a camera model without undistortion."""
     return camera.model_name in DISTORTION_KEYS
 
 
 def write_transforms(path: Path, model: pycolmap.Reconstruction, files: Mapping[str, str]) -> None:
-    """Write poses and cameras of a model.
+    """Write poses and cameras of a COLMAP model as ``transforms.json``.
 
     Args:
-        path: file to write.
-        model: all its images must have a pose.
-        files: image name -> path of the image file, relative to the folder of ``path``.
+        path: path of the ``transforms.json`` to write.
+        model: COLMAP model whose images all have a pose.
+        files: paths of the image files by image name, relative to the folder of ``path``.
     """
     frames = []
     for image in sorted(model.images.values(), key=lambda image: str(image.name)):

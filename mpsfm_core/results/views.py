@@ -1,6 +1,6 @@
-"""Files of the mapper's input for the report: small views, priors and verified matches.
+"""Write the mapper's input for the report as small images, priors and verified matches.
 
-They are also written for a failed run, to show the cause.
+A failed run also writes these files, so that the report shows the cause.
 """
 
 from __future__ import annotations
@@ -17,32 +17,28 @@ from mpsfm_core.support.npz import write_npz
 from mpsfm_core.support.threads import parallel_map
 
 PICTURE_SIDE = 960
-"""Longer side of the images in pixels."""
+"""Longer side in pixels of the images in ``views/``."""
 PICTURE_QUALITY = 80
 """WebP quality."""
 MATCHES_A_PAIR = 100
-"""Maximum number of written matches of a pair."""
+"""Maximum number of written matches per image pair."""
 MATCHES = "matches.npz"
-"""File of the matches in the folder."""
+"""File name of the matches in ``views/``."""
 
 
 def write_views(folder: Path, problem: MappingProblem, view_of: Callable[[str], View]) -> None:
     """Write ``NAME.webp`` and ``NAME.npz`` for every image, and ``matches.npz``.
 
-    ``NAME.webp`` is the undistorted view, reduced. Arrays of ``NAME.npz``:
+    The file ``NAME.webp`` is the downscaled undistorted image. In ``NAME.npz``, ``depth`` (h, w)
+    float32 is the depth prior in units of the depth provider. ``relative_std`` (h, w) float16 is
+    the standard deviation of the depth prior over the depth. ``valid`` (h, w) bool is the mask of
+    valid depth. ``normals`` (h, w, 3) float16 are unit normals in the camera frame. ``camera`` (6,)
+    float64 is the width, height, fx, fy, cx, cy of the full undistorted image.
 
-    * ``depth`` (h, w) float32, prior in its own units
-    * ``relative_std`` (h, w) float16, std of the depth over the depth
-    * ``normals`` (h, w, 3) float16, unit, camera frame
-    * ``valid`` (h, w) bool, of the depth
-    * ``camera`` (6,) float64, width, height, fx, fy, cx, cy of the view
-
-    Arrays of ``matches.npz``:
-
-    * ``names`` (n,) of all images
-    * ``pairs`` (p, 2) int64, rows of ``names``
-    * ``starts`` (p + 1,) int64, first row of each pair in ``points_a`` and ``points_b``
-    * ``points_a``, ``points_b`` (m, 2) float32, pixels of the views
+    In ``matches.npz``, ``names`` (n,) are the image names, and ``pairs`` (p, 2) int64 are image
+    pairs as rows of ``names``. ``points_a`` and ``points_b`` (m, 2) float32 are the matched
+    keypoints of all pairs in pixels of the undistorted images. ``starts`` (p + 1,) int64 is the
+    first row of each pair in ``points_a`` and ``points_b``.
     """
 
     def write(image: MappingImage) -> None:
@@ -61,7 +57,7 @@ def write_views(folder: Path, problem: MappingProblem, view_of: Callable[[str], 
 
 
 def _relative_std(image: MappingImage) -> NDArray[np.float16]:
-    assert image.depth.variance is not None  # MappingImage requires a variance
+    assert image.depth.variance is not None  # a MappingImage requires a depth variance
     depth = np.where(image.depth.valid, image.depth.depth, 1)
     std = np.sqrt(np.where(image.depth.valid, image.depth.variance, 0)) / depth
     return np.asarray(np.minimum(std, np.finfo(np.float16).max), np.float16)

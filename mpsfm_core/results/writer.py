@@ -1,4 +1,4 @@
-"""Writer of the result folder; replaces earlier results atomically.
+"""Write the result folder and replace earlier results atomically.
 
 ::
 
@@ -64,15 +64,15 @@ class ComponentResult:
     """Reconstruction of one component with its COLMAP model."""
 
     reconstruction: Reconstruction
-    """Poses, points and refined depth maps."""
+    """Poses, 3D points and refined depth maps of the component."""
     colors: UInt8
-    """(p, 3) uint8 RGB of each point."""
+    """(p, 3) uint8 RGB colors of the 3D points."""
     model: pycolmap.Reconstruction
-    """COLMAP model of the original images."""
+    """COLMAP model of the component for the original images."""
 
     @classmethod
     def of(cls, reconstruction: Reconstruction, photos: OriginalImages) -> ComponentResult:
-        """Color the points and build the COLMAP model."""
+        """Color the 3D points and build the COLMAP model of the original images."""
         colors = average_point_colors(reconstruction, photos.keypoints(reconstruction), photos.view)
         cameras = [photos.original_camera(image) for image in reconstruction.images]
         keypoints = photos.original_keypoints(reconstruction)
@@ -80,7 +80,7 @@ class ComponentResult:
         return cls(reconstruction, colors, model)
 
     def undistorted(self, photos: OriginalImages) -> pycolmap.Reconstruction:
-        """Build the COLMAP model of the undistorted views."""
+        """Build the COLMAP model of the undistorted images."""
         cameras = [colmap_from_pinhole(image.camera) for image in self.reconstruction.images]
         keypoints = photos.keypoints(self.reconstruction)
         images = (replace(i, name=exported_image_name(i.name)) for i in self.reconstruction.images)
@@ -100,11 +100,12 @@ def write_results(
 
     Args:
         output: result folder.
-        components: at least one, largest first.
+        components: reconstructed components, at least one, largest first.
         photos: original images.
-        options: files to write.
-        summarize: returns the plain data of the summary; called after all else is written.
-        seed: seed of the choice of pixels for ``dense.ply``.
+        options: selection of the files to write.
+        summarize: function that returns the content of ``summary.json``, called after all other
+            files are written.
+        seed: random seed of the selection of pixels for ``dense.ply``.
 
     Raises:
         OSError: as :func:`mpsfm_core.support.files.replace_entries`.
@@ -132,7 +133,7 @@ def write_results(
 
 
 def _write_text_model(folder: Path, model: pycolmap.Reconstruction) -> None:
-    """Write the text model, or warn if a name has a space: COLMAP would cut it off there."""
+    """Write the COLMAP text model, or warn if an image name has a space, which COLMAP cuts off."""
     spaced = [name for i in model.images.values() if len((name := str(i.name)).split()) != 1]
     if spaced:
         text = "sparse_text is not written: COLMAP's text format allows no spaces in names (%s)"
@@ -148,7 +149,7 @@ def _write_dense(
     options: ResultOptions,
     seed: int,
 ) -> None:
-    """Write the fused point cloud and the depth maps if enabled."""
+    """Write the point cloud of the fused depth maps, and the depth maps if enabled."""
     if options.dense_cloud:
         cloud = fuse_depth_maps(component.reconstruction, photos.view, options, seed)
         write_cloud(folder / DENSE, cloud)
@@ -157,14 +158,14 @@ def _write_dense(
 
 
 def update_summary(output: Path, summary: Mapping[str, Any]) -> None:
-    """Replace the summary after the results were written; raise :class:`OSError` on failure."""
+    """Replace ``summary.json`` of written results; raise :class:`OSError` if writing fails."""
     write_file(output / SUMMARY, _json_text(summary))
 
 
 def write_failure(
     output: Path, photos: OriginalImages, options: ResultOptions, summary: Mapping[str, Any]
 ) -> None:
-    """Write summary and views of a failed run; keep earlier models."""
+    """Write ``summary.json`` and ``views/`` of a failed run; keep earlier models in the folder."""
     with replace_entries(output, (VIEWS, REPORT, SUMMARY)) as folder:
         if options.report:
             write_views(folder / VIEWS, photos.problem, photos.view)
@@ -180,7 +181,7 @@ def _write_undistorted(folder: Path, component: ComponentResult, photos: Origina
 def _write_nerfstudio(
     path: Path, output: Path, component: ComponentResult, photos: OriginalImages
 ) -> None:
-    """Write ``transforms.json`` of the originals, or of views if the format needs it."""
+    """Write ``transforms.json`` of the original or, for some camera models, undistorted images."""
     images = component.reconstruction.images
     has_cameras = all(supports_camera(camera) for camera in component.model.cameras.values())
     if has_cameras and not photos.any_rotated(component.reconstruction):

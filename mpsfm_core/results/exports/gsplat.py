@@ -47,11 +47,11 @@ def write(source: ExportSource, folder: Path) -> None:
 def write_maps(source: ExportSource, folder: Path) -> None:
     """Write ``folder/NAME.npz`` for each image that has refined depth.
 
-    The arrays are z-depth ``depth`` and its standard deviation ``depth_std`` (h, w) float32 in
-    world units, unit normals ``normals`` (h, w, 3) float32 in the camera frame (x right, y down, z
-    forward), their angular standard deviation ``normals_std`` (h, w) float32 in radians along each
-    tangent, the masks ``depth_valid`` and ``normals_valid`` (h, w) bool, and ``camera`` (4,)
-    float64, the fx, fy, cx, cy of this grid over the undistorted image.
+    ``depth`` and ``depth_std`` (h, w) float32 are the z-depth and its standard deviation in world
+    units. ``normals`` (h, w, 3) float32 are unit normals in the camera frame (x right, y down, z
+    forward). ``normals_std`` (h, w) float32 is the standard deviation of normals in radians along
+    each tangent. ``depth_valid`` and ``normals_valid`` (h, w) bool are masks. ``camera`` (4,)
+    float64 is fx, fy, cx, cy of the depth grid over the undistorted image.
     """
     for name in source.names:
         maps = source.maps(name)
