@@ -23,8 +23,7 @@ from mpsfm_core.providers.weights import WeightStore, exports_folder, file_sha25
 from mpsfm_core.support.files import write_file
 
 RANDOM = "random"
-"""Checkpoint name that selects seeded random weights, which tests an export without a download. An
-ONNX file with random weights is not listed in the folder of exports."""
+"""Checkpoint name that selects seeded random weights, which tests an export without a download."""
 
 TOLERANCE = 1e-3
 """Largest accepted relative difference between outputs of the ONNX file and of the original
