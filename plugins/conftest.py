@@ -17,7 +17,7 @@ _DEFAULT = Path(__file__).resolve().parents[2] / "shared"
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Return the folder of real scenes and models: ``$MPSFM_SHARED`` or ``../shared``."""
+    """Return the folder of real scenes and models, ``$MPSFM_SHARED`` or ``../shared``."""
     folder = Path(os.environ.get("MPSFM_SHARED", _DEFAULT))
     if not folder.is_dir():
         pytest.skip("no shared scenes and models here (set MPSFM_SHARED)")

@@ -28,7 +28,7 @@ WITHOUT_THEIR_DEPENDENCIES = {"depth_anything_3", "vismatch"}
 """
 FOR_TESTS_ONLY = ("contract.py", "stand_in.py")
 BESIDE_THE_AUTHORS_CODE = ("export.py", "export_moge.py", "export_unidepth.py")
-"""Export scripts, which import the authors' code and its packages."""
+"""Model export scripts, which import the authors' code and its packages."""
 HEAVY = {"viser", "rerun", "torch", "transformers", "onnxruntime", "kornia", "cv2", "scipy", "onnx"}
 
 each_plugin = pytest.mark.parametrize("folder", PLUGINS, ids=lambda folder: folder.name)

@@ -40,8 +40,8 @@ def test_augmented_labels_are_those_of_the_augmented_camera(seed: int) -> None:
     batch = augmented([slanted_plane()] * 4, (256, 192), rng)
     focal = np.exp(batch.log_focal.numpy()[:, :, None, None]) * np.hypot(256, 192)
     depth = np.exp(batch.log_depth.numpy()) * focal / CANONICAL_FOCAL
-    # A ray per block of 32 input pixels is a ray per block of 16 label pixels. Ray slopes are
-    # linear between block centers.
+    # Label maps have half the size of the input, so each ray of a block of 32 input pixels belongs
+    # to 16 label pixels. Ray slopes are linear between block centers.
     rays = batch.rays.numpy()
     step = (rays[:, :, 1:, 1:] - rays[:, :, :-1, :-1])[:, :, :1, :1] / 16
     at = np.arange(7.5, 120, 16)
@@ -109,7 +109,7 @@ def test_training_runs_from_rendering_to_onnx(tmp_path: Path) -> None:
         if value.is_floating_point():
             torch.testing.assert_close(value, (stages[0][name] + stages[1][name]) / 2)
     differences = export(tmp_path / "mean.pt", tmp_path / "network.onnx")
-    assert max(differences.values()) < 0.03  # float16 weights of a hardly trained network
+    assert max(differences.values()) < 0.03  # float16 rounding of a hardly trained network
 
 
 def test_views_of_a_panorama_have_the_scale_of_its_tripod() -> None:
@@ -157,7 +157,7 @@ def test_views_of_a_panorama_have_the_scale_of_its_tripod() -> None:
 
 
 def test_triangulated_points_are_the_depth_of_a_photo() -> None:
-    """Check that 3D points are drawn as 3 x 3 pixels, the nearest in front, others unknown."""
+    """Check that 3D points become 3 x 3 pixels of depth, and that other pixels are unknown."""
     from training.make_data import _sparse
     from training.samples import HEIGHT, SURFACE, UNKNOWN, WIDTH
 

@@ -59,7 +59,7 @@ def triangulated(data: Data, images: Path, model: Path, name: str) -> None:
 
 @app.command("views")
 def views(data: Data, panoramas: Path, teacher: Path) -> None:
-    """Cut perspective images from panoramas, scaled by the known height of the tripod."""
+    """Cut perspective images from panoramas, with depth scaled by the known tripod height."""
     from training.make_data import make_views
 
     make_views(data, panoramas, teacher)
@@ -113,7 +113,7 @@ def export(
 def unpack(
     data: Data, output: Path, shards: list[str], most: Annotated[int, typer.Option()] = 40
 ) -> None:
-    """Convert the samples of the named shards to a scene folder for ``mpsfm calibrate``."""
+    """Convert training samples of the named shards to a scene folder for ``mpsfm calibrate``."""
     from training.samples import find_shards
     from training.unpack import unpack as run_unpack
 

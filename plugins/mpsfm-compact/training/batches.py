@@ -1,7 +1,7 @@
 """Batches of augmented training samples.
 
-Labels and intrinsics follow the augmentation of the image. Crops move the principal point, zooms
-change the focal length, a roll rotates the normals, and mirroring flips them.
+The augmentation of an image also transforms its labels and intrinsics. Crops move the principal
+point, zooms change the focal length, a roll rotates the normals, and mirroring flips them.
 """
 
 from __future__ import annotations
@@ -23,9 +23,10 @@ from training.network import CANONICAL_FOCAL
 from training.samples import HEIGHT, ROUGH, SURFACE, WIDTH, Shard
 
 _SIZES = ((256, 192), (256, 192), (256, 192), (192, 256), (224, 224))
-"""Width and height of the network input, drawn per batch. Every size has about 49 000 pixels."""
+"""Possible widths and heights of the network input, one drawn per batch. Each size has 0.05
+megapixels."""
 _ZOOM = 1.6
-"""Maximum zoom of the augmentation. Small zooms are more frequent, because inference uses none.
+"""Maximum zoom of the augmentation. Small zooms are more frequent, because inference does not zoom.
 """
 _ROLL_DEG = 6.0
 
@@ -38,8 +39,9 @@ class Batch:
     z and y / z at the centers of pixel blocks. ``log_depth`` (n, 1, h / 2, w / 2) is the log of
     depth at the canonical focal length. ``known`` (n, 1, h / 2, w / 2) is True where depth is
     known. ``normals`` (n, 3, h / 2, w / 2) are in the camera frame, 0 if unknown. ``kind`` (n, 1, h
-    / 2, w / 2) has the values of ``Sample.kind``. ``log_focal`` (n, 1) is the log of the focal
-    length relative to the image diagonal. ``metric`` (n,) is True if depth has metric scale.
+    / 2, w / 2) is UNKNOWN, SURFACE, EMPTY or ROUGH per pixel. ``log_focal`` (n, 1) is the log of
+    the focal length relative to the image diagonal. ``metric`` (n,) is True if depth has metric
+    scale.
     """
 
     image: Tensor
@@ -55,8 +57,9 @@ class Batch:
 class Sampler:
     """Random sampler of training samples from shards on disk.
 
-    Each source (rendered, real, panoramas, sky) has a fixed share. A scene within a source is drawn
-    with a probability proportional to the square root of its number of samples.
+    Each data source (rendered, real, panoramas, sky) has a fixed share of the samples. A scene
+    within a source is drawn with a probability proportional to the square root of its number of
+    samples.
     """
 
     def __init__(self, sources: Sequence[tuple[Sequence[Path], float]]) -> None:
@@ -95,7 +98,7 @@ def augmented(
     size: tuple[int, int],
     rng: np.random.Generator | None = None,
 ) -> Batch:
-    """Combine stored samples to a batch of ``size``, augmented if ``rng`` is given."""
+    """Combine stored samples to a batch of images of ``size``, augmented if ``rng`` is given."""
     width, height = size
     n = len(drawn)
     image = torch.from_numpy(np.stack([_developed(d["image"], rng) for d in drawn]))
@@ -118,8 +121,8 @@ def augmented(
         mirror = rng.choice([-1.0, 1.0], n)
         slack = rng.random((n, 2))
     corner = slack * (np.array([WIDTH, HEIGHT]) - np.array(size) / zoom[:, None])
-    # Output pixel = c_out + mirror * R(-roll) * zoom * (stored pixel - c), a rotation about the
-    # principal point c.
+    # The augmentation rotates and zooms about the principal point c by ``output_pixel = c_out +
+    # mirror * R(-roll) * zoom * (stored_pixel - c)``.
     center_out = (camera[:, 2:] - corner) * zoom[:, None]
     center_out[:, 0] = np.where(mirror < 0, width - center_out[:, 0], center_out[:, 0])
     cos, sin = np.cos(roll), np.sin(roll)
@@ -203,7 +206,7 @@ def _developed(image: np.ndarray, rng: np.random.Generator | None) -> np.ndarray
 
 
 def _spoiled(image: Tensor, rng: np.random.Generator) -> Tensor:
-    """Apply random defocus, motion blur, downsampling and noise to images."""
+    """Apply random defocus blur, motion blur, downsampling and noise to images."""
     out = []
     for picture in image:
         kind = rng.random()

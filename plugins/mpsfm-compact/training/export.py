@@ -74,7 +74,7 @@ def export(checkpoint: Path, output: Path) -> dict[str, float]:
     image, intrinsics = torch.rand(1, 3, 192, 256) * 255, torch.eye(3)[None] * 220
     intrinsics[0, :2, 2] = torch.tensor([128.0, 96.0])
     with warnings.catch_warnings():
-        # The TorchScript exporter needs no further package, but warns about dynamic shapes.
+        # torch's TorchScript-based ONNX exporter needs no further package, but warns about shapes.
         warnings.simplefilter("ignore")
         torch.onnx.export(
             module,
@@ -98,7 +98,7 @@ def export(checkpoint: Path, output: Path) -> dict[str, float]:
 
 
 def keep(checkpoint: Path, output: Path) -> None:
-    """Write only the averaged weights of a checkpoint, as float16, for ``train --start``."""
+    """Write the averaged weights of a checkpoint as float16, a start for another training run."""
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
     weights = averaged(state)
     torch.save({k: v.half() if v.is_floating_point() else v for k, v in weights.items()}, output)
@@ -108,7 +108,7 @@ def average(checkpoints: Sequence[Path], output: Path) -> None:
     """Write the mean weights of several checkpoints, with the largest of their sample counts.
 
     The mean of checkpoints of one run is often more accurate than each of them (Wortsman et al.,
-    Model soups, 2022). Verify the accuracy of the mean on validation data.
+    Model soups, 2022). Verify the accuracy of the mean weights on validation data.
     """
     states = [torch.load(path, map_location="cpu", weights_only=True) for path in checkpoints]
     stages = [averaged(state) for state in states]

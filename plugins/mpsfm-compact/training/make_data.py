@@ -32,9 +32,10 @@ _FIELD_DEG = 60.0
 
 
 def make_drawn(output: Path, shards: int, seed: int, workers: int, photos: Path | None) -> None:
-    """Render the missing ones among ``shards`` shards of :data:`PER_SHARD` samples each.
+    """Render all shards, up to number ``shards``, that do not exist in the folder ``output``.
 
-    ``photos`` is a folder of pictures that are used as textures.
+    Each shard has :data:`PER_SHARD` samples. ``photos`` is a folder of pictures that are used as
+    textures.
     """
     pictures = sorted(photos.rglob("*.jpg")) if photos else []
     wanted = [n for n in range(shards) if not (output / f"drawn-{seed}-{n:04d}").exists()]
@@ -104,13 +105,14 @@ def _sparse(
 def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str]) -> None:
     """Label the depth of indoor images with a depth network, one shard per folder.
 
-    ``photos`` is a folder of folders with JPEGs and ``licence.json`` (``hfov_deg`` by file name,
-    default 60). ``teacher`` is the ONNX file of the depth network, for example FastDepth. The
-    network has the input (1, 3, 224, 224), RGB in 0..1, and the output (1, 1, 224, 224). ``names``
-    are prefixes of the images or folders to use.
+    ``photos`` is a folder of folders with JPEGs and ``licence.json``, which has the horizontal
+    field of view ``hfov_deg`` by file name (default 60). ``teacher`` is the ONNX file of the depth
+    network, for example FastDepth. The network has the input (1, 3, 224, 224), RGB in 0..1, and the
+    output (1, 1, 224, 224). ``names`` are prefixes of the images or image folders to label.
 
     The depth network assumes the camera of NYU Depth v2, so its depth is multiplied by the ratio of
-    the focal lengths. All pixels are ROUGH, so depth edges of the labels do not enter the loss.
+    the focal lengths. All pixels have the kind ROUGH, which excludes the depth edges of these
+    labels from the loss.
     """
     teach = _teacher(teacher, 224)
 
@@ -128,8 +130,8 @@ def make_sky(output: Path, photos: Path, teacher: Path, names: Sequence[str]) ->
     """Label the sky in images with a segmentation network, and leave depth unknown.
 
     ``teacher`` is the ONNX file of the segmentation network. The network has the input (1, 3, 384,
-    384), RGB in 0..1, and its output (1, 1, 384, 384) is the sky probability. Folders are organized
-    as for :func:`make_labelled`.
+    384), RGB in 0..1, and its output (1, 1, 384, 384) is the sky probability. The image folders are
+    organized as for :func:`make_labelled`.
     """
     teach = _teacher(teacher, 384)
 
@@ -144,7 +146,7 @@ def make_sky(output: Path, photos: Path, teacher: Path, names: Sequence[str]) ->
 
 
 def make_views(output: Path, panoramas: Path, teacher: Path) -> None:
-    """Cut perspective images from panoramas, one shard each, scaled by the tripod height.
+    """Cut perspective images from panoramas, one shard each, with scale from the tripod height.
 
     ``panoramas`` is a folder of equirectangular JPEGs. ``teacher`` is an ONNX file of the compact
     network that predicts depth and normals.
@@ -223,7 +225,7 @@ def _frames(description: Path) -> Iterator[Sample]:
 def _fitted(
     image: NDArray[np.uint8], depth: NDArray[np.float32], camera: NDArray[np.float32], metric: bool
 ) -> Sample:
-    """Crop an image and its depth to the aspect ratio of samples, and resize them."""
+    """Crop an image and its depth to the aspect ratio of training samples, and resize both."""
     height, width = depth.shape
     scale = max(WIDTH / width, HEIGHT / height)
     w, h = min(width, round(WIDTH / scale)), min(height, round(HEIGHT / scale))

@@ -13,7 +13,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-# Rows: expansion, channels, repeats, stride, kernel of each EfficientNet-lite0 stage but the last.
+# Rows of expansion, channels, repeats, stride and kernel of EfficientNet-lite0's stages but the
+# last.
 _STAGES = (
     (1, 16, 1, 1, 3),
     (6, 24, 2, 2, 3),
@@ -63,12 +64,12 @@ class CompactNetwork(nn.Module):
         for skip, out in zip(reversed(_SKIPS), _DECODER, strict=True):
             self.decoder.append(_Up(channels, _STAGES[skip][1], out))
             channels = out
-        self.decoder[-1].mix = nn.Identity()  # at half the image size, one convolution suffices
+        self.decoder[-1].mix = nn.Identity()  # no mixing at half the image size
         self.head = nn.Sequential(_ConvNorm(channels, channels, 3), nn.Conv2d(channels, 7, 1))
         self.register_buffer("start", torch.tensor([0.9, -1.5, 0.0, 0.0, -1.0, -1.2, 2.0]))
 
     def forward(self, image: Tensor, rays: Tensor) -> dict[str, Tensor]:
-        """Predict the dictionary of maps that the class docstring lists."""
+        """Predict a dictionary of output maps and focal length, as in the class docstring."""
         x = self.stem((image - 127.0) / 128.0)  # normalization of EfficientNet-lite
         skips = []
         for number, stage in enumerate(self.stages):

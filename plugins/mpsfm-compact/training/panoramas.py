@@ -1,9 +1,9 @@
 """Perspective images cut from panoramas, with metric scale from the height of the tripod.
 
 A panorama is upright, and the height of its camera above the floor is known. A pixel below the
-horizon is floor if its predicted normal points up. The depth of a floor pixel is the camera height
-divided by the downward slope of its ray. The ratio of true to predicted floor depth scales the
-predicted depth of all other pixels.
+horizon is a floor pixel if its predicted normal points up. The depth of a floor pixel is the camera
+height divided by the downward slope of its ray. The ratio of true to predicted floor depth scales
+the predicted depth of all other pixels.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from training.samples import EMPTY, HEIGHT, ROUGH, UNKNOWN, WIDTH, Sample
 VIEWS = 24
 """Number of perspective images cut from each panorama."""
 _TRIPOD = 1.45
-"""Assumed tripod height in meters. Doors of 2.05 m in four rooms of Poly Haven panoramas imply 1.3,
-1.3, 1.5 and 1.6 m.
+"""Assumed tripod height in meters. Doors of 2.05 m in four rooms of Poly Haven panoramas imply
+tripod heights of 1.3, 1.3, 1.5 and 1.6 m.
 """
 _UPWARDS = 0.95
 """Minimum cosine between the predicted normal of a floor pixel and the up direction."""
@@ -30,12 +30,14 @@ _BELOW = 0.12
 """Minimum sine of the angle of floor rays below the horizon. This minimum limits the distance of
 floor pixels to 12 m."""
 _SAME = 0.35
-"""Maximum difference of the log camera height among floor pixels. Table tops differ by more."""
+"""Maximum difference of the log camera height among floor pixels. The pixels of table tops exceed
+this difference."""
 _ENOUGH = 0.04
 """Minimum share of floor pixels in a perspective image that yield a camera height."""
 _USUAL = 0.3
 """Maximum difference of the log camera height of one image from the median of its panorama. Beyond
-this difference the surface is a table or bed, and the median height is used.
+this difference, the supposed floor is a table or bed, and the median height of the panorama is
+used.
 """
 _OUTDOORS = 0.3
 """Minimum share of sky above the horizon in an outdoor panorama. Outdoors, only ground pixels get

@@ -19,10 +19,10 @@ from training.samples import Shard, find_shards
 
 @dataclass(frozen=True)
 class Schedule:
-    """Number of training steps, learning rates, and shares of the data sources.
+    """Number of training steps, learning rates, and sampling shares of the data sources.
 
     The learning rate is constant after ``warmup`` steps, and falls linearly to zero over the last
-    ``cooldown`` of ``steps``. Training can therefore be extended beyond ``steps`` from its last
+    ``cooldown`` of ``steps``. A run can therefore be extended beyond ``steps`` from its last
     checkpoint.
     """
 
@@ -35,7 +35,8 @@ class Schedule:
     warmup: int = 200
     decay: float = 1e-2
     average: float = 0.998
-    """Decay of the exponential moving average of the weights, which is the exported network."""
+    """Decay of the exponential moving average of the weights, which ``export`` writes to the ONNX
+    file."""
     real_share: float = 0.15
     """Share of RGB-D frames in the training samples."""
     view_share: float = 0.25
@@ -57,7 +58,7 @@ def train(
 
     ``run`` is the folder of the checkpoint ``last.pt`` and of ``log.csv``. ``start`` is a
     checkpoint with initial weights instead of ImageNet weights. Training stops after ``minutes``,
-    and a later call resumes from the checkpoint.
+    and a later call resumes from ``last.pt``.
     """
     torch.manual_seed(seed)
     torch.backends.cudnn.benchmark = True
@@ -141,9 +142,9 @@ def judge(
 ) -> dict[str, dict[str, float]]:
     """Compute accuracy metrics of the network on each shard, by the name of the shard.
 
-    Depth metrics are AbsRel and delta < 1.25 after median scaling, and the median ratio of scale to
-    the truth. The other metrics are the median angular error of normals in degrees, and the median
-    ratio of the focal length to the truth.
+    Depth metrics are AbsRel and delta < 1.25 after median scaling, and the median ratio of
+    predicted to true scale. Further metrics are the median angular error of normals in degrees, and
+    the median ratio of predicted to true focal length.
     """
     was = network.training
     network.eval()

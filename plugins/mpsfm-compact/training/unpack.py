@@ -13,7 +13,7 @@ from training.samples import Shard
 
 
 def unpack(shards: Sequence[Path], output: Path, most: int) -> int:
-    """Write at most ``most`` evenly spaced samples of each shard to a scene folder.
+    """Write at most ``most`` evenly spaced training samples of each shard to a scene folder.
 
     The scene folder has ``images/``, ``gt_depth/`` (16-bit PNG, millimeters), ``gt_normals/`` and
     ``intrinsics.yaml``.

@@ -64,7 +64,7 @@ def view_of(width, height, camera=None, colour=(0, 0, 0)):
 
 @pytest.mark.parametrize("size", [1200, 64])
 def test_intrinsics_follow_resizing_and_padding(model, size, context):
-    """Check 150 x 90 pixels padded to 160 x 96, and shrunk to 64 x 38 and padded to 64 x 64."""
+    """Check an image that is padded to multiples of 32 pixels, at full size and when shrunk."""
     view = view_of(150, 90, PinholeCamera(150, 90, 110.0, 120.0, 70.0, 48.0))
     prior = Dsine(DsineOptions(model=model, size=size), context).predict(view)
     height, width = prior.shape
@@ -79,7 +79,7 @@ def test_intrinsics_follow_resizing_and_padding(model, size, context):
 
 
 def test_black_padding_before_normalisation(write_onnx, context):
-    """Check the padding color with a network that returns a corner pixel as x of all normals."""
+    """Check DSINE's padding color with a network that returns the corner pixel as x of normals."""
     text = """
     dsine (float[b,3,h,w] image, float[b,3,3] intrins) => (float[b,4,h,w] normal) {
         nothing = Mul (image, none)

@@ -74,8 +74,9 @@ def test_disagreement_is_the_sample_variance():
 def test_fused_variance_is_the_larger_of_both():
     depth, variance = np.array([[2.0, 2.0, 3.0, 2.0]]), np.array([[0.5, 0.1, 0.1, 0.5]])
     fused = flip(Biased(depth, variance)).predict(VIEW)
-    # Both passes agree outside, with network variance 0.5. Inside, both passes predict 2 and 3 with
-    # variance 0.1, so (0.5^2 + 0.5^2) is the larger variance.
+    # At the outer two pixels, both passes agree, with network variance 0.5. At the inner two
+    # pixels, the passes predict depths of 2 and 3 with variance 0.1, so the sample variance 0.5 is
+    # larger.
     np.testing.assert_allclose(fused.depth, [[2.0, 2.5, 2.5, 2.0]])
     np.testing.assert_allclose(fused.variance, [[0.5, 0.5, 0.5, 0.5]], rtol=1e-6)
 
@@ -105,7 +106,7 @@ def test_normals_come_back_into_the_frame_of_the_view():
 
 @pytest.mark.parametrize("angle_deg", [0.5, 20.0, 80.0])
 def test_covariance_of_normals_by_explicit_geometry(angle_deg):
-    """Compare with log maps on the sphere at the mean, and half the trace of their covariance."""
+    """Compare fused normals with log maps on the sphere, and half the trace of their covariance."""
     rng = np.random.default_rng(3)
     middle = np.array([0.3, -0.2, -0.9]) / np.linalg.norm([0.3, -0.2, -0.9])
     basis = np.linalg.svd(middle[None])[2][1:]
@@ -126,7 +127,7 @@ def test_covariance_of_normals_by_explicit_geometry(angle_deg):
 
 
 def test_covariance_of_normals_agrees_with_the_papers_spherical_coordinates():
-    """Compare with appendix B of the paper, the trace of the covariance of normals in xyz."""
+    """Compare fused normals with the paper's appendix B, the trace of their xyz covariance."""
     angles = np.array([[2.3, 0.4], [2.34, 0.45]])  # polar, azimuth
 
     def cartesian(polar, azimuth):

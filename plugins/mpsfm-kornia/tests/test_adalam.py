@@ -55,7 +55,7 @@ def test_matches_of_inconsistent_scale_are_dropped(blocks, moved, context):
     ]
     kept = [np.isin(np.arange(COUNT), f.indices[:, 0]) for f in found]
     assert kept[1][100:].mean() > 0.95
-    # A neighborhood only accepts matches with the scale change of its seed.
+    # A neighborhood only accepts matches with the same scale change as its seed match.
     assert kept[0][100:].sum() < kept[1][100:].sum()
 
 

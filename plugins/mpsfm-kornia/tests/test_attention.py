@@ -33,7 +33,7 @@ def test_block(dimension, heads, counts):
 
 @pytest.mark.parametrize("architecture", [_LIGHTERGLUE, _LIGHTGLUE, LIGHTGLUE_256])
 def test_state_and_other_networks_stay(architecture):
-    """Check that tensor names are unchanged, and that other networks are not affected."""
+    """Check that the fused blocks keep tensor names, and do not affect other networks."""
     network = LightGlue(None, **architecture).eval()
     other, before = copy.deepcopy(network), dict(network.state_dict())
     fuse_cross_attention(network)

@@ -30,7 +30,7 @@ def changed(view, image, mask=None):
 
 
 def offset_to(found, expected):
-    """Compute the median distance of keypoints to the nearest expected keypoint in pixels."""
+    """Compute the median distance in pixels of keypoints to the nearest expected keypoint."""
     distance, nearest = cKDTree(expected).query(found)
     near = distance < 1.5
     assert near.mean() > 0.35

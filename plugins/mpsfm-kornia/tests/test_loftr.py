@@ -28,7 +28,7 @@ def test_positions_and_scores(make, blocks, checkpoint):
     other = type(blocks)("b.png", np.roll(blocks.image, 9, axis=1).copy(), blocks.camera)
     dense = matcher.match(blocks, other).dense
     assert len(dense) > 0
-    assert dense.std_px == 1.0  # half of a network pixel, which is two pixels of the view
+    assert dense.std_px == 1.0  # half of a network pixel of 2 view pixels
 
     halves = [v.image.reshape(96, 2, 128, 2, 3).mean(axis=(1, 3)) / 255 for v in (blocks, other)]
     gray = [torch.tensor(half @ (0.299, 0.587, 0.114)).float()[None, None] for half in halves]

@@ -68,21 +68,21 @@ def detector(write_onnx):
 
 
 def test_keypoints_become_pixels_of_the_view(detector, context):
-    """Check an image of 128 x 96 shrunk to 32 x 24, where keypoints outside are dropped."""
+    """Check keypoints in an image shrunk to 32 x 24 pixels, without those outside of the image."""
     options = SuperPointOptions(model=detector(1), resize=32)
     found = SuperPoint(options, context).extract(view_of(128, 96))
-    order = [1, 3, 0, 2]  # sorted by score, without the keypoint at (40, 5)
+    order = [1, 3, 0, 2]  # by score, without the keypoint at (40, 5)
     np.testing.assert_allclose(found.keypoints, (PLACES[0][order] + 0.5) * 4)
     np.testing.assert_allclose(found.scores, STRENGTHS[0][order])
     assert found.std_px == 4.0
-    np.testing.assert_allclose(found.descriptors, 0.299, rtol=1e-5)  # the luma of pure red
+    np.testing.assert_allclose(found.descriptors, 0.299, rtol=1e-5)  # luma of pure red
 
 
 def test_disk_sees_colours_on_multiples_of_16(detector, context):
     found = Disk(DiskOptions(model=detector(3), max_keypoints=2), context).extract(
         view_of(50, 30, (255, 51, 0))
     )
-    # An image of 50 x 30 becomes 48 x 32, where all five keypoints are inside.
+    # The image of 50 x 30 pixels is resized to 48 x 32, where all five keypoints are inside.
     np.testing.assert_allclose(found.keypoints[0], (10.5 * 50 / 48, 4.5 * 30 / 32))
     np.testing.assert_allclose(found.keypoints[1], (40.5 * 50 / 48, 5.5 * 30 / 32))
     np.testing.assert_allclose(found.descriptors, [[1.0, 0.2, 0.0]] * 2, rtol=1e-5)
@@ -118,7 +118,7 @@ def test_both_forms_of_the_matches(form, write_onnx, context):
 
 
 def test_keypoints_are_normalised_by_the_longer_side(write_onnx, context):
-    """Check with a network whose match scores are x and y of the first keypoint, plus 0.5."""
+    """Check the normalization of keypoints by a network that returns x and y as match scores."""
     constants = {"known": [[0, 1], [1, 0]], "all": [-1], "zero": [0], "two": [2]}
     arrays = {name: np.array(value) for name, value in constants.items()}
     model = write_onnx(ECHO, half=[0.5], **arrays)

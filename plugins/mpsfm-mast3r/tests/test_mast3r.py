@@ -14,7 +14,7 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
-SIZE = (80, 60)  # size of the test views, resized to 64 x 48 without cropping
+SIZE = (80, 60)  # size of test views, resized to 64 x 48
 
 # The network returns the red channel as z and green as certainty for its first input, and 90 for
 # both for its second input. Descriptors are the unit vectors of (red, green, blue).
@@ -110,7 +110,7 @@ class TestDense:
         np.testing.assert_allclose(found.scores, certainty / (1 + certainty), rtol=1e-5)
 
     def test_positions_lie_at_pixel_centres_of_the_cropped_view(self, model, context):
-        """Check an image of 100 x 61 resized to 64 x 39 and cropped to 64 x 32 from row 3 on."""
+        """Check depth and matches of an image that is resized to 64 x 39 and cropped to 64 x 32."""
         rng = np.random.default_rng(0)
         image = rng.integers(30, 225, (61, 100, 3), dtype=np.uint8)
         view = view_of(image)
@@ -155,7 +155,7 @@ def test_depth_of_each_view_comes_from_the_pass_where_it_is_first(model, context
     for prior, view in ((depth.depth_a, a), (depth.depth_b, b)):
         assert prior.shape == (39, 64) and prior.metric
         inside = np.zeros(39, dtype=bool)
-        inside[3:35] = True  # rows beyond multiples of 16 were cropped
+        inside[3:35] = True  # crop from 39 to 32 rows
         np.testing.assert_array_equal(prior.valid, np.broadcast_to(inside[:, None], (39, 64)))
         columns = (np.arange(64) + 0.5) * 100 / 64 - 0.5
         expected = np.interp(columns, np.arange(100), view.image[0, :, 0]) / 255

@@ -45,7 +45,8 @@ def view_of(width, height, colour, focal=(500.0, 500.0)):
 def test_canonical_camera_padding_and_normals(model, context):
     view = view_of(640, 480, (90, 175, 6), (700.0, 720.0))
     depth, normals = Metric3dDepth(Metric3dOptions(**model), context).predict_joint(view)
-    # The rows limit the scale to 616 / 480. The image covers 821 x 616 of the 1064 x 616 input.
+    # The image height limits the scale to 616 / 480. The resized image covers 821 x 616 pixels of
+    # the 1064 x 616 network input.
     assert depth.shape == normals.shape == (616, 821)
     assert depth.valid.all() and depth.metric and depth.variance is None
     focal = (700 + 720) / 2 * 616 / 480
@@ -66,7 +67,7 @@ def test_confidence_becomes_the_variance_of_depth(model, context):
 
 
 def test_padding_has_the_mean_colour(write_onnx, context):
-    """Check the padding with a network that returns the upper left input pixel as depth."""
+    """Check Metric3D's padding color with a network that returns the corner pixel as depth."""
     path = write_onnx(
         """
         corner (float[1,3,616,1064] pixel_values) => (

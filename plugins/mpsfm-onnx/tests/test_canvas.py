@@ -25,14 +25,14 @@ VIEWS = [(640, 480), (333, 517), (101, 20), (1, 1)]
 @pytest.mark.parametrize("view", VIEWS)
 @pytest.mark.parametrize("stride", [1, 4, 7])
 def test_cut_output_covers_the_view_exactly(rule, view, stride):
-    """Check with an output of pixel positions that positions in the view are restored."""
+    """Check that a network output of input pixel positions is cut to the positions in the view."""
     canvas = Canvas.plan(rule, view)
     cells = tuple(max(1, side // stride) for side in canvas.size)
     positions = scale_pixels(pixel_centers(*cells), cells, canvas.size)  # canvas pixels
     cut = canvas.cut(positions.astype(np.float32))
     size = cut.shape[1], cut.shape[0]
     expected = scale_pixels(pixel_centers(*size), size, canvas.image) + canvas.offset
-    # The outer half of a border pixel has the value at the pixel center.
+    # Interpolation is constant in the outer half of a border pixel.
     expected = expected.clip(positions.min(axis=(0, 1)), positions.max(axis=(0, 1)))
     np.testing.assert_allclose(cut, expected, rtol=1e-5)
 
@@ -98,7 +98,7 @@ def test_resizing_does_not_move_the_image(interpolation):
 
 @pytest.mark.parametrize("stride", [1, 4])
 def test_cropping_and_back(stride):
-    """Check that cropped pixels have no value, and that other pixels keep their position."""
+    """Check that cropped view pixels are NaN, and that other pixels keep their position."""
     size = SideSize(mode="longest", side=100, multiple_of=16, fit="crop")
     canvas = Canvas.plan(size, (200, 150))
     assert (canvas.size, canvas.image, canvas.offset) == ((96, 64), (100, 75), (-2, -5))
@@ -128,7 +128,7 @@ def test_the_camera_follows_the_image():
 
 @pytest.mark.parametrize(("rounding", "width"), [("nearest", 819), ("down", 818)])
 def test_sides_are_rounded_as_the_networks_authors_do(rounding, width):
-    """Check 517 x 389 pixels on 616 rows, which is 818.7 columns."""
+    """Check the rounding of 818.7 columns, the width of a 517 x 389 image on 616 rows."""
     size = FixedSize(mode="fixed", width=1064, height=616, fit="pad", rounding=rounding)
     assert Canvas.plan(size, (517, 389)).image == (width, 616)
 

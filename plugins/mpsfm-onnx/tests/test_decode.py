@@ -50,7 +50,7 @@ def test_expected_angle_is_the_mean_of_the_density(kappa):
 
 
 def test_cautious_side_of_the_squared_angle():
-    """Check that the variance of the density is 3/4 of the squared mean angle for large kappa."""
+    """Check that the variance of normals is 3/4 of the squared mean angle for large kappa."""
     kappa = 60.0
     density = [lambda a, p=p: a**p * np.exp(-kappa * a) * np.sin(a) for p in (0, 2)]
     norm, second = (quad(f, 0, np.pi, points=[1 / kappa])[0] for f in density)
@@ -114,7 +114,7 @@ def test_shift_of_points_is_estimated_from_the_camera(shift):
 
 
 def test_the_shift_minimises_the_reprojection_error_of_noisy_points():
-    """Check Gauss-Newton, as in MoGe. The linear solution alone is 8 % smaller here."""
+    """Check the z-shift from Gauss-Newton, where the linear solution is 8 % smaller."""
     rng = np.random.default_rng(1)
     camera = PinholeCamera(64, 64, 60.0, 60.0, 32.0, 32.0)
     xy = rays(camera, pixel_centers(64, 64))[..., :2]

@@ -96,7 +96,7 @@ def test_first_use_fetches_and_the_next_one_does_not(server, registry, config, p
     report = extract(load_images(*photos), provision.config, registry).report["providers"]
     (depth,) = [line for line in report if line["kind"] == "depth"]
     assert (depth["name"], depth["computed"]) == ("moge-2-small", 3)
-    assert not [line for line in report if line["kind"] == "normals"]  # from the same pass as depth
+    assert not [line for line in report if line["kind"] == "normals"]  # computed with depth
     assert resolve_providers(config, registry).config == provision.config
     assert len(server.requests) == 1
 

@@ -48,7 +48,7 @@ def runs(monkeypatch):
 
 
 def priors(photos, folder, normals):
-    """Compute the priors of the first image with the given provider of normals."""
+    """Compute the priors of the first image, with the provider of normals ``normals``."""
     options = dict(contract.setup(folder).options)
     chosen = {
         "extends": "demo",

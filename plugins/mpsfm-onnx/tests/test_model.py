@@ -1,4 +1,4 @@
-"""Tests of the choice between CPU and GPU."""
+"""Tests of the choice between CPU and GPU for an ONNX model."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ def test_integer_models_get_rounded_integers(write_onnx, write_description, make
     description = write_description(input={**IDENTITY_INPUT, "scale": 0.5}, outputs=depth())
     options = OnnxOptions(description=description, model=str(write_onnx(text)))
     prior = OnnxDepth(options, context).predict(make_view(4, 4, colour=(13, 0, 0)))
-    np.testing.assert_array_equal(prior.depth, 6)  # 6.5 is rounded to the even number
+    np.testing.assert_array_equal(prior.depth, 6)  # 6.5 is rounded to even
 
 
 def test_camera_and_constants_are_inputs(write_onnx, write_description, make_view, context):
@@ -101,14 +101,14 @@ def test_camera_and_constants_are_inputs(write_onnx, write_description, make_vie
     model = write_onnx(text, **{name: np.array(shape) for name, shape in shapes.items()})
     network = Network(load_description(description), context, str(model))
     answer = network.run(make_view(80, 60, focal=(100.0, 110.0)))
-    # The image is resized to 40 x 30 and placed at (4, 1) of 48 x 32 pixels.
+    # The view is resized to 40 x 30 and placed at (4, 1) of a network input of 48 x 32 pixels.
     expected = [[50, 0, 20 + 4 - 0.5], [0, 55, 15 + 1 - 0.5], [0, 0, 1], [1800] * 3]
     assert answer.maps["out"].shape == (30, 40, 12)
     np.testing.assert_allclose(answer.maps["out"][7, 9].reshape(4, 3), expected)
 
 
 def test_guessed_focal_length_and_unit(write_onnx, write_description, make_view, context):
-    """Check Depth Pro's focal length and MoGe's scale for an input with another aspect ratio."""
+    """Check depth with an estimated focal length and unit, for a view stretched to a square."""
     text = """
     tiny (float[1,3,h,w] image) => (float[1,1,h,w] out, float[1] focal, float[1,1] unit) {
         out = Gather <axis = 1> (image, red)
@@ -125,7 +125,7 @@ def test_guessed_focal_length_and_unit(write_onnx, write_description, make_view,
     view = make_view(64, 16, colour=(8, 0, 0), focal=(120.0, 300.0))
     provider = OnnxDepth(options, context)
     np.testing.assert_allclose(provider.predict(view).depth, 8 * (120 * 32 / 64) / 50 * 0.25)
-    assert provider.estimate_focal(view) == pytest.approx(100)  # 50 px on 32 of 64 columns
+    assert provider.estimate_focal(view) == pytest.approx(100)  # 50 px at half width
 
 
 def test_mask_applies_to_depth_and_normals(write_onnx, write_description, make_view, context):
@@ -217,7 +217,7 @@ SHIPPED_STAND_INS = {
 
 @pytest.mark.parametrize("name", SHIPPED_STAND_INS)
 def test_shipped_interfaces(name, write_onnx, make_view, context):
-    """Check shipped descriptions with networks that invert the preprocessing and return red."""
+    """Check the descriptions in the package with networks that return the input's red channel."""
     rule = load_description(name).input
     signature, body = SHIPPED_STAND_INS[name]
     red = f"red = Gather <axis = 1> ({rule.name}, first) a = Mul (red, std) meaning = Add (a, mean)"
@@ -238,7 +238,7 @@ def test_shipped_interfaces(name, write_onnx, make_view, context):
 
 
 def test_unidepth_interface(write_onnx, make_view, context):
-    """Check rays, fixed size and error of UniDepth's export, with points at 4 m for red 0.4."""
+    """Check the ray input, fixed size and std of a network like UniDepth, with points at 4 m."""
     red = "r = Gather <axis = 1> (rgbs, first) a = Mul (r, std) b = Add (a, mean) c = Mul (b, ten)"
     model = write_onnx(
         f"""uni (float[b,3,28,42] rgbs, float[b,3,28,42] rays) => (
@@ -265,7 +265,7 @@ def test_unidepth_interface(write_onnx, make_view, context):
 
 
 def test_moge_interface(write_onnx, make_view, context):
-    """Check a plane at z = 2 m in half meters, shifted by 0.3, with a hole in the mask."""
+    """Check MoGe's points of a plane at z = 2 m, given in half meters with a shift and a hole."""
     text = """
     moge (float[b,3,h,w] image, int64 num_tokens) => (
         float[b,h,w,3] points, float[b,h,w,3] normal, float[b,h,w] mask, float[b] scale) {
@@ -316,7 +316,7 @@ def test_listing_does_not_import_onnxruntime():
 
 
 def test_fastdepth_on_real_photos(shared_data, make_view, context):
-    """Compare with sensor depth after median scaling, with a measured AbsRel of 0.18."""
+    """Compare FastDepth with sensor depth after median scaling (measured AbsRel: 0.18)."""
     model = shared_data / "models" / "fastdepth_224.onnx"
     provider = OnnxDepth(OnnxOptions(model=str(model)), context)
     scene = shared_data / "data" / "hololens_room"
@@ -333,6 +333,6 @@ def test_fastdepth_on_real_photos(shared_data, make_view, context):
         errors.append(np.abs(ratio - 1).mean())
         close.append((np.maximum(ratio, 1 / ratio) < 1.25).mean())
     assert len(errors) == 21
-    assert 0.75 < np.median(scales) < 1.1  # metric depth is roughly correct (measured: 0.89)
+    assert 0.75 < np.median(scales) < 1.1  # ratio of predicted to true depth, 0.89
     assert np.mean(errors) < 0.21
     assert np.mean(close) > 0.66

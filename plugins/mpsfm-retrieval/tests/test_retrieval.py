@@ -35,7 +35,7 @@ def view_of(image, mask=None):
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("network", ["dinov2", "eigenplaces", "netvlad"])
 def test_forms_of_the_output(form, network, write_onnx, context):
-    """Check a mean color as vector, as first of two tokens, and as half of a map."""
+    """Check a mean-color descriptor as output vector, as first of two tokens, and as map."""
     signature, body = FORMS[form]
     text = f"net (float[b,3,h,w] image) => ({signature}) {{"
     text += f" mean = GlobalAveragePool (image) {body} }}"

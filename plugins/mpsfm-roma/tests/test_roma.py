@@ -13,7 +13,7 @@ from mpsfm_core.data.errors import ConfigError, ProviderError
 ROWS, COLUMNS = 28, 42
 """Height and width in pixels of the network input and of the warp."""
 SHIFT = np.array([0.2, -0.1])
-"""Shift of normalized positions from view a to view b, which is scaled by 0.8."""
+"""Translation of normalized positions from view a to view b, after scaling by 0.8."""
 SCALE = 0.8
 
 CONSTANT = """
@@ -70,7 +70,7 @@ def test_dense_positions_in_pixels_of_views_of_other_sizes(options, symmetric, c
     matcher = DenseMatcher(DenseOptions(**options(symmetric, cell=1)), context)
     found = matcher.match(A, B).dense
     np.testing.assert_allclose(found.points_b, b_from_a(found.points_a), atol=1e-4)
-    # The warp of view a is at pixel centers. Targets outside of view b yield no match.
+    # The warp positions in view a are pixel centers. Targets outside of view b yield no match.
     first = (pixel + 0.5 for pixel in (0, 0))
     np.testing.assert_allclose(found.points_a[0], np.array([*first]) * (120 / 42, 80 / 28))
     inside = (np.abs(grid() * SCALE + SHIFT) <= 1).all(axis=-1).sum()
@@ -126,7 +126,7 @@ def test_uncertain_keypoints_have_no_match(options, context):
 
 
 def test_what_is_fed_is_normalised(write_onnx, context):
-    """Check with a model whose certainty is the red channel of the first view."""
+    """Check the color normalization by a model whose certainty is the first view's red channel."""
     text = """
     roma (float[b,3,h,w] one, float[b,3,h,w] two) => (float[b,h,w,4] warp, float[b,h,w] sure) {
         warp = Identity (known_warp)

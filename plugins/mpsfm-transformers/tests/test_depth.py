@@ -52,7 +52,7 @@ def test_the_map_of_the_library(models, context, photo, name, size):
 
 @pytest.mark.parametrize("size", SIZES)
 def test_depth_pro_as_the_library_computes_it(models, context, photo, size):
-    """Compare with the steps of Depth Pro's image processor, which needs torchvision."""
+    """Compare depth with the steps of Depth Pro's image processor, which needs torchvision."""
     view = photo(*size)
     provider = HubDepth(DepthOptions(model=str(models["depth-pro"])), context)
     with quiet(), torch.inference_mode():
@@ -72,7 +72,7 @@ def test_depth_pro_as_the_library_computes_it(models, context, photo, size):
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", stand_in.DEPTH)
 def test_cut_map_covers_the_image(models, context, photo, name, size):
-    """Check that cutting the prepared image to the view restores the image."""
+    """Check that the network input, cut to the area of the view, is the resized image."""
     gray = np.add.outer(np.arange(size[1]) * 0.5, np.arange(size[0])).astype(np.uint8)
     view = photo(*size)
     view = View(view.name, np.repeat(gray[..., None], 3, axis=2), view.camera)
@@ -84,7 +84,7 @@ def test_cut_map_covers_the_image(models, context, photo, name, size):
     std = loaded.preprocessor.get("image_std", [1.0])[0]
     seen = prepared.cut((prepared.pixels[0, 0].numpy() * std + mean) * 255)
     expected = resize_map(gray, seen.shape[1], seen.shape[0])
-    # Resizing filters differ at the border, and in the rounding of a ramp of 8 bits.
+    # Resizing filters differ at the image border, and in the rounding of an 8-bit gray ramp.
     inner = np.s_[3:-3, 3:-3]
     wrapped = np.abs(seen - expected)[inner] > 60
     error = np.abs(seen - expected)[inner][~wrapped]
@@ -94,7 +94,7 @@ def test_cut_map_covers_the_image(models, context, photo, name, size):
 
 
 def test_zoedepth_as_the_library_cuts_it(models, context, photo):
-    """Compare with transformers, which crops after resizing (half a network pixel apart)."""
+    """Compare ZoeDepth with transformers, which crops depth after resizing."""
     view = photo(320, 240)
     _, outputs = of_the_library(models["zoedepth"], view)
     prior = HubDepth(DepthOptions(model=str(models["zoedepth"])), context).predict(view)

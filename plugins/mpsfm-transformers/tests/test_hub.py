@@ -1,4 +1,4 @@
-"""Tests of the model files that are read, and of error messages."""
+"""Tests of reading model files of the Hub, and of the error messages."""
 
 from __future__ import annotations
 

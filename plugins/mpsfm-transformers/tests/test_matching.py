@@ -97,7 +97,7 @@ def test_given_keypoints_match_as_detected_ones(name, context, tmp_path, blocks,
 
 @pytest.mark.parametrize("name", MATCHERS)
 def test_size_of_a_view_does_not_matter(name, context, tmp_path, view_of, blocks):
-    """Check that match positions are relative to the size of each view."""
+    """Check that enlarging a view and its keypoints does not change the matches."""
     factory, options, _ = MATCHERS[name]
     matcher = factory(options(model=str(getattr(stand_in, name)(tmp_path / name))), context)
     rng = np.random.default_rng(1)
@@ -129,7 +129,7 @@ def test_features_of_another_family(name, context, tmp_path, view_of, blocks):
 
 
 def test_efficient_loftr_where_matches_cross(context, tmp_path, blocks, view_of):
-    """Check an image with exchanged halves, which transformers pairs incorrectly."""
+    """Check images with exchanged halves, whose matches transformers pairs incorrectly."""
     folder = stand_in.efficient_loftr(tmp_path / "loftr")
     matcher = EfficientLoftrMatcher(EfficientLoftrOptions(model=str(folder)), context)
     swapped = np.concatenate([blocks[:, 128:], blocks[:, :128]], axis=1)
@@ -142,7 +142,7 @@ def test_efficient_loftr_where_matches_cross(context, tmp_path, blocks, view_of)
 
 
 def test_efficient_loftr_of_different_sizes(context, tmp_path, blocks, view_of):
-    """Check that positions are in pixels of each view, although both share an input size."""
+    """Check that match positions are in pixels of each view, not of the common input size."""
     folder = stand_in.efficient_loftr(tmp_path / "loftr")
     matcher = EfficientLoftrMatcher(EfficientLoftrOptions(model=str(folder)), context)
     dense = matcher.match(view_of(blocks), view_of(blocks[:, :192])).dense

@@ -72,7 +72,7 @@ def test_positions_in_pixels_of_views_of_other_sizes(context: ProviderContext) -
     found = matcher.DenseMatcher(options, context).match(view(200, 60), view(100, 40)).dense
     assert [tuple(image.shape) for image in Known.shown] == [(3, 30, 100), (3, 40, 100)]
     assert 0 <= Known.shown[0].min() <= Known.shown[0].max() <= 1
-    # Pixel centers are at integers, and matches outside of the second view are dropped.
+    # The network's pixel centers are integers, and matches outside of the second view are dropped.
     np.testing.assert_allclose(found.points_a, (A[:2] + 0.5) * 2, atol=4e-3)
     np.testing.assert_allclose(found.points_b, B[:2] + 0.5)
     assert found.scores.tolist() == [0.25, 1.0] and found.std_px == 1.0

@@ -1,7 +1,7 @@
 """Functions ``(builder, x, y, yaw)`` that add a piece of furniture of random size.
 
-The back of a piece is at ``(x, y)`` in meters, and its front faces the direction ``yaw`` (rad).
-The sizes of all pieces are those of real furniture.
+The back of the furniture is at ``(x, y)`` in meters, and the front faces the direction ``yaw``
+(rad). All furniture has sizes as in real rooms.
 """
 
 from __future__ import annotations

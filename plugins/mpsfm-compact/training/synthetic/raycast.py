@@ -1,9 +1,9 @@
 """Compiled ray casting of boxes, ellipsoids and cylinders.
 
 Every solid is a unit solid (cube [-1, 1]^3, unit ball, or cylinder of radius 1 along z in [-1, 1])
-under an affine map. Each kind of solid therefore needs one intersection routine. In world
-coordinates, x and y are horizontal and z is up, in meters. In camera coordinates, x is right, y
-down and z forward.
+under an affine map. Each kind of solid (cube, ball or cylinder) therefore needs one intersection
+routine. In world coordinates, x and y are horizontal and z is up, in meters. In camera coordinates,
+x is right, y down and z forward.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GROUP = 8
 _NEAR = 1e-4
 _TILE = 16
 _compiled = njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
-"""Options of the numba compiler. Comparisons with infinity must be exact."""
+"""Options of the numba compiler. These options keep comparisons with infinity exact."""
 
 
 @_compiled
@@ -194,7 +194,7 @@ def _shade(scene, i, axis, point, direction, distance, pixel, normal, colour):
     kinds, inverses, _, _ = solids
     uv = np.empty(2)
     _surface(kinds, inverses, sizes, i, axis, point, direction, normal, uv)
-    look = looks[i]  # Elements: texture, texels' scale, tint rgb, offset uv, shine, glow.
+    look = looks[i]  # texture index, 1 / texture period, tint rgb, offset uv, shine, glow
     slant = max(
         0.15, -(normal[0] * direction[0] + normal[1] * direction[1] + normal[2] * direction[2])
     )
@@ -214,7 +214,7 @@ def _shade(scene, i, axis, point, direction, distance, pixel, normal, colour):
         start[a] = point[a] + 2e-3 * normal[a]
     towards = np.empty(3)
     for k in range(len(lights)):
-        light = lights[k]  # Elements of a light: position or direction, color rgb, and 1 for a sun.
+        light = lights[k]  # position or direction of a light, color rgb, and 1 for a sun
         reach = 0.0
         for a in range(3):
             towards[a] = light[a] - (0.0 if light[6] > 0 else start[a])
@@ -243,10 +243,11 @@ def draw(scene, shows, sky, origin, rotation, focal, width, height, image, depth
     """Render color, depth, normals and surface kind of a scene.
 
     ``scene`` starts with the solids: kinds (n,), inverses (n, 3, 4), centers (n, 3) and radii (n,).
-    Then follow half sizes (n, 3), looks (n, 9), and textures (levels, t, s, s, 3). The shadow
-    casters are solid indices, and bounding spheres of :data:`GROUP` solids each. The last elements
-    are lights (m, 7) and the ambient light (2, 3) from above and below. ``shows`` (n,) is PLAIN,
-    MIRROR or WINDOW for each solid, and ``rotation`` is world_from_camera.
+    The next elements of ``scene`` are half sizes (n, 3), surface appearances (n, 9), and textures
+    (levels, t, s, s, 3). The shadow casters in ``scene`` are solid indices, and bounding spheres of
+    :data:`GROUP` solids each. The last elements of ``scene`` are lights (m, 7) and the ambient
+    light (2, 3) from above and below. ``shows`` (n,) is PLAIN, MIRROR or WINDOW for each solid, and
+    ``rotation`` is world_from_camera.
 
     The function fills ``image`` (h, w, 3) in linear light, ``depth`` (h, w) along z, ``normals``
     (h, w, 3) in the camera frame, and ``kind`` (h, w) uint8. In ``kind``, 0 is sky, 1 is a surface,
