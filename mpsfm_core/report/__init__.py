@@ -1,5 +1,5 @@
-"""Report page of a finished result folder, and scenes for viewers.
+"""Write the report page of a finished result folder, and show scenes in viewers.
 
-The report reads only the result folder, so ``mpsfm report DIR`` can write it again at any time. It
-is one HTML file that opens without a server or network.
+The report needs only the result folder, so ``mpsfm report DIR`` can write the page again at any
+time. The report page is one HTML file that opens without a server or network.
 """

@@ -1,4 +1,4 @@
-"""Findings of a run for users: what is wrong or doubtful, where, and what to do."""
+"""Collect findings for users about wrong or doubtful parts of a run, with next steps."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ from mpsfm_core.report.verdict import is_focal_refined, judge
 Level = Literal["bad", "warning", "note"]
 _ORDER: tuple[Level, ...] = ("bad", "warning", "note")
 _MAX_FOCAL_CHANGE = 0.1
-"""Relative change of a refined focal length from which it is reported."""
+"""Minimum relative change of a refined focal length that is reported to the user."""
 
 _NETWORKLESS = {"flat", "from-depth"}
-"""Depth providers that use no network."""
+"""Names of the depth providers that use no neural network."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One finding."""
+    """Finding about a run for users."""
 
     level: Level
-    """Severity."""
+    """Severity of the finding."""
     title: str
-    """One line."""
+    """Title of the finding in one line."""
     text: str
-    """What happened, in sentences."""
+    """Description of the finding in sentences."""
     remedy: str = ""
-    """Next step for the user, may be empty."""
+    """Next step for the user, empty if there is no remedy."""
     images: tuple[str, ...] = field(default=())
-    """Names of the images that are concerned."""
+    """Names of the images that the finding concerns."""
 
 
 def findings(summary: Mapping[str, Any]) -> list[Finding]:
@@ -63,7 +63,7 @@ def findings(summary: Mapping[str, Any]) -> list[Finding]:
 
 
 def _failure(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield the cause of a failed run."""
+    """Yield a finding about the cause of a failed run."""
     if summary["status"] == "success":
         return
     pairs = summary["pairs"]
@@ -111,7 +111,7 @@ def _doubts(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _left_out(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield the images that were left out before the reconstruction."""
+    """Yield a finding about images that were left out before the reconstruction."""
     faults = summary["images"].get("left_out", {})
     if faults:
         first, fault = next(iter(faults.items()))
@@ -126,12 +126,12 @@ def _left_out(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _missing(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield one finding for each reason of unregistered images."""
+    """Yield one finding for each reason why images are unregistered."""
     by_title = defaultdict(list)
     for name, reason in summary["images"]["unregistered"].items():
         by_title[explain_image(reason).title].append((name, explain_image(reason)))
     failed = summary["status"] != "success"
-    if failed:  # the cause of the failure implies these reasons
+    if failed:  # the cause of the failure implies that images are unregistered
         implied = {ImageReason.NO_REGISTERED_NEIGHBOR}
         if not summary["pairs"]["verified"]:
             implied.add(ImageReason.NO_VERIFIED_MATCHES)
@@ -148,7 +148,7 @@ def _missing(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _unconfirmed(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield the images that are registered tentatively."""
+    """Yield a finding about tentatively registered images."""
     names = tuple(summary["images"]["unconfirmed"])
     if names:
         yield Finding(
@@ -161,7 +161,7 @@ def _unconfirmed(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _providers(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield the fallbacks that replaced configured providers."""
+    """Yield findings about fallbacks that replaced configured providers."""
     for provider in summary["providers"]:
         passed = provider["passed_over"]
         if provider["name"] in _NETWORKLESS and provider["block"] == "depth":
@@ -184,7 +184,7 @@ def _providers(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _scale(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield that the metric scale is unknown or uncertain."""
+    """Yield a finding if the metric scale is unknown or uncertain."""
     for reconstruction in summary["reconstructions"][:1]:
         metric = reconstruction["metric_scale"]
         if metric is None:
@@ -206,7 +206,7 @@ def _scale(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield estimated focal lengths, and those that refinement changed by much."""
+    """Yield findings about estimated and strongly refined focal lengths."""
     details = summary["images"]["details"]
     refined = {
         name: (image["focal_length_px"], image.get("refined_focal_length_px"))
@@ -252,7 +252,7 @@ def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _weak(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield the images with verified matches to only one other image."""
+    """Yield a finding about images with verified matches to only one other image."""
     partners = partner_counts(summary)
     weak = tuple(name for name in summary["images"]["registered"] if partners[name] == 1)
     if weak and len(summary["images"]["registered"]) > 2:
@@ -266,7 +266,7 @@ def _weak(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def weakest(summary: Mapping[str, Any], max_images: int = 3) -> list[tuple[str, int]]:
-    """Return the registered images with the fewest verified matches, with the numbers."""
+    """Return the registered images with the fewest verified matches, and their match counts."""
     registered = set(summary["images"]["registered"])
     matches = Counter(dict.fromkeys(summary["images"]["registered"], 0))
     for pair in summary["pairs"]["all"]:
@@ -278,7 +278,7 @@ def weakest(summary: Mapping[str, Any], max_images: int = 3) -> list[tuple[str, 
 
 
 def partner_counts(summary: Mapping[str, Any]) -> Counter[str]:
-    """Count the registered images with which each registered image has verified matches."""
+    """Count for each registered image the registered images with verified matches to it."""
     registered = set(summary["images"]["registered"])
     return Counter(
         name

@@ -1,4 +1,4 @@
-"""Writer of ``report.html``, one self-contained file."""
+"""Write ``report.html``, a self-contained page about a run."""
 
 from __future__ import annotations
 
@@ -30,31 +30,31 @@ from mpsfm_core.support.yaml_text import write_yaml
 
 MAX_DENSE_POINTS = 280_000
 MAX_SPARSE_POINTS = 40_000
-"""Maximum numbers of points; 16 bytes each in base64, 5 MB together."""
+"""Maximum numbers of dense and sparse points in the page, 16 bytes each in base64."""
 MAX_PICTURE_BYTES = 9_000_000
-"""Maximum size of all pictures together in bytes; with many images each picture is smaller."""
+"""Maximum size in bytes of all pictures in the page; with many images each picture is smaller."""
 _PHOTO_SIDE = (192, 800)
-"""Minimum and maximum of the longer side of an image in pixels."""
+"""Minimum and maximum of the longer side in pixels of an embedded image."""
 _MAP_SIDE = (128, 360)
-"""Minimum and maximum of the longer side of a map in pixels."""
+"""Minimum and maximum of the longer side in pixels of an embedded depth or normal map."""
 _BYTES_PER_PIXEL = 0.16
-"""Mean size of WebP in base64 at our quality, measured on indoor images."""
+"""Mean size in bytes per pixel of a WebP picture in base64, measured on indoor images."""
 _NUM_MAPS = 4
-"""Number of maps per image."""
+"""Number of embedded depth, std and normal maps per image."""
 _MAX_COORDINATE = 0xFFFF
-"""Range of 16-bit coordinates."""
+"""Maximum value of a 16-bit coordinate."""
 _DEFAULT_MAX_STD = 0.2
-"""Brightest relative std of a map if no image is registered."""
+"""Relative std of the brightest color of std maps if no image is registered."""
 
 
 def write_report(folder: Path) -> Path:
     """Write the report page of a finished result folder.
 
     Returns:
-        Path of the page.
+        Path of the report page.
 
     Raises:
-        InputError: the folder has no results, or they are damaged.
+        InputError: the folder has no results, or the results are damaged.
         OSError: the disk is full.
     """
     result = ResultFolder.open(folder)
@@ -69,7 +69,7 @@ def write_report(folder: Path) -> Path:
 
 
 def render(result: ResultFolder) -> str:
-    """Return the report page as HTML text."""
+    """Return the report page of a result folder as HTML text."""
     parts = {
         "TITLE": html.escape(result.path.resolve().name),
         "STYLE": _asset("page.css"),
@@ -91,7 +91,7 @@ def _asset(name: str) -> str:
 
 
 def _script_safe(data: str) -> str:
-    """Escape JSON so that it cannot end the script element that contains it."""
+    """Escape JSON text so that the text cannot close its ``<script>`` element."""
     return data.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
@@ -129,7 +129,7 @@ def _payload(result: ResultFolder) -> dict[str, Any]:
 
 
 class _ImageEntries:
-    """Collects statistics and pictures of each image for the page."""
+    """Collector of the statistics and pictures of each image for the report page."""
 
     def __init__(self, result: ResultFolder, maps: Mapping[str, RefinedMap | None]) -> None:
         self._result = result
@@ -152,7 +152,7 @@ class _ImageEntries:
         self._views: dict[str, tuple[int, int]] = {}
 
     def describe(self, name: str) -> dict[str, Any]:
-        """Return status, statistics, pose and pictures of an image."""
+        """Return status, statistics, pose and pictures of an image for the report page."""
         images = self._result.summary["images"]
         reason = {**images["unregistered"], **images["unconfirmed"]}.get(name)
         explained = None if reason is None else explain_image(reason)
@@ -183,7 +183,7 @@ class _ImageEntries:
         }
 
     def lines(self, pair: MatchLines) -> str:
-        """Encode matches as (ax, ay, bx, by) uint16, relative to the sizes of both views."""
+        """Encode matches as uint16 (ax, ay, bx, by), relative to the sizes of both images."""
         sides = []
         for name, points in ((pair.image_a, pair.points_a), (pair.image_b, pair.points_b)):
             size = np.array(self._views.get(name, (1, 1)))
@@ -191,7 +191,7 @@ class _ImageEntries:
         return _base64(np.concatenate(sides, axis=1).astype("<u2"))
 
     def _in_model(self, name: str) -> dict[str, Any]:
-        """Return the number of points of an image and their mean reprojection error in pixels."""
+        """Return the 3D point count and mean reprojection error in pixels of an image."""
         image = self._images.get(name)
         if image is None:
             return {"points": 0, "error": None}
@@ -262,14 +262,14 @@ class _ImageEntries:
 
 @dataclass(frozen=True)
 class _PictureSizes:
-    """Longer sides of an image and of a map in pixels."""
+    """Longer sides in pixels of an embedded image and of an embedded map."""
 
     photo: int
     maps: int
 
     @classmethod
     def of(cls, count: int) -> _PictureSizes:
-        """Return the largest sizes of ``count`` images within :data:`MAX_PICTURE_BYTES`."""
+        """Return the picture sizes with which ``count`` images fit in :data:`MAX_PICTURE_BYTES`."""
         full = 0.75 * (_PHOTO_SIDE[1] ** 2 + _NUM_MAPS * _MAP_SIDE[1] ** 2)
         share = (MAX_PICTURE_BYTES / (max(count, 1) * full * _BYTES_PER_PIXEL)) ** 0.5
         return cls(
@@ -287,7 +287,7 @@ def _scale_between(prior: PriorMaps, refined: RefinedMap | None) -> float:
 
 
 def _pairs(summary: Mapping[str, Any], ids: Mapping[str, int]) -> list[list[Any]]:
-    """Return indices, matches, inliers and the reason of rejection of each pair."""
+    """Return image indices, matches, inliers and reason of rejection of each image pair."""
     return [
         [
             *(ids[name] for name in pair["images"]),
@@ -300,14 +300,14 @@ def _pairs(summary: Mapping[str, Any], ids: Mapping[str, int]) -> list[list[Any]
 
 
 def _why_unused(pair: Mapping[str, Any]) -> str:
-    """Return why a pair was dropped or cannot initialize a component; empty if neither."""
+    """Return why an image pair was dropped or cannot initialize a component, else ""."""
     if "dropped" in pair:
         return explain_pair(pair["dropped"]).text
     return explain_image(pair["cannot_start"]).text if "cannot_start" in pair else ""
 
 
 def _points(points: PointSet) -> dict[str, Any]:
-    """Encode positions with 16 bits, colors and values with 8 bits."""
+    """Encode positions of points with 16 bits, and colors and other values with 8 bits."""
     count = len(points.xyz)
     low = np.zeros(3)
     step = np.ones(3)
@@ -329,7 +329,7 @@ def _points(points: PointSet) -> dict[str, Any]:
 
 
 def _values(values: NDArray[np.float32], unit: str) -> dict[str, Any]:
-    """Encode values in 255 steps from the minimum to the 98th percentile; 255 means none."""
+    """Quantize values from the minimum to the 98th percentile to 8 bits; 255 is no value."""
     known = values[np.isfinite(values)]
     low, high = np.percentile(known, [0, 98]).tolist() if len(known) else (0.0, 0.0)
     share = (np.nan_to_num(values, nan=high) - low) / max(high - low, 1e-9)
@@ -338,7 +338,7 @@ def _values(values: NDArray[np.float32], unit: str) -> dict[str, Any]:
 
 
 def _estimate_up(maps: list[RefinedMap]) -> list[float]:
-    """Return the mean up axis of the cameras in the world, a unit vector."""
+    """Return the mean up axis of the cameras as a unit vector in world coordinates."""
     mean: Float64 = -np.sum([refined.rotation[1] for refined in maps], axis=0, dtype=np.float64)
     length = np.linalg.norm(mean)
     return _rounded(mean / length) if length > 1e-6 else [0.0, -1.0, 0.0]

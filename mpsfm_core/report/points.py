@@ -1,4 +1,4 @@
-"""Points of the report page: subsampled, with error, std and number of images."""
+"""Subsample the points of the report page and measure their error, std and image count."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from mpsfm_core.geometry import inside, project, sample_nearest, transform
 from mpsfm_core.report.result_folder import RefinedMap
 
 _SIGMAS = 3.0
-"""Maximum depth difference in standard deviations for a map to count as observing a point."""
+"""Maximum depth difference in standard deviations of a depth map that observes a point."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointSet:
-    """Points with the values by which the page can color them."""
+    """Points with the values by which the report page colors points."""
 
     xyz: Float64
-    """(n, 3) float64, world coordinates."""
+    """(n, 3) float64 points in world coordinates."""
     rgb: UInt8
-    """(n, 3) uint8."""
+    """(n, 3) uint8 RGB colors of the points."""
     error: Float32
-    """(n,) float32, reprojection error or relative depth difference, in :attr:`error_unit`."""
+    """(n,) float32 reprojection errors in pixels or relative depth differences in percent."""
     std: Float32
-    """(n,) float32, minimum relative std of the observing maps in percent, NaN without one."""
+    """(n,) float32 minimum relative std in percent of the observing depth maps, NaN without one."""
     views: Float32
-    """(n,) float32, number of images that observe the point."""
+    """(n,) float32 numbers of images that observe each point."""
     error_unit: str
-    """``px`` or ``%``."""
+    """Unit of :attr:`error`, ``px`` or ``%``."""
 
 
 def sparse_points(
     model: pycolmap.Reconstruction, maps: Sequence[RefinedMap], max_points: int
 ) -> PointSet:
-    """Return at most ``max_points`` triangulated points."""
+    """Return a random subset of at most ``max_points`` triangulated points."""
     points = [model.points3D[key] for key in sorted(model.points3D)]
     points = [points[row] for row in _sample_rows(len(points), max_points)]
     xyz = np.array([p.xyz for p in points], np.float64).reshape(-1, 3)
@@ -51,7 +51,7 @@ def sparse_points(
 def dense_points(
     cloud: tuple[Float64, UInt8], maps: Sequence[RefinedMap], max_points: int
 ) -> PointSet:
-    """Return at most ``max_points`` points of the fused depth maps."""
+    """Return a random subset of at most ``max_points`` points of the fused depth maps."""
     rows = _sample_rows(len(cloud[0]), max_points)
     xyz, rgb = cloud[0][rows], cloud[1][rows]
     error, std, views = _measure_observations(xyz, maps)
@@ -59,7 +59,7 @@ def dense_points(
 
 
 def _sample_rows(count: int, max_rows: int) -> Int64:
-    """Return at most ``max_rows`` of ``count`` rows, drawn with a fixed seed."""
+    """Draw at most ``max_rows`` of ``count`` row indices with a fixed seed."""
     if count <= max_rows:
         return np.arange(count)
     return np.sort(np.random.default_rng(0).choice(count, max_rows, replace=False))
@@ -71,8 +71,8 @@ def _measure_observations(
     """Compare points with the depth maps that observe them.
 
     Returns:
-        Mean relative depth difference in percent, minimum relative std in percent, and number of
-        observing maps of each point.
+        Mean relative depth difference in percent, minimum relative depth std in percent, and number
+        of observing depth maps of each point.
     """
     total = np.zeros(len(xyz))
     views = np.zeros(len(xyz), np.float32)

@@ -1,7 +1,7 @@
 """Render the typed reasons of a run into words and a remedy for users.
 
-:mod:`mpsfm_core.data.decisions` defines the reasons. Terminal, report page and exceptions all call
-:func:`explain`, so the words for each reason exist once.
+:mod:`mpsfm_core.data.decisions` defines the reasons. Terminal, report page and exceptions call
+:func:`explain`, so that each reason has one text.
 """
 
 from __future__ import annotations
@@ -40,14 +40,15 @@ _NO_REMEDY = ""
 
 @dataclass(frozen=True)
 class Explanation:
-    """A reason in words."""
+    """Explanation of a reason for users."""
 
     title: str
-    """A phrase without numbers; photos with the same title are reported together."""
+    """Short phrase without numbers; photos whose reasons have the same title are reported
+    together."""
     text: str
-    """One sentence about what happened."""
+    """Sentence about what happened to the photo, pair or run."""
     remedy: str
-    """The next step for the user; empty if there is none."""
+    """Next step for the user, empty if there is no remedy."""
 
 
 _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
@@ -279,39 +280,39 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
 
 
 def explain(reason: Reason) -> Explanation:
-    """Return the title, text and remedy of a reason."""
+    """Render a reason as title, text and remedy for users."""
     title, text, remedy = _TEMPLATES[reason.code]
     values = {name: _readable(value) for name, value in reason.values.items()}
     return Explanation(title, text.format(**values), remedy)
 
 
 def explain_image(stored: Mapping[str, Any]) -> Explanation:
-    """Explain a reason of an image as ``summary.json`` stores it."""
+    """Explain why an image is not registered, from the reason stored in ``summary.json``."""
     return explain(reason_from_json(ImageReason, stored))
 
 
 def explain_pair(stored: Mapping[str, Any]) -> Explanation:
-    """Explain a reason of a dropped pair as ``summary.json`` stores it."""
+    """Explain why an image pair was dropped, from the reason stored in ``summary.json``."""
     return explain(reason_from_json(PairReason, stored))
 
 
 def explain_camera(stored: Mapping[str, Any]) -> Explanation:
-    """Explain why a focal length is not refined, as ``summary.json`` stores it."""
+    """Explain why a focal length is not refined, from the reason in ``summary.json``."""
     return explain(reason_from_json(CameraReason, stored))
 
 
 def explain_provider(stored: Mapping[str, Any]) -> Explanation:
-    """Explain why a provider was passed over, as ``summary.json`` stores it."""
+    """Explain why a provider was not used, from the reason stored in ``summary.json``."""
     return explain(reason_from_json(ProviderReason, stored))
 
 
 def explain_gps(stored: Mapping[str, Any]) -> Explanation:
-    """Explain why a model is not georeferenced, as ``summary.json`` stores it."""
+    """Explain why a model is not georeferenced, from the reason stored in ``summary.json``."""
     return explain(reason_from_json(GpsReason, stored))
 
 
 def _readable(value: str | int | float) -> str | int | float:
-    """Return the value; the code of a step becomes words."""
+    """Replace the hyphens in names of mapping steps by spaces; return other values unchanged."""
     return value.replace("-", " ") if isinstance(value, str) and value in _STEPS else value
 
 

@@ -1,4 +1,4 @@
-"""Reader of a finished result folder."""
+"""Read summary, model, depth maps, priors and matches of a finished result folder."""
 
 from __future__ import annotations
 
@@ -30,48 +30,50 @@ class RefinedMap:
     """Refined depth of a registered image."""
 
     depth: Float32
-    """(h, w) float32, z in units of the model."""
+    """(h, w) float32 z-depth in units of the COLMAP model."""
     relative_std: Float32
-    """(h, w) float32, std of the depth over the depth."""
+    """(h, w) float32 standard deviation of the depth over the depth."""
     valid: Bool
-    """(h, w) bool."""
+    """(h, w) bool mask of valid depth."""
     camera: PinholeCamera
-    """Camera of the depth grid."""
+    """Pinhole camera of the grid of the depth map."""
     rotation: Float64
-    """(3, 3), of ``cam_from_world``."""
+    """(3, 3) rotation ``cam_from_world`` of the image."""
     translation: Float64
-    """(3,), of ``cam_from_world``."""
+    """(3,) translation ``cam_from_world`` of the image."""
 
 
 @dataclass(frozen=True, eq=False)
 class PriorMaps:
-    """Depth and normal prior of an image."""
+    """Depth prior and normal prior of an image."""
 
     depth: Float32
-    """(h, w) float32, z in the units of the prior."""
+    """(h, w) float32 z-depth in units of the depth provider."""
     relative_std: Float32
-    """(h, w) float32, std of the depth over the depth."""
+    """(h, w) float32 standard deviation of the depth over the depth."""
     normals: Float32
-    """(h, w, 3) float32, unit, camera frame."""
+    """(h, w, 3) float32 unit normals in the camera frame."""
     valid: Bool
-    """(h, w) bool."""
+    """(h, w) bool mask of valid depth."""
     camera: PinholeCamera
-    """Camera of the view (full resolution, not the grid of the prior)."""
+    """Camera of the undistorted image at full resolution, not of the grid of the prior."""
 
 
 @dataclass(frozen=True, eq=False)
 class MatchLines:
-    """Sample of the verified matches of two images, (m, 2) float32 each, pixels of the views."""
+    """Sampled verified matches of two images, as keypoints in pixels of the undistorted images."""
 
     image_a: str
     image_b: str
     points_a: Float32
+    """(m, 2) float32 keypoints in image a."""
     points_b: Float32
+    """(m, 2) float32 keypoints in image b, in the order of the keypoints in image a."""
 
 
 @dataclass(frozen=True, eq=False)
 class ResultFolder:
-    """Results of a run; arrays are read on demand."""
+    """Results of a run, whose arrays are read on demand."""
 
     path: Path
     """Result folder."""
@@ -80,7 +82,7 @@ class ResultFolder:
 
     @classmethod
     def open(cls, path: Path) -> ResultFolder:
-        """Open a result folder; raise :class:`InputError` if its summary cannot be read."""
+        """Open a result folder; raise :class:`InputError` for a missing or damaged summary."""
         summary = read_summary(path / SUMMARY)
         required = {"images", "pairs", "reconstructions", "stages", "providers"}
         if not required <= summary.keys():
@@ -89,7 +91,7 @@ class ResultFolder:
 
     @property
     def failed(self) -> bool:
-        """True if the run failed; models in the folder are then from an earlier run."""
+        """True if the run failed, so that models in the folder are from an earlier run."""
         return bool(self.summary["status"] != "success")
 
     @property
@@ -105,14 +107,14 @@ class ResultFolder:
         return read_model(self.path / "sparse")
 
     def dense_cloud(self) -> tuple[Float64, UInt8]:
-        """Read points (n, 3) and RGB colors (n, 3) of ``dense.ply``, empty if it does not exist."""
+        """Read points (n, 3) and RGB colors (n, 3) of ``dense.ply``, empty without this file."""
         file = self.path / DENSE
         if self.failed or not file.is_file():
             return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
         return read_ply(file)
 
     def refined(self, name: str) -> RefinedMap | None:
-        """Read the refined depth of an image, None if it was not written."""
+        """Read the refined depth of an image, None if the run wrote no depth map."""
         file = self.path / DEPTH / f"{name}.npz"
         if self.failed or not file.is_file():
             return None
@@ -128,7 +130,7 @@ class ResultFolder:
             raise InputError(f"{file} is damaged: {error}") from error
 
     def prior(self, name: str) -> PriorMaps | None:
-        """Read the priors of an image, None if they were not written."""
+        """Read the priors of an image, None if the run wrote no priors."""
         file = self.path / VIEWS / f"{name}.npz"
         if not file.is_file():
             return None
@@ -146,7 +148,7 @@ class ResultFolder:
             raise InputError(f"{file} is damaged: {error}") from error
 
     def picture(self, name: str) -> UInt8 | None:
-        """Read the reduced undistorted view, (h, w, 3) BGR, None if it was not written."""
+        """Read the downscaled undistorted image, (h, w, 3) BGR, None if the run wrote no image."""
         file = self.path / VIEWS / f"{name}.webp"
         if not file.is_file():
             return None
@@ -156,7 +158,7 @@ class ResultFolder:
         return np.asarray(picture, np.uint8)
 
     def matches(self) -> list[MatchLines]:
-        """Read the sampled verified matches of all pairs, empty if they were not written."""
+        """Read the sampled verified matches of all image pairs, empty if not written."""
         file = self.path / VIEWS / MATCHES
         if not file.is_file():
             return []

@@ -1,8 +1,8 @@
-"""Judge a run: good, doubtful, partial or failed, with the reasons for doubt.
+"""Judge a run as good, doubtful, partial or failed, with reasons for doubt.
 
-Registered images are no proof: a model with look-alike places or a wrong focal length registers
-them too. The doubts come from measured evidence (:mod:`mpsfm_core.results.evidence`).
-``benchmarks.real_photos`` shows verdicts next to true pose errors.
+A wrong model, for example with look-alike places or a wrong focal length, also registers images.
+Doubts about a model come from measured evidence (:mod:`mpsfm_core.results.evidence`).
+The benchmark ``benchmarks.real_photos`` compares verdicts with true pose errors.
 """
 
 from __future__ import annotations
@@ -16,48 +16,49 @@ from mpsfm_core.data.decisions import DoubtReason, GpsReason, Reason
 Level = Literal["good", "doubtful", "partial", "failed"]
 
 MIN_PAIR_INLIERS = 50
-"""Inliers that make a verified pair evidence against a model [ours]."""
+"""Minimum number of inliers of a verified pair that counts as evidence against a model [ours]."""
 MAX_UNEXPLAINED_RATIO = 0.1
-"""A pair is unexplained if its images share less than this share of its inliers as points
+"""Share of explained inliers of an image pair below which the model does not explain the pair
 [ours]."""
 MIN_UNEXPLAINED_PAIRS = 2
-"""Unexplained pairs that make a model doubtful [ours]."""
+"""Minimum number of unexplained image pairs that make a model doubtful [ours]."""
 MIN_ANGLE_DEG = 0.5
-"""Median ray angle below which depth rests on the priors [ours]."""
+"""Median triangulation angle in degrees below which depth comes from the priors alone [ours]."""
 MIN_POINTS = 30
-"""Points that the pose of an image needs [COLMAP abs_pose_min_num_inliers]."""
+"""Minimum number of 3D points that support the pose of an image [COLMAP
+abs_pose_min_num_inliers]."""
 MIN_EXPLAINED_RATIO = 0.2
-"""Share of the matches of an image that the model explains [ours]."""
+"""Minimum share of the matches of an image that the model must explain [ours]."""
 
 
 @dataclass(frozen=True)
 class Doubt:
-    """One reason for doubt."""
+    """Reason for doubt about a model, with the affected images."""
 
     reason: Reason
     images: tuple[str, ...] = field(default=())
-    """Images that it concerns; empty if it concerns the whole model."""
+    """Names of the images that the doubt concerns, empty if the doubt concerns the whole model."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Judgment of a run."""
+    """Verdict about a run for users."""
 
     level: Level
     text: str
-    """One sentence for users."""
+    """Verdict in one sentence for users."""
     doubts: tuple[Doubt, ...] = field(default=())
 
 
 def judge(summary: Mapping[str, Any]) -> Verdict:
-    """Judge a run.
+    """Judge a run from its summary.
 
     Args:
-        summary: Content of ``summary.json``.
+        summary: content of ``summary.json``.
 
     Returns:
-        ``failed`` without a model; ``doubtful`` if the evidence is weak or contradicts the model;
-        ``partial`` if images are missing; else ``good``.
+        The verdict, whose level is ``failed`` without a model, ``doubtful`` if the evidence is weak
+        or contradicts the model, ``partial`` if images are not registered, and else ``good``.
     """
     images = summary["images"]
     num_registered, total = len(images["registered"]), images["total"]
@@ -92,10 +93,10 @@ def find_doubts(summary: Mapping[str, Any]) -> Iterator[Doubt]:
 
 
 def is_focal_refined(image: Mapping[str, Any]) -> bool:
-    """Return whether bundle adjustment determined the focal length of an image.
+    """Return whether bundle adjustment refined the focal length of an image successfully.
 
     Args:
-        image: Entry of the image in ``images.details`` of ``summary.json``.
+        image: entry of the image in ``images.details`` of ``summary.json``.
     """
     return "refined_focal_length_px" in image and "focal_length_reason" not in image
 
@@ -121,7 +122,7 @@ def _unexplained_pairs(pairs: list[Mapping[str, Any]]) -> Iterator[Doubt]:
 
 
 def _weak_evidence(evidence: Mapping[str, Any]) -> Iterator[Doubt]:
-    """Yield the doubts about one model."""
+    """Yield doubts from connectivity, parallax, point counts and explained matches of a model."""
     parts = evidence["parts"]
     if len(parts) > 1:
         apart = tuple(name for part in parts[1:] for name in part)

@@ -1,8 +1,8 @@
-"""Scenes for viewers: posed images with pictures and points, from a run or a folder.
+"""Provide scenes of posed images and points from a run or a folder to viewers.
 
-A viewer is a plugin that implements the hook ``mpsfm_viewers``. The hook returns factories, which
-are called as ``factory(output, pictures)`` and return a :class:`Viewer`. During a run the viewer is
-registered as a plugin, so its event hooks are called.
+A viewer is a plugin that implements the hook ``mpsfm_viewers``. The hook ``mpsfm_viewers`` returns
+factories, which are called as ``factory(output, pictures)`` and return a :class:`Viewer`. During a
+run the viewer is registered as a plugin, so its event hooks are called.
 """
 
 from __future__ import annotations
@@ -35,48 +35,48 @@ from mpsfm_core.results.ply import read_ply
 PICTURE_SIDE = 320
 """Longer side of pictures in viewers, in pixels."""
 MAX_RELATIVE_STD = 0.3
-"""Maximum relative std of shown depth; less certain depth would occlude the rest."""
+"""Maximum relative std of shown depth pixels; uncertain pixels would occlude certain pixels."""
 _MAX_PIXELS = 8000
-"""Maximum number of shown pixels of a depth map."""
+"""Maximum number of shown pixels per depth map."""
 
 
 class Viewer(Protocol):
-    """Viewer of scenes."""
+    """Viewer of a sequence of scenes."""
 
     def show(self, scene: SceneState, cloud: ColoredPoints | None = None) -> None:
-        """Show a scene instead of the previous one."""
+        """Show a scene in place of the previous scene."""
         ...
 
     def finish(self) -> str:
-        """Finish after the last scene; return a line that says where to look."""
+        """Finish after the last scene; return a message with the address or file of the viewer."""
         ...
 
     def wait(self) -> None:
-        """Block until the user closes the viewer; return immediately if it writes a file."""
+        """Block until the user closes the viewer; return if it only writes files."""
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class ColoredPoints:
-    """Points with colors."""
+    """Colored points in the world frame."""
 
     xyz: Float64
-    """(n, 3) float64, world coordinates."""
+    """(n, 3) float64 points in world coordinates."""
     rgb: UInt8
-    """(n, 3) uint8."""
+    """(n, 3) uint8 RGB colors of the points."""
 
 
 Pictures = Callable[[str], UInt8 | None]
-"""Returns the reduced RGB image (h, w, 3) uint8 of an image name, None if there is none."""
+"""Function from an image name to the downscaled RGB image (h, w, 3) uint8, None if missing."""
 
 
 def pictures_from_photos(folder: Path) -> Pictures:
-    """Return pictures from a folder of images, None for images that cannot be read."""
+    """Return a function that reads downscaled images from a folder of images."""
     return lambda name: _read_picture(folder / name)
 
 
 def pictures_from_results(folder: Path) -> Pictures:
-    """Return pictures from a result folder."""
+    """Return a function that reads downscaled images from a result folder."""
     return lambda name: _read_picture(folder / VIEWS / f"{name}.webp")
 
 
@@ -98,7 +98,7 @@ def unproject_depth_map(image: PosedImage, picture: UInt8 | None) -> ColoredPoin
 
 
 def select_certain_pixels(depth: DepthPrior) -> Bool:
-    """Return the mask (h, w) of valid pixels with relative std up to :data:`MAX_RELATIVE_STD`."""
+    """Return the mask (h, w) of valid depth with relative std up to :data:`MAX_RELATIVE_STD`."""
     if depth.variance is None:
         return depth.valid
     shown: Bool = depth.valid & (depth.variance <= (MAX_RELATIVE_STD * depth.depth) ** 2)
@@ -106,10 +106,10 @@ def select_certain_pixels(depth: DepthPrior) -> Bool:
 
 
 def read_scene(folder: Path) -> tuple[SceneState, ColoredPoints, Pictures]:
-    """Read a result folder, a COLMAP model or a ``transforms.json`` with ``images/``.
+    """Read a scene from a result folder, COLMAP model or ``transforms.json`` with ``images/``.
 
     Raises:
-        InputError: the folder is none of them.
+        InputError: the folder has none of these three inputs.
     """
     if (folder / SUMMARY).is_file():
         result = ResultFolder.open(folder)
@@ -137,7 +137,7 @@ def scene_from_model(model: pycolmap.Reconstruction) -> tuple[SceneState, Colore
 
 
 def _read_picture(file: Path) -> UInt8 | None:
-    """Read an image reduced and upright, None if it cannot be read."""
+    """Read an image upright and downscaled, None if the image cannot be read."""
     try:
         data = np.frombuffer(file.read_bytes(), np.uint8)
         bgr = cv2.imdecode(data, cv2.IMREAD_COLOR)
