@@ -3,7 +3,7 @@
 The ground truth is a folder of true maps, the points of a COLMAP model, or a reconstruction of the
 images.
 
-:mod:`mpsfm_core.providers.uncertainty.calibration` defines the calibration model.
+The module :mod:`mpsfm_core.providers.uncertainty.calibration` defines the calibration model.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ _log = logging.getLogger(__name__)
 MAX_ROUNDS = 4
 """Maximum number of reconstructions of a self-calibration [ours]."""
 CONVERGENCE_RATIO = 0.05
-"""Relative change of the median std below which a self-calibration has converged [ours]."""
+"""Relative change of the median declared std below which a self-calibration has converged
+[ours]."""
 _METRICS = ("coverage", "coverage_without_scaling", "z_mad", "nll", "nll_heavy", "ause")
 
 
@@ -129,13 +130,14 @@ def compare_prior(
     options: StudyOptions | None = None,
     registry: Registry | None = None,
 ) -> CalibrationData:
-    """Compare a prior with true maps or with the points of a COLMAP model.
+    """Compare depth or normal priors with true maps or with the points of a COLMAP model.
 
-    :func:`~mpsfm_core.calibration.cross_validation.evaluate_calibrations` evaluates the result.
+    The function :func:`~mpsfm_core.calibration.cross_validation.evaluate_calibrations` evaluates
+    the returned samples.
 
     Args:
         photos: Images on which prior and truth are compared.
-        config: Configuration with the provider of the prior.
+        config: Configuration with the depth or normals provider.
         ground_truth: Options of the provider ``files``, which reads the true depth or normal maps.
         kind: Kind of the provider, depth or normals.
         model: COLMAP model whose points are true depth.
@@ -187,7 +189,7 @@ class _Run:
         self._context.run_masks()
 
     def with_files(self, options: Mapping[str, Any]) -> CalibrationResult:
-        """Calibrate the provider with true maps."""
+        """Calibrate the provider with true depth or normal maps."""
         data = self.data_of_files(options)
         return self._finish(data, f"{self._kind} maps in {PurePath(options['directory']).name}")
 
@@ -196,7 +198,7 @@ class _Run:
         return self._finish(self.data_of_model(folder), f"points of a model: {folder.name}")
 
     def data_of_files(self, options: Mapping[str, Any]) -> CalibrationData:
-        """Compare the prior with true maps."""
+        """Compare the prior of the provider with true depth or normal maps."""
         return self._comparison.with_files(options)
 
     def data_of_model(self, folder: Path) -> CalibrationData:

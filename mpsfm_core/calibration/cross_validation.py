@@ -58,7 +58,7 @@ class CalibrationStudy:
     """Calibration, report and warnings of a calibration study."""
 
     calibration: Calibration
-    """Calibration that is fitted to all images."""
+    """Calibration that is fitted to the samples of all images."""
     report: dict[str, Any]
     """All values of the calibration report as plain data."""
     warnings: tuple[str, ...]

@@ -29,8 +29,8 @@ class FileTruth:
         context: Extraction context.
         kind: ``depth`` or ``normals``.
         options: Options of the provider ``files``, which reads the true maps.
-        count: Maximum number of pixels per image.
-        seed: Seed of the pixel sampling.
+        count: Maximum number of sampled pixels per image.
+        seed: Random seed of the pixel sampling.
     """
 
     def __init__(

@@ -57,11 +57,11 @@ class Candidate:
     """Candidate of model selection: a fitted calibration model."""
 
     name: str
-    """Description of the calibration model for the report."""
+    """Short description of the calibration model for the report."""
     fit: StdFit
     """Maximum-likelihood fit of the std to the errors."""
     calibration: Calibration
-    """Calibration with the fitted parameters."""
+    """Calibration with the fitted std parameters."""
     gain: float
     """Gain of the mean log density over the previously selected model; 0 for the first model."""
     standard_error: float
@@ -97,7 +97,7 @@ def std_of(calibration: Calibration, residuals: Residuals) -> Float64:
 
 @dataclass(frozen=True, eq=False)
 class DepthData:
-    """Samples of depth priors, one entry per image.
+    """Samples of prior and true depth, one entry per image.
 
     ``alignments`` are the candidate alignments, the simplest first. ``in_meters`` is True if the
     true depth is in meters.
@@ -108,7 +108,7 @@ class DepthData:
     in_meters: bool = True
 
     def of(self, images: Int64) -> DepthData:
-        """Return the samples of some images."""
+        """Return the samples of a subset of the images."""
         return replace(self, samples=tuple(self.samples[i] for i in images))
 
     def residuals(self, calibration: Calibration, *, scaled: bool = True) -> Residuals:
@@ -135,12 +135,12 @@ class DepthData:
 
 @dataclass(frozen=True, eq=False)
 class NormalData:
-    """Samples of normal priors, one entry per image."""
+    """Samples of prior and true normals, one entry per image."""
 
     samples: tuple[NormalSamples, ...]
 
     def of(self, images: Int64) -> NormalData:
-        """Return the samples of some images."""
+        """Return the samples of a subset of the images."""
         return replace(self, samples=tuple(self.samples[i] for i in images))
 
     def residuals(self, calibration: Calibration, *, scaled: bool = True) -> Residuals:

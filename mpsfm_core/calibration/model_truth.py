@@ -72,8 +72,8 @@ def sample_evenly(
 
     Args:
         truth: True depth at the observed points of a view.
-        size: (width, height) of the view.
-        count: Number of sampled pixels.
+        size: (width, height) of the view in pixels.
+        count: Number of pixels to sample.
         rng: Random generator.
     """
     pixels = rng.uniform((0.0, 0.0), size, (count, 2))

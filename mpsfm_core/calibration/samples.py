@@ -33,7 +33,7 @@ class DepthTruth:
     xy: Float64
     """(n, 2) float64 positions of the samples, COLMAP pixels of the view."""
     depth: Float64
-    """(n,) float64 true z-depth > 0."""
+    """(n,) float64 true z-depth, positive."""
     std: Float64
     """(n,) float64 std of the true log depth; 0 if exact."""
 
@@ -142,7 +142,7 @@ def compare_depth(
     Args:
         name: Name of the image.
         prior: Depth prior.
-        size: (width, height) of the view.
+        size: (width, height) of the view in pixels.
         truth: True depth.
 
     Returns:

@@ -3,9 +3,9 @@
 The likelihood is a mixture of inlier errors and gross errors. An inlier error has a Student t
 distribution with the modeled variance plus the variance of the truth. Errors of networks have
 heavier tails than a normal distribution. A gross error is uniform up to the largest possible error;
-the ratio of gross errors is also fitted. Maximum likelihood determines the ratios between the
-factors ``theta_j``. The common scale of the factors is set such that 68.27 % of the inlier errors
-are within one std. All images have equal weight in the likelihood.
+the ratio of gross errors is also fitted. The maximum of the likelihood determines the ratios
+between the factors ``theta_j``. The common scale of the factors is set such that 68.27 % of the
+inlier errors are within one std. All images have equal weight in the likelihood.
 
 The paper chose the factors of appendix C from calibration plots and the area under sensitivity
 curves. The likelihood rewards a correct ranking and a correct size of the std.
@@ -51,7 +51,7 @@ class StdFit:
     names: tuple[str, ...]
     """Names of the m terms of the std."""
     values: Float64
-    """(m,) factors ``theta_j`` of the terms."""
+    """(m,) fitted factors ``theta_j`` of the std terms."""
     edge_ratio: float | None
     """Minimum ratio of neighboring depths at a depth edge, or None for a model without edges."""
     edge_scale: float
@@ -112,11 +112,11 @@ class _State:
     variance: Float64
     """(n,) modeled variance of each error."""
     total: Float64
-    """(n,) modeled variance plus variance of the truth."""
+    """(n,) modeled variance plus the variance of the true value."""
     inlier: Float64
     """(n,) posterior probability that the error is an inlier."""
     log_density: Float64
-    """(n,) log density of each error."""
+    """(n,) log probability density of each error."""
 
 
 class _Problem:

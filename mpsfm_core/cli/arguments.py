@@ -51,10 +51,10 @@ def distance_thresholds(distances: list[float] | None) -> tuple[float, ...]:
 
 
 def parse_overrides(overrides: list[str] | None) -> dict[str, Any]:
-    """Parse the ``--set`` options of a command without configuration file to a dictionary.
+    """Parse the ``--set KEY=VALUE`` options of a command to a dictionary.
 
     Raises:
-        ConfigError: A ``--set`` option is no assignment.
+        ConfigError: A ``--set`` option does not have the form ``KEY=VALUE``.
     """
     from mpsfm_core.support.yaml_text import parse_assignment
 

@@ -127,12 +127,12 @@ def _parse_result(text: str) -> tuple[str, Path]:
 
 
 def _split_list(text: str) -> tuple[str, ...]:
-    """Split the value of a comma-separated option."""
+    """Split the comma-separated value of a command-line option."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def _compare(first: str, second: str) -> None:
-    """Print the comparison of two finished benchmarks."""
+    """Print the pose AUC differences of two finished benchmarks."""
     from mpsfm_core.evaluation.comparison import (
         compare_benchmarks,
         format_differences,

@@ -54,7 +54,7 @@ def prune(
 ) -> None:
     """Remove cached files that were not used for some time.
 
-    Later runs compute or download missing files again.
+    Later runs compute or download the removed files again.
     """
     from mpsfm_core.extraction.cache import cache_folder
 

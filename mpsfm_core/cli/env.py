@@ -21,7 +21,7 @@ def create(
         str | None, typer.Option(help="Use this interpreter; default: the running one.")
     ] = None,
 ) -> None:
-    """Create an environment with the core and these packages, and list its providers."""
+    """Create an environment with mpsfm-core and the given packages, and list its providers."""
     from mpsfm_core.providers.environments.environment import create_environment
 
     environment, providers = create_environment(name, packages, python)
@@ -31,7 +31,7 @@ def create(
 
 @app.command("list")
 def list_environments() -> None:
-    """List the environments and their providers."""
+    """List the Python environments and their providers."""
     from mpsfm_core.providers.environments.environment import all_environments
 
     for environment in all_environments():
@@ -49,7 +49,7 @@ def refresh(name: Name) -> None:
 
 @app.command()
 def remove(name: Name) -> None:
-    """Delete an environment with all its packages."""
+    """Delete a Python environment with all its packages."""
     from mpsfm_core.providers.environments.environment import remove_environment
 
     remove_environment(name)

@@ -140,8 +140,8 @@ def export(
 ) -> None:
     """Export a network that is not published as a file, from its authors' code and weights.
 
-    The authors' code runs in a subprocess. The exported file is compared with the authors' network,
-    and its provider then finds the file by name.
+    The code of the network's authors runs in a subprocess. The exported file is compared with the
+    authors' network, and its provider then finds the file by name.
     """
     from mpsfm_core.data.errors import InputError, did_you_mean
     from mpsfm_core.providers.environments.environment import find_environment
@@ -221,7 +221,7 @@ def _default_weights() -> Iterator[tuple[str, WeightsFile]]:
 
 
 def _select_files(targets: list[str]) -> list[WeightsFile]:
-    """Resolve provider names and URIs to unique weights files.
+    """Find the unique weights files of provider names and URIs.
 
     Raises:
         InputError: A target is neither a provider with weights nor a URI.
@@ -244,7 +244,7 @@ def _select_files(targets: list[str]) -> list[WeightsFile]:
 
 
 def _resolve_targets(targets: list[str], overrides: list[str]) -> list[tuple[str, WeightsFile]]:
-    """Resolve configurations, providers and URIs to unique (provider name, weights file)."""
+    """Find the unique pairs (provider, weights file) of configurations, providers and URIs."""
     from mpsfm_core.config import load_config, shipped_configs
     from mpsfm_core.pipeline.provider_resolution import preview_providers
     from mpsfm_core.providers.registry import Registry

@@ -63,14 +63,14 @@ class ProgressBars:
 
     @hookimpl
     def mpsfm_stage_started(self, stage: str, total: int | None) -> None:
-        """Add the progress bar of a stage."""
+        """Add the progress bar of a pipeline stage."""
         self._tasks[stage] = self._progress.add_task(stage, total=total)
         self._remaining.start_stage(stage, total)
         self._update_run()
 
     @hookimpl
     def mpsfm_stage_progress(self, stage: str, done: int, total: int) -> None:
-        """Advance the progress bar of a stage."""
+        """Advance the progress bar of a pipeline stage."""
         if stage in self._tasks:
             self._progress.update(self._tasks[stage], completed=done, total=total)
         self._remaining.update_stage(stage, done, total)
@@ -78,7 +78,7 @@ class ProgressBars:
 
     @hookimpl
     def mpsfm_stage_finished(self, stage: str, seconds: float) -> None:
-        """Complete the progress bar of a stage."""
+        """Complete the progress bar of a pipeline stage."""
         self._remaining.finish_stage(stage)
         self._update_run()
         task = self._tasks.pop(stage, None)
@@ -104,14 +104,14 @@ class ProgressBars:
 
 
 class ProgressLines:
-    """Progress output for log files: one line per finished stage."""
+    """Progress output for log files with one line per finished stage."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
 
     @hookimpl
     def mpsfm_notice(self, text: str) -> None:
-        """Print a message of the run."""
+        """Print a message of the reconstruction run."""
         self._console.print(text, markup=False, soft_wrap=True)
 
     @hookimpl

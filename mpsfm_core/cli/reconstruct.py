@@ -106,7 +106,7 @@ def run(
     Args:
         images: Folder of images, or a video.
         output: Output folder.
-        config: Name or file of the configuration.
+        config: Name or file path of the configuration.
         quiet: If true, print neither progress nor summary.
         viewer: Name of a viewer that shows the run.
         arguments: Further arguments of :func:`mpsfm_core.pipeline.run.reconstruct`.

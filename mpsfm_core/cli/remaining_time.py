@@ -43,7 +43,7 @@ class RemainingTimeEstimator:
 
     Args:
         cache_dir: Cache folder, in which stage speeds are stored for the next run.
-        clock: Function that returns the time in seconds.
+        clock: Function that returns the current time in seconds.
     """
 
     def __init__(

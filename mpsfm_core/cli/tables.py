@@ -13,7 +13,7 @@ _PIPE_WIDTH = 2000
 
 
 def print_table(header: Sequence[str], rows: Iterable[Sequence[str | Text]]) -> None:
-    """Print a table with header; texts are never interpreted as markup of rich."""
+    """Print a table with header; rich does not interpret brackets in the cells as markup."""
     console = Console(highlight=False)
     if not console.is_terminal:
         console.width = _PIPE_WIDTH

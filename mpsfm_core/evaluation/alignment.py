@@ -47,7 +47,7 @@ class TrajectoryErrors:
 
     @property
     def ate_rmse(self) -> float:
-        """Absolute trajectory error: RMSE of the aligned camera centers."""
+        """Absolute trajectory error: RMSE between aligned and true camera centers."""
         return _rms(self.centers)
 
     @property
@@ -65,8 +65,8 @@ def umeyama(a: Float64, b: Float64) -> SimilarityTransform:
     """Fit the least-squares similarity transform ``b_from_a`` (Umeyama, PAMI 1991).
 
     Args:
-        a: (n, 3) points in frame a.
-        b: (n, 3) points in frame b.
+        a: (n, 3) corresponding points in frame a.
+        b: (n, 3) corresponding points in frame b.
 
     Raises:
         ValueError: All points in one of the frames coincide, so the scale is undefined.

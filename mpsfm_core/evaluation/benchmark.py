@@ -56,7 +56,8 @@ class BenchmarkPlan:
     buckets: tuple[str, ...] | None = None
     """Names of the overlap buckets whose test sets are reconstructed, or None for all buckets."""
     priors: tuple[str, ...] = ("config",)
-    """Prior qualities (:mod:`~mpsfm_core.evaluation.prior_quality`) with which mpsfm runs."""
+    """Qualities of the depth priors (:mod:`~mpsfm_core.evaluation.prior_quality`) with which mpsfm
+    runs."""
     peers: tuple[str, ...] = PEER_METHODS
     """Names of :data:`~mpsfm_core.evaluation.methods.PEER_METHODS`."""
     overrides: tuple[str, ...] = ()
@@ -76,7 +77,7 @@ def run_benchmark(
     registry: Registry | None = None,
     on_record: RecordCallback | None = None,
 ) -> list[BenchmarkRecord]:
-    """Run a benchmark and return the records of all runs, cached and new.
+    """Run a benchmark and return the records of all test sets and methods, cached or new.
 
     If a mapper fails, its record contains the error.
 
@@ -84,7 +85,7 @@ def run_benchmark(
         plan: What to run.
         output: Output folder of the benchmark records.
         registry: Registry of plugins.
-        on_record: Callback for each record, cached or new.
+        on_record: Callback for each benchmark record, cached or new.
 
     Raises:
         InputError: A name in the benchmark plan is unknown, or a scene folder is invalid.
@@ -139,11 +140,11 @@ class PreparedSets(NamedTuple):
     """Extraction results for all images of the benchmark's test sets."""
 
     problem: MappingProblem
-    """Priors and verified matches, before keypoint adjustment."""
+    """Priors and verified matches of the images, before keypoint adjustment."""
     images: ImageSet
     """Images of all test sets."""
     config: Config
-    """Configuration with resolved providers."""
+    """Configuration in which each block has one available provider."""
     registry: Registry
     """Registry of plugins."""
 

@@ -26,7 +26,7 @@ class _RelativePose(NamedTuple):
     pose: Pose
     """``cam_b_from_cam_a``."""
     num_inliers: int
-    """Number of inlier matches."""
+    """Number of matches that are inliers of the relative pose."""
 
 
 def estimate_chained_poses(problem: MappingProblem, seed: int = 0) -> list[dict[str, Pose]]:

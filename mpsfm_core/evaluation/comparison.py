@@ -33,7 +33,7 @@ RESAMPLES = 2000
 """Number of resamples of the bootstrap and of the randomization test."""
 _CONFIDENCE = 0.95
 _ROUNDING = 1e-9
-"""Tolerance of AUC comparisons for floating-point rounding."""
+"""Tolerance for floating-point rounding when AUC differences are compared."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class AucDifference:
     method: str
     """Label of the mapper, with its prior quality."""
     sets: int
-    """Number of common test sets."""
+    """Number of test sets that both benchmarks have in common."""
     unit: str
     """Resampled unit: ``sets`` or ``pairs``."""
     auc: Mapping[int, tuple[float, float]]
@@ -98,7 +98,7 @@ def compare_benchmarks(
         second: Records of the second benchmark by method.
         convention: Convention of the pose AUC for image pairs, translation sign and integration.
         resamples: Number of resamples.
-        seed: Seed of the random resampling.
+        seed: Random seed of the bootstrap and of the randomization test.
 
     Raises:
         InputError: The benchmarks have no test set and method in common.
@@ -164,7 +164,7 @@ def _method_name(method: str, pair: tuple[BenchmarkRecord, BenchmarkRecord]) -> 
 
 
 def _unordered_errors(record: BenchmarkRecord, convention: PoseConvention) -> Float64:
-    """Return pose errors (pairs, orders) in degrees, with both orders of a pair in one row."""
+    """Return relative pose errors (pairs, orders) in degrees, one row per image pair."""
     errors = record.errors_deg(convention)
     count = len(record.truth)
     if not convention.ordered:

@@ -31,7 +31,7 @@ class DenseEvaluation:
     dense: DenseOptions
     """Options of densification."""
     results: ResultOptions
-    """Options of the fused point cloud."""
+    """Options of the point cloud that is fused from the depth maps."""
     scene: SceneFolder
     """Scene folder with true depth maps."""
     distances: tuple[float, ...]
@@ -59,16 +59,16 @@ def evaluate_dense_geometry(
     depth maps of the reconstructed images are the true cloud.
 
     Args:
-        model: Reconstruction with depth maps.
+        model: Reconstruction of the test set with depth maps.
         cloud: (n, 3) points of the dense cloud, world frame of the reconstruction.
         scene: Scene folder.
         cameras: Undistorted cameras of the true depth maps by image name.
         distances: Distance thresholds of the point cloud in meters.
 
     Returns:
-        Plain data: ``depth``, the mean of
-        :func:`~mpsfm_core.evaluation.depth_accuracy.depth_accuracy` over the maps, and ``cloud``,
-        see :func:`~mpsfm_core.evaluation.cloud_accuracy.cloud_accuracy`. The result is None without
+        Plain data: Accuracy by key. The key ``depth`` has the mean depth accuracy over the images.
+        The key ``cloud`` has the result of
+        :func:`~mpsfm_core.evaluation.cloud_accuracy.cloud_accuracy`. The result is None without
         true depth or with fewer than three cameras.
 
     Raises:

@@ -93,7 +93,7 @@ def sample_depth_at_truth(
 
 
 def mean_accuracy(images: Sequence[DepthAccuracy]) -> dict[str, float]:
-    """Average the depth accuracy over images and sum ``pixels``, as plain data for JSON."""
+    """Average the depth accuracy over images as plain data, and sum the number of pixels."""
     rows = [asdict(image) for image in images]
     means = {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
     return {**means, "pixels": sum(row["pixels"] for row in rows), "images": len(rows)}

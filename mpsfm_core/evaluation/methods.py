@@ -32,9 +32,9 @@ OURS = "ours"
 CHAINED_PNP = "chained-pnp"
 """Name of the baseline without a mapper (:mod:`~mpsfm_core.evaluation.chained_pnp`)."""
 PRIOR_METHODS = (OURS, CHAINED_PNP)
-"""Methods that use depth priors and therefore run with each prior quality."""
+"""Names of the methods that use depth priors and therefore run with each prior quality."""
 PEER_METHODS = (CHAINED_PNP, *PEERS)
-"""Methods with which the benchmark compares mpsfm."""
+"""Names of the mappers with which the benchmark compares mpsfm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +65,7 @@ class MethodRun:
     method: str
     """Name of the method: :data:`OURS` or one of :data:`PEER_METHODS`."""
     problem: MappingProblem
-    """Mapping problem of the test set."""
+    """Mapping problem (images, priors and verified matches) of the test set."""
     options: MapperOptions
     """Options of mpsfm."""
     dense: DenseEvaluation | None = None
@@ -92,7 +92,7 @@ def run_methods(
 
 
 def run_method(run: MethodRun) -> MethodResult:
-    """Run a method in the current process; an exception becomes the error of the result."""
+    """Run a benchmark method in this process; an exception becomes the error of the result."""
     started, cpu_started = time.perf_counter(), time.process_time()
     models: list[dict[str, Pose]] = []
     reconstructions: Sequence[Reconstruction] = ()
@@ -127,7 +127,7 @@ class _WorkerProcesses:
         self._processes: list[ProcessPoolExecutor] = []
 
     def run(self, run: MethodRun) -> MethodResult:
-        """Run a method in the subprocess of the calling thread."""
+        """Run a benchmark method in the subprocess of the calling thread."""
         process = getattr(self._local, "process", None) or self._start_process()
         try:
             return process.submit(run_method, run).result()
@@ -136,7 +136,7 @@ class _WorkerProcesses:
             return MethodResult(error="its process died")
 
     def close(self) -> None:
-        """Shut down all subprocesses of the pool."""
+        """Shut down all subprocesses of the process pool."""
         for process in self._processes:
             process.shutdown(wait=True, cancel_futures=True)
 

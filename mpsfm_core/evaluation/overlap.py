@@ -39,7 +39,7 @@ _ONES: UInt8 = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).su
 
 @dataclass(frozen=True, eq=False)
 class Overlap:
-    """Two-view and three-view overlap of n views."""
+    """Two-view and three-view overlap of n views of a scene."""
 
     names: tuple[str, ...]
     """Names of the n views."""
@@ -122,7 +122,7 @@ def _downsample(camera: PinholeCamera, depth: Float32) -> tuple[PinholeCamera, F
 
 
 def _sees(camera: PinholeCamera, depth: Float32, pose: Pose, world: Float64) -> Bool:
-    """Return the mask (n,) of world points (n, 3) that a view sees at consistent depth."""
+    """Return the mask (n,) of world points (n, 3) that agree with the depth map of a view."""
     local = transform(*pose, world)
     xy = project(camera, local)
     within = inside(xy, camera.size)

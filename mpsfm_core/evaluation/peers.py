@@ -96,8 +96,8 @@ def run_peer(name: str, problem: MappingProblem) -> list[dict[str, Pose]]:
 def write_database(problem: MappingProblem, path: Path) -> None:
     """Write keypoints, verified matches and two-view geometries as a COLMAP database.
 
-    A COLMAP image id is the image index in the mapping problem plus one. Each image has its own
-    camera.
+    A COLMAP image id is the image index in the mapping problem plus one. In the COLMAP database,
+    each image has its own camera.
     """
     with pycolmap.Database.open(path) as database:
         for number, image in enumerate(problem.images, start=1):

@@ -26,7 +26,7 @@ from mpsfm_core.support.files import write_file
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors, degrade_depth
 
 QUALITIES = ("sensor", "degraded", "config")
-"""Names of the prior qualities."""
+"""Names of the qualities of depth priors."""
 SENSOR_STD = 0.01
 """Relative std that is declared for true depth."""
 _MILLIMETER = 0.001
@@ -34,7 +34,7 @@ _MILLIMETER = 0.001
 
 
 def parse_error_seed(quality: str) -> int | None:
-    """Parse the error seed of a quality ``degraded-N``, or return None for other qualities."""
+    """Parse the random seed N of a prior quality ``degraded-N``; None for other qualities."""
     match = re.fullmatch(r"degraded(?:-(\d+))?", quality)
     return int(match[1] or 0) if match else None
 
@@ -42,12 +42,12 @@ def parse_error_seed(quality: str) -> int | None:
 def prior_overrides(
     quality: str, scene: SceneFolder, images: Iterable[str], work: Path
 ) -> tuple[str, ...]:
-    """Return the settings ``KEY=VALUE`` that select depth priors of a quality.
+    """Return the settings ``KEY=VALUE`` that select depth priors of the given quality.
 
     Args:
         quality: Prior quality.
         scene: Scene folder.
-        images: Names of the images.
+        images: Names of the images of the scene.
         work: Folder to which degraded depth maps are written.
 
     Raises:

@@ -20,7 +20,7 @@ from mpsfm_core.support.files import write_file
 from mpsfm_core.support.format_versions import VERSION, check_version
 
 FORMAT = 1
-"""Format version of the record files."""
+"""Format version of the benchmark record files."""
 RUNS = "runs"
 """Folder of the records below a benchmark's output folder."""
 
@@ -56,8 +56,8 @@ class BenchmarkRecord:
     others: Sequence[Mapping[str, Pose]] = ()
     """Poses ``cam_from_world`` by image name of each further model."""
     dense: Mapping[str, Any] | None = None
-    """Dense evaluation from :func:`~mpsfm_core.evaluation.dense_geometry.evaluate_dense_geometry`,
-    or None."""
+    """Accuracy of the dense results from
+    :func:`~mpsfm_core.evaluation.dense_geometry.evaluate_dense_geometry`, or None."""
 
     def errors_deg(self, convention: PoseConvention) -> Float64:
         """Compute the relative pose errors of all image pairs of the test set in degrees."""
@@ -73,7 +73,7 @@ class BenchmarkRecord:
 
     @property
     def name(self) -> tuple[str, str, str, str]:
-        """Scene, configuration, test set and label, which identify a run across benchmarks."""
+        """Scene, configuration, test set and method label, which identify a benchmark run."""
         return self.scene, self.config, self.set_name, self.label
 
 
@@ -83,7 +83,7 @@ def record_file(scene: str, config: str, set_name: str, label: str) -> Path:
 
 
 def write_record(output: Path, record: BenchmarkRecord) -> None:
-    """Write a record atomically."""
+    """Write a benchmark record atomically to its file."""
     path = output / record.file
     content = {VERSION: FORMAT, **asdict(record)}
     content["estimated"] = _flatten_poses(record.estimated)

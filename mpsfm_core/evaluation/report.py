@@ -62,7 +62,7 @@ class BenchmarkRow:
     auc: Mapping[int, float]
     """Pose AUC in percent of the pooled errors of all test sets, by threshold in degrees."""
     registered: float
-    """Ratio of the images that are registered."""
+    """Ratio of registered images to images of the test sets."""
     seconds: float
     """Mean wall time per test set in seconds."""
     cpu_seconds: float
@@ -155,7 +155,7 @@ def list_failures(records: Iterable[BenchmarkRecord]) -> list[str]:
 
 
 def write_report(output: Path, records: Sequence[BenchmarkRecord]) -> None:
-    """Write ``report.md``, ``report.json`` (all conventions) and ``report.html``."""
+    """Write ``report.md``, ``report.json`` (with all AUC conventions) and ``report.html``."""
     convention = CONVENTIONS["paper"]
     rows, failed = build_rows(records), list_failures(records)
     text = format_markdown(rows, convention)

@@ -56,7 +56,7 @@ class SamplingOptions:
     attempts: int = 20
     """Number of random start images that are tried per requested test set."""
     seed: int = 0
-    """Seed of the random generator."""
+    """Random seed of the sampling."""
 
 
 def sample_buckets(overlap: Overlap, options: SamplingOptions | None = None) -> dict[str, Any]:

@@ -62,7 +62,7 @@ class SceneFolder:
     truth: Mapping[str, Pose]
     """True poses ``cam_from_world`` by image name."""
     sets: tuple[EvaluationSet, ...]
-    """Test sets of all buckets."""
+    """Test sets of all overlap buckets."""
 
     @property
     def name(self) -> str:

@@ -30,7 +30,7 @@ def build_true_surface(
 
     Args:
         folder: Folder of true depth maps as 16-bit PNG files in millimeters.
-        images: Names of the images.
+        images: Names of the images whose true depth maps are used.
         cameras: Undistorted cameras, at any image size, by image name.
         poses: True poses ``cam_from_world`` by image name.
         spacing: Side in meters of grid cubes; each depth map contributes at most one point per

@@ -1,1 +1,1 @@
-"""Extraction runs all providers: features, pairs, verified matches and priors."""
+"""Extraction of features, image pairs, verified matches and priors by providers."""

@@ -32,9 +32,9 @@ class Usage:
     """Number of results and computing time of a provider in a run."""
 
     computed: int = 0
-    """Number of results that the provider computed."""
+    """Number of results that the provider computed in the run."""
     cached: int = 0
-    """Number of results from the cache."""
+    """Number of results that were loaded from the cache."""
     seconds: float = 0.0
     """Computing time in seconds, summed over all workers."""
 
@@ -75,7 +75,7 @@ class ActiveProvider:
 
     @property
     def instance(self) -> Any:
-        """The provider instance of this thread."""
+        """Provider instance of the calling thread."""
         if not hasattr(self._local, "provider"):
             # The lock makes one thread import libraries and download weights, not all threads.
             with self._lock:
@@ -96,12 +96,12 @@ class ActiveProvider:
         and a new instance computes further results.
 
         Args:
-            key: Key of the result in the cache.
+            key: Key of the provider result in the cache.
             compute: Function that computes the result with a provider instance.
             timeout_s: Time limit of the computation in seconds, or None for no limit.
 
         Raises:
-            ProviderRunError: the time limit is exceeded.
+            ProviderRunError: the computation exceeds the time limit.
         """
         provider = self.instance
         started = time.perf_counter()

@@ -70,7 +70,7 @@ class Cache:
         """Store an object as a cache entry.
 
         Raises:
-            OutputError: the disk is full or fails.
+            OutputError: the entry cannot be written to disk.
         """
         path, arrays = self._path(kind, key), cast(Any, pack(value))
         try:

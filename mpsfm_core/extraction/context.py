@@ -54,7 +54,7 @@ class ExtractionContext:
         self._masks: dict[int, tuple[UInt8, str]] = {}
 
     def provider(self, kind: Kind, backend: ProviderConfig) -> ActiveProvider:
-        """Create a provider for this run."""
+        """Create the provider of a configuration block for this run."""
         provider = ActiveProvider(kind, backend, self.registry, self.config.runtime)
         self.providers.append(provider)
         return provider
@@ -71,7 +71,7 @@ class ExtractionContext:
 
         Args:
             stage: Name of the stage, for progress messages.
-            items: Input of each call of ``work``.
+            items: Inputs of the calls of ``work``, one per call.
             work: Function that computes the result of one item.
             providers: Providers that the stage uses; each provider limits the number of threads.
             local: If true, the stage runs on this machine even if a remote executor is configured.

@@ -55,7 +55,7 @@ class AdjustmentOptions(Options):
 
     enabled: bool = True
     """Refine keypoints to a fraction of a pixel; false uses the detected positions [reference].
-    Imported keypoints are never refined."""
+    Keypoints imported from other programs are never refined."""
 
 
 class ExtractionOptions(Options):

@@ -30,8 +30,8 @@ def run_stage(
 
     Args:
         events: Receiver of progress; called in the calling thread.
-        stage: Name of the stage.
-        items: Input of each call of ``work``.
+        stage: Name of the extraction stage, for progress messages.
+        items: Inputs of the calls of ``work``, one per call.
         work: Function that computes the result of one item.
         workers: Number of threads.
         remote: Generator that yields whenever a remote worker has written an item's result to the

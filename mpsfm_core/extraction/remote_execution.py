@@ -90,7 +90,7 @@ class RemoteStep:
     """Pickled function that processes an item of a stage on any machine."""
 
     run: str
-    """Identifier of the run; a worker caches the providers of its latest run only."""
+    """Identifier of the run; a remote worker keeps only the providers of its latest run."""
     stage: str
     images: ImageSet
     config: Config

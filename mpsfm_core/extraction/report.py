@@ -24,7 +24,7 @@ def describe(
     """Describe pairs, images and providers of an extraction.
 
     Args:
-        context: Images, failures and providers of the run.
+        context: Context of the extraction with images, failures and providers.
         problem: Input of the mapper with images and verified pairs.
         proposed: Number of selected pairs before plugins filter the pairs.
         candidates: Candidate matches of all matched pairs.

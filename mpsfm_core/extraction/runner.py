@@ -61,13 +61,13 @@ def extract(
     events: ExtractionEvents | None = None,
     imported: ImportedMatches | None = None,
 ) -> Extraction:
-    """Run all providers of a configuration.
+    """Run all providers of a configuration on a set of images.
 
     Cached results are not computed again, so an interrupted run continues where it stopped.
 
     Args:
         images: The images.
-        config: Configuration with resolved providers.
+        config: Configuration in which each block has one available provider.
         registry: The installed providers.
         events: Receives progress.
         imported: Imported keypoints and matches, which are verified and replace feature extraction,
@@ -79,7 +79,7 @@ def extract(
     Raises:
         InputError: a provider, its weights or its files are missing, or the configured providers
             are incompatible.
-        ProviderRunError: a provider failed.
+        ProviderRunError: a provider failed on an image.
         ProviderOutputError: the output of a provider violates the provider contract.
         ConfigError: the executor is unavailable, or its workers do not share the cache.
         OutputError: the cache cannot be written.
@@ -100,13 +100,13 @@ def extend_matches(
     unconstrained: Collection[int],
     events: ExtractionEvents | None = None,
 ) -> Extraction:
-    """Extend an extraction by matches of the images that the fast pass does not constrain.
+    """Extend the extraction of a fast first pass by matches of unconstrained images.
 
     Depth and normals of the first pass are reused. Raises the same errors as :func:`extract`.
 
     Args:
         images: The images.
-        config: Configuration whose ``features`` and matchers are used.
+        config: Configuration with the feature provider and matchers of the second pass.
         registry: The installed providers.
         first: Extraction result of the fast first pass.
         unconstrained: Indices of the images to match again; each new pair contains at least one of
@@ -136,7 +136,7 @@ def adjust_problem(
 
     Args:
         images: The images.
-        config: Configuration with the options of adjustment.
+        config: Configuration with the options of keypoint adjustment.
         registry: The installed providers.
         problem: Mapping problem to adjust, with all or a part of its image pairs.
     """

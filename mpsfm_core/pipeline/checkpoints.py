@@ -64,7 +64,7 @@ class MappingCheckpoints:
 
     Args:
         cache_dir: Cache folder, or None for the platform's cache folder.
-        problem: Input of the mapper.
+        problem: Input of the mapper (images, priors and verified matches).
         options: Options of the mapper.
         stages: Receiver of messages to the user.
         every_s: Minimum seconds between checkpoints; the interval is extended if writing is slow.
@@ -92,7 +92,7 @@ class MappingCheckpoints:
             self._path.unlink()
 
     def load(self) -> CheckpointArrays | None:
-        """Load the mapper state from the checkpoint, or None if missing or invalid."""
+        """Load the mapper state, or return None if the checkpoint is missing or invalid."""
         self._clear_up()
         if not self._path.is_file():
             return None
@@ -196,13 +196,13 @@ class DenseCheckpoints:
         try:
             self._cache.store("dense", self._key(name), depth)
         except OutputError as error:
-            with self._warning_lock:  # several threads save images
+            with self._warning_lock:  # several threads save depth maps
                 if not self._failed:
                     _log.warning(_DISK_ERROR, error)
                 self._failed = True
 
     def forget(self) -> None:
-        """Delete the stored depth of all images."""
+        """Delete the stored stereo depth of all images."""
         for name in self._names:
             self._cache.forget("dense", self._key(name))
 
@@ -214,7 +214,7 @@ def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], CheckpointArrays]:
     """Read header and mapper state of a checkpoint file.
 
     Raises:
-        DataError: the checkpoint file is damaged.
+        DataError: the checkpoint file is damaged or incomplete.
     """
     try:
         arrays = read_npz(path)

@@ -45,8 +45,8 @@ def densify_model(
     """Compute and write depth maps of a posed model by multi-view stereo.
 
     The depth search of an image starts from its map in ``model/depth`` of a result folder. Without
-    such a map, the search starts from the depth range of the image's 3D points. Images without map
-    and points are omitted.
+    such a map, the search starts from the depth range of the image's 3D points. Images without
+    depth map and without 3D points are omitted.
 
     Args:
         model: COLMAP model, ``transforms.json`` or result folder.
@@ -56,7 +56,7 @@ def densify_model(
         workers: Number of threads, or None for one thread per core.
 
     Returns:
-        Report of the dense stage.
+        Report of the dense stage as plain data.
 
     Raises:
         InputError: model or photos cannot be read, image names do not match, the model has no

@@ -33,7 +33,7 @@ from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 _FIRST_KERNELS = ("bundles", "depth")
-"""Kernels that the first and the second compilation process compile first."""
+"""Numba kernels that the first and the second process compile first."""
 _PACKAGES = ("geometry", "providers/builtin", "extraction", "optimize", "mapping", "dense")
 _SOURCES = tuple(f"{package}/**/*.py" for package in _PACKAGES)
 _CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)

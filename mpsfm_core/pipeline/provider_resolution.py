@@ -35,7 +35,7 @@ class ProviderChoice:
     """Name of the configuration block, such as ``depth`` or ``masks.0``."""
     provider: ProviderSpec
     origin: str
-    """Distribution and version of the provider."""
+    """Name and version of the Python distribution that contains the provider."""
     reason: ChoiceReason
     passed_over: Mapping[str, Reason] = field(default_factory=dict)
     """Reasons why preferred providers are unavailable, by provider name."""
@@ -79,7 +79,7 @@ def resolve_providers(
     Blocks for which no provider can be available raise an error before the first download.
 
     Args:
-        config: Configuration of the run.
+        config: Configuration that may name several candidate providers per block.
         registry: Installed providers.
         stages: Receiver of messages about choices and downloads.
         blocks: Names of the configuration blocks that get a provider; other blocks stay unchanged.

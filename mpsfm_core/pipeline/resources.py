@@ -114,9 +114,9 @@ def estimate_resources(
     """Estimate memory and disk space of a run.
 
     Args:
-        sizes: (width, height) of the undistorted views.
-        config: Configuration with resolved providers.
-        providers: Specifications of the chosen providers.
+        sizes: (width, height) of the undistorted images in pixels.
+        config: Configuration in which each block has one available provider.
+        providers: Specifications (requirements and weights) of the chosen providers.
         networks: Size in bytes of the weights of each network, see :func:`measure_weights`.
         workers: Number of worker threads; default: the number in ``config.runtime``.
     """
@@ -139,7 +139,7 @@ def reduce_workers(
 
     Args:
         estimate: Function that estimates the resources for a number of workers.
-        workers: Maximum number of workers.
+        workers: Maximum number of worker threads.
         free_mb: Free memory, MB.
     """
     counts = range(workers, 1, -1)

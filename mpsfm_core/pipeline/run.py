@@ -200,7 +200,7 @@ class _Run:
         return result
 
     def _resolve_providers(self) -> None:
-        """Choose providers and download weights before any image is decoded."""
+        """Choose providers and download their weights before any image is decoded."""
         if not is_video(self._source.images):
             find_images(self._source.images)  # a missing folder must not cause downloads
         with self._stages.stage("providers"):
@@ -446,7 +446,7 @@ class _Run:
         """Report estimated memory and disk space; use fewer workers if memory is short.
 
         Raises:
-            InputError: the run exceeds memory or disk even with one worker.
+            InputError: the estimated memory or disk space is too large even with one worker.
         """
         config = self._config
         store = WeightStore(config.runtime.cache_dir, offline=True)

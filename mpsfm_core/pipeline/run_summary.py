@@ -53,8 +53,8 @@ def summarize_run(
     Args:
         status: ``success`` or ``failed``.
         resolution: Configuration with one provider per block, and the reasons of the choices.
-        stages: Records of times, memory and warnings.
-        usage: Provider entries of the extraction report.
+        stages: Recorder of the times, peak memory and warnings of all stages.
+        usage: Entries of the extraction report with the number of results per provider.
     """
     return {
         VERSION: SUMMARY_FORMAT,

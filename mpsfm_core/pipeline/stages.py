@@ -68,7 +68,7 @@ class Stages:
             self.stage_finished(name, time.perf_counter() - started)
 
     def report(self) -> dict[str, StageRecord]:
-        """Return the records of all stages in order; running stages have their current values.
+        """Return the duration and memory records of all stages, including running stages.
 
         Steps within a stage (features, depth, ...) are not recorded.
         """
@@ -78,7 +78,7 @@ class Stages:
         return StageRecord(time.perf_counter() - self._running[name], peak_memory_mb())
 
     def notice(self, text: str) -> None:
-        """Show one line to the user."""
+        """Show a message of one line to the user."""
         self._registry.call_hook("mpsfm_notice", text=text)
 
     def warn(self, text: str) -> None:

@@ -44,8 +44,8 @@ def import_scene(kind: str, source: Path, target: Path, every: int = 1) -> Scene
         every: Step between imported images; n imports every n-th image.
 
     Raises:
-        InputError: The dataset is unknown, the source does not have its layout, or the target is
-            not empty.
+        InputError: The dataset is unknown, the source folder does not have the layout of the
+            dataset, or the target folder is not empty.
     """
     if kind not in IMPORTERS:
         raise InputError(f"no dataset {kind!r}{did_you_mean(kind, IMPORTERS)}")

@@ -19,7 +19,7 @@ from mpsfm_core.geometry.pycolmap_conversion import camera_key
 from mpsfm_core.inputs.image_header import read_header
 
 PHOTOS = (".jpg", ".jpeg", ".png")
-"""Suffixes of image files."""
+"""Suffixes of image files that importers accept."""
 _MAX_DEPTH_COLUMNS = 1024
 """Maximum number of columns of a depth map that is resampled to another camera."""
 

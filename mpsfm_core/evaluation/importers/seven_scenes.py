@@ -21,7 +21,7 @@ from mpsfm_core.evaluation.importers.frames import Frame, invert_pose, photo_siz
 _FOCAL_RATIO = 585 / 640
 """Focal length of 7-Scenes relative to the image width."""
 _UNKNOWN = 65535
-"""Depth image value of pixels without depth."""
+"""Value of pixels without depth in the depth images of 7-Scenes."""
 
 
 def read_frames(source: Path) -> list[Frame]:

@@ -41,7 +41,7 @@ def snap_to_keypoints(
     If several dense matches are nearest to a keypoint, the match with the best score is used.
 
     Args:
-        dense: Dense matches of the pair.
+        dense: Dense matches of the image pair.
         keypoints_a: (n, 2) keypoints of the first view, pixels.
         keypoints_b: (k, 2) keypoints of the second view, pixels.
         radius_px: Maximum distance between dense match and keypoint, pixels.
@@ -58,10 +58,10 @@ def sample_dense_matches(
 ) -> PointMatches:
     """Select confident dense matches that are distant from keypoints and from each other.
 
-    See the MP-SfM paper, appendix "two-view correspondences".
+    The selection follows the appendix "two-view correspondences" of the MP-SfM paper.
 
     Args:
-        dense: Dense matches of the pair.
+        dense: Dense matches of the image pair.
         keypoints_a: (n, 2) keypoints of the first view, pixels.
         keypoints_b: (k, 2) keypoints of the second view, pixels.
     """

@@ -101,7 +101,7 @@ class KeypointAdjuster:
     """Adjusts the keypoints of all images of a run.
 
     Args:
-        context: Views, options and progress of the run.
+        context: Context of the extraction with images, options and progress.
         keypoints: (n, 2) keypoints of each image, pixels.
         std_px: Standard deviation of the keypoints of each image.
     """
@@ -148,7 +148,7 @@ def select_best_matches(
     Args:
         pairs: Verified pairs.
         counts: Number of keypoints of each image.
-        max_matches: Number of best matches per keypoint.
+        max_matches: Number of best matches to select per keypoint.
 
     Returns:
         Image pairs with their selected matches; pairs without selected matches are omitted.

@@ -46,7 +46,7 @@ class CandidateMatches:
 
     pair: Pair
     sparse: SparseMatches
-    """Matches between detected features."""
+    """Matches between detected keypoints."""
     points: PointMatches
     """Matches sampled from dense matches; match indices count ``sparse`` first, then ``points``."""
     std_px: float

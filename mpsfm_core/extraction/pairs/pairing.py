@@ -47,7 +47,7 @@ def most_similar_pairs(
     Args:
         similarity: (n, n) similarity of all images.
         count: Number of most similar images that each image is paired with.
-        min_similarity: Minimum similarity of a pair.
+        min_similarity: Minimum similarity of a paired image.
         images: Indices of the images that are paired with similar images; default: all images.
     """
     ranked = similarity.copy()
@@ -60,7 +60,7 @@ def most_similar_pairs(
 
 
 def numbered_neighbor_pairs(names: Sequence[str], options: PairOptions) -> list[Pair]:
-    """Pair each image with the following images of its numbered sequence.
+    """Pair each image with the next images of its sequence of numbered file names.
 
     Images form a sequence if their names differ only in the last number, which gives the order.
     """
@@ -83,7 +83,7 @@ def filter_pairs(
     """Select the image pairs that the filters of all plugins accept.
 
     Args:
-        pairs: Pairs of image indices.
+        pairs: Image pairs as image indices.
         names: Names of all images.
         answers: Pairs of image names that each filter accepts, in any order.
     """

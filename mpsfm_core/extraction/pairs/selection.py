@@ -26,7 +26,7 @@ class PairSelection:
     """Selects the image pairs that are matched.
 
     Args:
-        context: Options, cache and progress of the run.
+        context: Context of the extraction with options, cache and progress.
         table: Features of the images, or None without a feature provider.
         unconstrained: Images to match again after the fast first pass, of which each pair contains
             at least one; if None, all pairs are allowed.

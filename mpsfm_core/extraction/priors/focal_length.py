@@ -32,7 +32,7 @@ def estimate_focal_lengths(
 
     Args:
         images: All input images.
-        config: Configuration with resolved providers.
+        config: Configuration in which each block has one available provider.
         registry: Installed providers.
         events: Receiver of progress.
 

@@ -27,7 +27,7 @@ def choose_groups(count: int, matches: dict[Pair, int], size: int) -> list[tuple
     Args:
         count: Number of images.
         matches: Number of verified matches of each pair.
-        size: Maximum size of a group.
+        size: Maximum number of images in a group.
 
     Returns:
         The image indices of each group and the number of its core images, which come first in the

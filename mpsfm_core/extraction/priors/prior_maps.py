@@ -75,9 +75,9 @@ def inflate_edge_variance(normals: NormalPrior, depth: DepthPrior, ratio: float)
     """Set the variance of normals on both sides of depth edges to :data:`EDGE_VARIANCE`.
 
     Args:
-        normals: Normal prior with variance.
+        normals: Normal prior with its variance.
         depth: Depth prior on the same grid; steps to invalid pixels are not edges.
-        ratio: Ratio of neighboring depths above which there is a depth edge.
+        ratio: Ratio of neighboring depths above which two pixels are separated by a depth edge.
     """
     edges = log_depth_steps(depth.depth, depth.valid) > np.log(ratio)
     variance = np.where(edges & normals.valid, np.float32(EDGE_VARIANCE), _variance(normals))

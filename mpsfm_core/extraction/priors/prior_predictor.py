@@ -22,8 +22,8 @@ class PriorPredictor:
     """Runs the depth and normals providers; calibrates, resizes and masks their maps.
 
     Args:
-        context: Views, options and progress of the run.
-        matcher: Matcher that predicts depth, for ``depth.use: matcher``.
+        context: Context of the extraction with images, options and progress.
+        matcher: Matcher that predicts depth, used if the setting ``depth.use`` is ``matcher``.
         candidates: Candidate matches, from which the pair with the best depth of each image is
             chosen.
         groups: Predictions of the multi-view network, for ``depth.use: multiview``.
