@@ -153,8 +153,8 @@ def inspect_plugin(module: object, name: str, distribution: str, version: str) -
     Args:
         module: Plugin module, or object with hook implementations.
         name: Name of the plugin's entry point.
-        distribution: Name of the plugin's distribution package.
-        version: Version of the plugin's distribution package.
+        distribution: Name of the plugin's pip package.
+        version: Version of the plugin's pip package.
 
     Returns:
         Providers and hooks of the plugin, with a ``fault`` if the plugin implements an unknown

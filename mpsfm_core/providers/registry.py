@@ -1,7 +1,7 @@
-"""Registry of providers: availability, options, weights, calibration and construction.
+"""Registry that lists, checks and constructs providers of all installed plugins.
 
-A :class:`Registry` is an ordinary object and no singleton. The pipeline creates a registry with
-:meth:`Registry.discover` and passes the registry on.
+The class :class:`Registry` is no singleton. The pipeline creates a registry with
+:meth:`Registry.discover` and passes the registry to its stages.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ from mpsfm_core.providers.validation import validate_filtered_pairs
 _log = logging.getLogger(__name__)
 
 CORE = "mpsfm-core"
-"""Distribution package of the built-in providers. Other plugins cannot replace the names of the
-built-in providers."""
+"""Pip package that contains the built-in providers. Providers of other pip packages cannot have the
+name of a built-in provider of the same kind."""
 
 TIMEOUT_VARIABLE = "MPSFM_PLUGIN_TIMEOUT_S"
-"""Environment variable that sets the time limit for loading one plugin, in seconds."""
+"""Environment variable with the time limit in seconds for loading one plugin."""
 
 DEFAULT_TIMEOUT_S = 10.0
 """Time limit in seconds for loading one plugin; a slow network disk needs several seconds."""
@@ -59,14 +59,15 @@ DEFAULT_TIMEOUT_S = 10.0
 _HOOK_VALIDATORS: Mapping[str, Callable[..., Any]] = MappingProxyType(
     {"mpsfm_filter_pairs": validate_filtered_pairs}
 )
-"""Validator of each hook's return value, which receives the value and the hook's arguments."""
+"""Functions that validate the return value of a plugin hook, by the name of the hook. A validator
+receives the return value and the arguments of the hook."""
 
 Calibration = DepthCalibration | NormalCalibration
 
 
 @dataclass(frozen=True)
 class ProviderStatus:
-    """Status of one provider or plugin, shown as one line of ``mpsfm plugins list``."""
+    """Status of one provider or plugin, as in one line of ``mpsfm plugins list``."""
 
     kind: Kind | Literal["plugin"]
     """Kind of the provider, or ``"plugin"`` for a plugin without usable providers."""
@@ -81,35 +82,35 @@ class ProviderStatus:
     summary: str = ""
     available: bool = True
     reason: str = ""
-    """Reason why the provider or plugin is not available, else empty."""
+    """Reason why the provider or plugin is not available, or an empty string."""
     install_hint: str = ""
-    """Advice for the user if the provider or plugin is not available."""
+    """Advice for the user on how to install or repair an unavailable provider or plugin."""
 
 
 @dataclass(frozen=True)
 class _Entry:
-    """Registered provider specification and its origin."""
+    """Registered specification of a provider with the pip package that contains it."""
 
     spec: ProviderSpec
     distribution: str
     version: str
     fault: str = ""
-    """Reason why the provider is unavailable, else empty."""
+    """Reason why the provider is unavailable, or an empty string."""
     hint: str = ""
-    """Advice for the user that explains how to repair the fault."""
+    """Advice for the user on how to make the provider available."""
 
     @property
     def label(self) -> str:
-        """Name of the provider for messages: kind, name, distribution and version."""
+        """Kind, name, pip package and version of the provider, for messages to the user."""
         return f"{self.spec.kind} provider {self.spec.name!r} ({self.distribution} {self.version})"
 
 
 class Registry:
     """Collection of all providers by kind and name, and of the hooks of all plugins.
 
-    A new registry is empty. :meth:`discover` returns one with the built-in providers and all
-    installed plugins. Listing providers imports no heavy module; only :meth:`create` imports the
-    provider's code.
+    The constructor creates an empty registry. The method :meth:`discover` returns a registry with
+    the built-in providers and all installed plugins. Listing providers does not import their code,
+    which only :meth:`create` imports.
     """
 
     def __init__(self) -> None:
@@ -122,20 +123,21 @@ class Registry:
     def discover(
         cls, timeout_s: float | None = None, environments: bool = True, *, probe: bool = False
     ) -> Registry:
-        """Load the built-in providers, every installed plugin and the environments.
+        """Create a registry of the built-in providers, all installed plugins and environments.
 
-        A plugin that fails to load is listed with the reason and does not affect other plugins.
+        The registry lists a plugin that fails to load with the reason; other plugins are not
+        affected.
 
         Args:
-            timeout_s: Time limit for loading one plugin; by default ``$MPSFM_PLUGIN_TIMEOUT_S`` or
-                10 s.
+            timeout_s: Time limit in seconds for loading one plugin, by default
+                ``$MPSFM_PLUGIN_TIMEOUT_S`` or 10.
             environments: True also registers the providers of other Python environments as
                 ``NAME@ENVIRONMENT``, see :mod:`mpsfm_core.providers.environments`.
             probe: True loads all plugins in a child process first. A plugin that crashes the child
-                process is then listed as unavailable.
+                process is listed as unavailable and not loaded in this process.
 
         Returns:
-            The registry.
+            Registry with the providers of all plugins.
         """
         registry = cls()
         registry.register(builtin, name="builtin", distribution=CORE, version=core_version())
@@ -154,13 +156,13 @@ class Registry:
         distribution: str = "this process",
         version: str = "0",
     ) -> None:
-        """Register a plugin of this process that has no entry point.
+        """Register a plugin that is defined in this process, without an installed package.
 
         Args:
-            plugin: Plugin module, or object with ``@hookimpl`` functions.
-            name: Name of the plugin, by default the name of ``plugin``.
-            distribution: Name of the distribution package, shown in lists.
-            version: Version of the distribution package, shown in lists.
+            plugin: Plugin module, or object with methods that are marked by ``@hookimpl``.
+            name: Name of the plugin, by default the name of the module or class ``plugin``.
+            distribution: Name of the pip package that ``mpsfm plugins list`` shows.
+            version: Version of the pip package that ``mpsfm plugins list`` shows.
 
         Raises:
             ProviderError: The plugin fails to load or is already registered.
@@ -177,18 +179,18 @@ class Registry:
     def add(
         self, *specs: ProviderSpec, distribution: str = "this process", version: str = "0"
     ) -> None:
-        """Register provider specifications of this process; their factory may be a callable.
+        """Register provider specifications without a plugin; their factory may be a callable.
 
         Args:
-            specs: Specifications.
-            distribution: Name of the distribution package, shown in lists.
-            version: Version of the distribution package, shown in lists.
+            specs: Specifications of the providers to register.
+            distribution: Name of the pip package that ``mpsfm plugins list`` shows.
+            version: Version of the pip package that ``mpsfm plugins list`` shows.
         """
         for spec in specs:
             self._entries.append(_Entry(spec, distribution, version, *find_spec_fault(spec)))
 
     def status(self) -> tuple[ProviderStatus, ...]:
-        """List all providers by kind and name, then plugins that are broken or only have hooks."""
+        """List all providers by kind and name, then plugins without usable providers."""
         providers = [_status(entry, *self._fault(entry)) for entry in self._entries]
         order = (*KINDS, "plugin")
         return tuple(
@@ -203,7 +205,7 @@ class Registry:
         )
 
     def names(self, kind: Kind) -> list[str]:
-        """Return the sorted names of the available providers of a kind."""
+        """Return the sorted names of the available providers of one kind, such as ``depth``."""
         entries = [e for e in self._entries if e.spec.kind == kind]
         return sorted(e.spec.name for e in entries if not self._fault(e)[0])
 
@@ -212,12 +214,13 @@ class Registry:
 
         Raises:
             ProviderError: No provider has that kind and name, or the provider is unavailable. The
-                message has the reason, the most similar name, or the package to install.
+                error message has the reason, the most similar provider name, or the package to
+                install.
         """
         return self._entry(kind, name).spec
 
     def version(self, kind: Kind, name: str) -> str:
-        """Return the distribution and version of a provider, such as ``mpsfm-onnx 0.1.0``."""
+        """Return the pip package and version of a provider, such as ``mpsfm-onnx 0.1.0``."""
         entry = self._entry(kind, name)
         return f"{entry.distribution} {entry.version}"
 
@@ -228,26 +231,26 @@ class Registry:
         values: Mapping[str, Any] | None = None,
         path: SettingPath = ("options",),
     ) -> Options | None:
-        """Validate the options of a provider and fill in default values.
+        """Validate option values of a provider and add default values.
 
         Args:
             kind: Kind of the provider, such as ``depth``.
             name: Name of the provider.
             values: Option values from the configuration.
-            path: Path of ``values`` in the configuration, for messages.
+            path: Path of the options in the configuration, for error messages.
 
         Returns:
-            The validated options, or None if the provider has no options.
+            Validated options of the provider, or None if the provider has no options.
 
         Raises:
-            SettingsError: An option value is wrong. The message has the path of the option and the
-                most similar key.
+            SettingsError: An option name or value is wrong. The error message has the path of the
+                option and the most similar option name.
         """
         model = self._options_model(kind, name)
         return parse_settings(model or _NoOptions, values or {}, path) if model or values else None
 
     def default_options(self, kind: Kind, name: str) -> dict[str, Any]:
-        """Return the default options of a provider; required options have the value None."""
+        """Return the default option values of a provider, with None for required options."""
         model = self._options_model(kind, name) or _NoOptions
         return dict.fromkeys(model.model_fields) | model.model_construct().model_dump(mode="json")
 
@@ -262,11 +265,12 @@ class Registry:
             values: Option values from the configuration.
 
         Returns:
-            The files.
+            Weights files of the provider, with URI and expected hash.
 
         Raises:
-            SettingsError: An option value is wrong or missing.
-            ProviderError: The plugin's weights function raises an exception.
+            SettingsError: An option value of the provider is wrong or missing.
+            ProviderError: The function with which the plugin declares the weights files raises an
+                exception.
         """
         entry = self._entry(kind, name)
         files = entry.spec.weights
@@ -284,17 +288,18 @@ class Registry:
     def calibration(self, kind: Kind, config: ProviderConfig) -> Calibration:
         """Return the uncertainty model of a depth, multi-view or normals provider.
 
-        Sources are searched in this order: the configuration, each wrapper from the outermost, the
-        provider, and the defaults of the class. A wrapper or provider declares a model by the
-        plugin's ``mpsfm_calibration`` hook or in its specification.
+        The first uncertainty model that is declared is returned. The order is the configuration,
+        each wrapper provider from the outermost to the innermost, the provider, and the default
+        values of the class. A wrapper or provider declares an uncertainty model by the plugin's
+        ``mpsfm_calibration`` hook or in its specification.
 
         Args:
             kind: Kind of the provider, such as ``depth``.
-            config: Configuration of the provider. ``config.calibration`` contains values only,
-                because loading the configuration has already read a calibration file.
+            config: Configuration of the provider. The value of ``config.calibration`` is no file
+                name, because calibration files are read when the configuration is loaded.
 
         Returns:
-            The calibration.
+            Uncertainty model of the provider.
         """
         model: type[Calibration] = NormalCalibration if kind == "normals" else DepthCalibration
         if isinstance(config.calibration, Mapping):
@@ -320,22 +325,22 @@ class Registry:
         context: ProviderContext,
         wrap: Sequence[ProviderConfig] = (),
     ) -> Any:
-        """Import and construct a provider and its wrappers.
+        """Import and construct a provider and the wrapper providers around it.
 
         Args:
             kind: Kind of the provider, such as ``depth``.
             name: Name of the provider.
-            options: Validated options, or option values from the configuration.
-            context: Resources of the run that the factory receives.
-            wrap: Wrappers, innermost first.
+            options: Validated options of the provider, or option values from the configuration.
+            context: Device, threads, seed and weights access for the factory of the provider.
+            wrap: Configurations of the wrapper providers, innermost first.
 
         Returns:
-            Provider object with the methods of ``PROTOCOLS[kind]``.
+            Provider object with the methods of the protocol ``PROTOCOLS[kind]``.
 
         Raises:
-            ProviderError: The provider cannot be imported or constructed, or the object lacks a
-                method.
-            MpsfmError: An MP-SfM error that the factory raises, unchanged.
+            ProviderError: The provider cannot be imported or constructed, or the provider object
+                lacks a method.
+            MpsfmError: Any MP-SfM error that the provider's factory raises, unchanged.
         """
         entry = self._entry(kind, name)
         provider = self._construct(entry, (), options, context)
@@ -351,21 +356,22 @@ class Registry:
 
     @property
     def hook(self) -> pluggy.HookRelay:
-        """Hooks of all plugins without protection from exceptions; see :meth:`call_hook`."""
+        """Plugin hooks of pluggy, whose exceptions are not handled as in :meth:`call_hook`."""
         return self._manager.hook
 
     def call_hook(self, name: str, /, **arguments: Any) -> list[Any]:
-        """Call a hook of every plugin and return the answers that are not None.
+        """Call a hook of every plugin and return the values that are not None.
 
-        A plugin whose hook raises or returns an invalid value is skipped with a warning, and this
-        hook of the plugin is not called again. A broken viewer or logger plugin must not end a run.
+        If a plugin's hook raises an exception or returns an invalid value, a warning is logged and
+        this hook of the plugin is not called again. An error in a viewer or logger plugin must not
+        end a run.
 
         Args:
-            name: Name of the hook to call.
-            arguments: Keyword arguments of the hook.
+            name: Name of the plugin hook to call.
+            arguments: Keyword arguments of the plugin hook.
 
         Returns:
-            Return values in the order of registration.
+            Return values of the hooks, in the order in which the plugins were registered.
         """
         answers = []
         for implementation in reversed(getattr(self.hook, name).get_hookimpls()):
@@ -422,7 +428,7 @@ class Registry:
         raise ProviderError(self._unknown(kind, name))
 
     def _fault(self, entry: _Entry) -> tuple[str, str]:
-        """Return why a provider is unavailable (own fault or duplicate name), and the repair."""
+        """Return why a provider is unavailable and advice for the user, or empty strings."""
         if entry.fault:
             return entry.fault, entry.hint
         same_name = [e for e in self._entries if _key(e) == _key(entry) and not e.fault]
@@ -481,7 +487,7 @@ class Registry:
 
 
 class _NoOptions(Options):
-    """Options class of a provider without options, which rejects every key."""
+    """Options class of a provider without options, which rejects every option."""
 
 
 def _label(plugin: LoadedPlugin) -> str:
@@ -514,7 +520,7 @@ def _sentence(subject: str, what: str, hint: str) -> str:
 
 
 def _load_reference(entry: _Entry, reference: str) -> Any:
-    """Import the object that ``"package.module:Name"`` names."""
+    """Import the class or function that a text ``"package.module:Name"`` names."""
     module, _, path = reference.partition(":")
     try:
         target: Any = importlib.import_module(module)
@@ -548,7 +554,7 @@ def _default_timeout() -> float:
 
 
 def core_version() -> str:
-    """Return the version of mpsfm-core, ``"source"`` if the package is not installed."""
+    """Return the version of mpsfm-core, or ``"source"`` if the package is not installed."""
     try:
         return metadata.version(CORE)
     except metadata.PackageNotFoundError:

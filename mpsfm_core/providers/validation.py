@@ -1,10 +1,12 @@
-"""Validation of everything that a provider returns.
+"""Validation of the depth, normals, matches and other values that providers return.
 
-``run_*`` calls a provider and validates its return value. Any failure of a provider becomes one
-:class:`~mpsfm_core.data.errors.MpsfmError` that names provider and image. ``validate_*`` only
-validates a given return value. The data types validate themselves on construction. The validators
-check these types again, because arrays are mutable. The validators also compare the return value
-with the view and with the capabilities of the specification.
+The functions ``run_*`` call a provider and validate its return value. Any exception of a provider
+becomes an :class:`~mpsfm_core.data.errors.MpsfmError` that names provider and image. The functions
+``validate_*`` only validate a given return value of a provider. Return values are instances of the
+classes in :mod:`mpsfm_core.data`, which validate themselves on construction. The functions
+``validate_*`` validate these instances again, because arrays are mutable. The functions
+``validate_*`` also compare the return value with the image size and with the declared capabilities
+of the provider.
 """
 
 from __future__ import annotations
@@ -49,15 +51,15 @@ from mpsfm_core.providers import (
 
 MAX_MEDIAN_NORMAL_VARIANCE = np.pi**2
 """Largest plausible median of the angular variance of normals in rad^2. No angle exceeds pi, so a
-larger value is in degrees or no variance."""
+larger median is in degrees or no variance."""
 
 FACING_TOLERANCE = 1e-3
-"""Largest ``n . ray`` of a normal that faces the camera. It is positive because of rounding, see
-:data:`~mpsfm_core.data.UNIT_NORMAL_TOLERANCE`."""
+"""Largest dot product of a unit normal that faces the camera with its viewing ray. The limit is
+positive because of rounding, see :data:`~mpsfm_core.data.UNIT_NORMAL_TOLERANCE`."""
 
 
 def run_depth(spec: ProviderSpec, provider: DepthProvider, view: View) -> DepthPrior:
-    """Predict the depth of a view and validate the result, see :meth:`DepthProvider.predict`."""
+    """Predict the depth of an image and validate it, see :meth:`DepthProvider.predict`."""
     with provider_errors(spec, view.name):
         return validate_depth(spec, view, provider.predict(view))
 
@@ -65,7 +67,7 @@ def run_depth(spec: ProviderSpec, provider: DepthProvider, view: View) -> DepthP
 def run_joint(
     spec: ProviderSpec, provider: JointProvider, view: View
 ) -> tuple[DepthPrior, NormalPrior]:
-    """Predict depth and normals of a view in one network pass and validate both."""
+    """Predict depth and normals of an image in one network pass and validate both."""
     with provider_errors(spec, view.name):
         answer = provider.predict_joint(view)
         if not (isinstance(answer, tuple) and len(answer) == 2):
@@ -74,7 +76,7 @@ def run_joint(
 
 
 def run_focal(spec: ProviderSpec, provider: FocalEstimator, view: View) -> float | None:
-    """Estimate the focal length of a view in pixels, or return None without an estimate."""
+    """Estimate the focal length of an image in pixels; return None if there is no estimate."""
     with provider_errors(spec, view.name):
         focal = provider.estimate_focal(view)
         if focal is None:
@@ -87,9 +89,9 @@ def run_focal(spec: ProviderSpec, provider: FocalEstimator, view: View) -> float
 def run_normals(
     spec: ProviderSpec, provider: NormalsProvider, view: View, depth: DepthPrior | None = None
 ) -> NormalPrior:
-    """Predict the normals of a view and validate the result.
+    """Predict the normals of an image and validate the normal prior.
 
-    The provider receives ``depth`` only if the specification declares ``needs-depth``.
+    The provider receives the prior ``depth`` only if it has the capability ``needs-depth``.
     """
     given = depth if "needs-depth" in spec.capabilities else None
     with provider_errors(spec, view.name):
@@ -99,13 +101,13 @@ def run_normals(
 def run_multiview(
     spec: ProviderSpec, provider: MultiViewProvider, views: Sequence[View]
 ) -> MultiViewPrior:
-    """Predict the depth of a group of views and validate the result."""
+    """Predict the depth of several images jointly and validate the depth priors."""
     with provider_errors(spec, _group_name(views)):
         return validate_multiview(spec, views, provider.predict_group(tuple(views)))
 
 
 def run_features(spec: ProviderSpec, provider: FeatureProvider, view: View) -> Features:
-    """Extract the features of a view and validate the result."""
+    """Extract the features of an image and validate the keypoints and descriptors."""
     with provider_errors(spec, view.name):
         return validate_features(spec, view, provider.extract(view))
 
@@ -116,9 +118,9 @@ def run_matcher(
     views: tuple[View, View],
     features: tuple[Features, Features] | None = None,
 ) -> PairMatches:
-    """Match two views and validate the result.
+    """Match two images and validate the matches.
 
-    The provider receives ``features`` only if the specification declares ``sparse``.
+    The matcher receives ``features`` only if it has the capability ``sparse``.
     """
     given = features if features and "sparse" in spec.capabilities else (None, None)
     with provider_errors(spec, _pair_name(views)):
@@ -126,50 +128,50 @@ def run_matcher(
 
 
 def run_retrieval(spec: ProviderSpec, provider: RetrievalProvider, view: View) -> Float32:
-    """Compute the global descriptor of a view and validate the descriptor."""
+    """Compute the global descriptor of an image and validate the descriptor."""
     with provider_errors(spec, view.name):
         return validate_retrieval(spec, view, provider.describe(view))
 
 
 def run_mask(spec: ProviderSpec, provider: MaskProvider, view: View) -> Bool:
-    """Segment the usable pixels of a view and validate the mask."""
+    """Compute the mask of usable pixels of an image and validate the mask."""
     with provider_errors(spec, view.name):
         return validate_mask(spec, view, provider.mask(view))
 
 
 def validate_depth(spec: ProviderSpec, view: View, output: object) -> DepthPrior:
-    """Validate a depth prior: type, values, at least one valid pixel, declared capabilities.
+    """Validate the type, values and declared capabilities of a predicted depth prior.
 
     Args:
-        spec: Specification of the provider.
-        view: View from which the provider computed the result.
+        spec: Specification of the provider, with its capabilities.
+        view: Undistorted image that the provider processed.
         output: Return value of the provider.
 
     Returns:
-        The prior.
+        The validated prior as returned by the provider.
 
     Raises:
-        ProviderOutputError: The return value violates a rule of the interface. The message names
-            provider, image, field and rule.
+        ProviderOutputError: The provider's output violates a rule of the interface. The error
+            message names provider, image, field and rule.
     """
     with _name_violations(spec, view.name):
         return _check_depth(spec, output, "depth")
 
 
 def validate_normals(spec: ProviderSpec, view: View, output: object) -> NormalPrior:
-    """Validate a normal prior: type, unit normals that face the camera, variance in rad^2.
+    """Validate that predicted normals are unit vectors that face the camera.
 
     Args:
-        spec: Specification of the provider.
-        view: View from which the provider computed the result.
+        spec: Specification of the provider, with its capabilities.
+        view: Undistorted image that the provider processed.
         output: Return value of the provider.
 
     Returns:
-        The prior.
+        The validated prior as returned by the provider.
 
     Raises:
-        ProviderOutputError: The return value violates a rule of the interface. The message names
-            provider, image, field and rule.
+        ProviderOutputError: The provider's output violates a rule of the interface. The error
+            message names provider, image, field and rule.
     """
     with _name_violations(spec, view.name):
         prior = _revalidate(output, NormalPrior, "normals")
@@ -186,19 +188,19 @@ def validate_normals(spec: ProviderSpec, view: View, output: object) -> NormalPr
 
 
 def validate_multiview(spec: ProviderSpec, views: Sequence[View], output: object) -> MultiViewPrior:
-    """Validate the priors of a group: one per view, with the declared poses and intrinsics.
+    """Validate the depth priors, poses and intrinsics that a multi-view network predicts.
 
     Args:
-        spec: Specification of the provider.
-        views: Views from which the provider computed the result.
+        spec: Specification of the provider, with its capabilities.
+        views: Undistorted images that the provider processed.
         output: Return value of the provider.
 
     Returns:
-        The group prior.
+        The validated priors as returned by the provider.
 
     Raises:
-        ProviderOutputError: The return value violates a rule of the interface. The message names
-            provider, images, field and rule.
+        ProviderOutputError: The provider's output violates a rule of the interface. The error
+            message names provider, images, field and rule.
     """
     with _name_violations(spec, _group_name(views)):
         group = _revalidate(output, MultiViewPrior, "output")
@@ -215,19 +217,19 @@ def validate_multiview(spec: ProviderSpec, views: Sequence[View], output: object
 
 
 def validate_features(spec: ProviderSpec, view: View, output: object) -> Features:
-    """Validate features: type, values, and keypoints inside the view.
+    """Validate the values of extracted features, whose keypoints must be inside the image.
 
     Args:
-        spec: Specification of the provider.
-        view: View from which the provider computed the result.
+        spec: Specification of the provider, with its capabilities.
+        view: Undistorted image that the provider processed.
         output: Return value of the provider.
 
     Returns:
-        The features.
+        The validated features as returned by the provider.
 
     Raises:
-        ProviderOutputError: The return value violates a rule of the interface. The message names
-            provider, image, field and rule.
+        ProviderOutputError: The provider's output violates a rule of the interface. The error
+            message names provider, image, field and rule.
     """
     with _name_violations(spec, view.name):
         features = _revalidate(output, Features, "features")
@@ -241,19 +243,20 @@ def validate_matches(
     features: tuple[Features, Features] | None,
     output: object,
 ) -> PairMatches:
-    """Validate matches: indices within the features, points inside the views.
+    """Validate the feature indices and the points of matches.
 
     Args:
-        spec: Specification of the provider.
-        views: Views from which the provider computed the result.
-        features: Features of both views, None for a matcher without features.
+        spec: Specification of the provider, with its capabilities.
+        views: Undistorted images that the provider processed.
+        features: Features of both images, or None for a matcher that needs no features.
         output: Return value of the provider.
 
     Returns:
-        The matches.
+        The validated matches as returned by the provider.
 
     Raises:
-        ProviderOutputError: The result violates a rule or lacks the field of a declared capability.
+        ProviderOutputError: The matches violate a rule of the interface or lack the field of a
+            declared capability.
     """
     with _name_violations(spec, _pair_name(views)):
         matches = _revalidate(output, PairMatches, "matches")
@@ -276,19 +279,19 @@ def validate_matches(
 
 
 def validate_retrieval(spec: ProviderSpec, view: View, output: object) -> Float32:
-    """Validate a global descriptor, which is (d,) float32, finite, with d > 0.
+    """Validate that a global descriptor is a finite, non-empty float32 vector.
 
     Args:
-        spec: Specification of the provider.
-        view: View from which the provider computed the result.
+        spec: Specification of the provider, with its capabilities.
+        view: Undistorted image that the provider processed.
         output: Return value of the provider.
 
     Returns:
-        The descriptor.
+        The validated descriptor as returned by the provider.
 
     Raises:
-        ProviderOutputError: The return value violates a rule of the interface. The message names
-            provider, image, field and rule.
+        ProviderOutputError: The provider's output violates a rule of the interface. The error
+            message names provider, image, field and rule.
     """
     with _name_violations(spec, view.name):
         vector = _require_array(output, "descriptor", np.dtype(np.float32), 1)
@@ -299,19 +302,19 @@ def validate_retrieval(spec: ProviderSpec, view: View, output: object) -> Float3
 
 
 def validate_mask(spec: ProviderSpec, view: View, output: object) -> Bool:
-    """Validate a mask (H, W) bool on the pixel grid of the view.
+    """Validate that a mask is a bool array in the size of the image.
 
     Args:
-        spec: Specification of the provider.
-        view: View from which the provider computed the result.
+        spec: Specification of the provider, with its capabilities.
+        view: Undistorted image that the provider processed.
         output: Return value of the provider.
 
     Returns:
-        The mask.
+        The validated mask as returned by the provider.
 
     Raises:
-        ProviderOutputError: The return value violates a rule of the interface. The message names
-            provider, image, field and rule.
+        ProviderOutputError: The provider's output violates a rule of the interface. The error
+            message names provider, image, field and rule.
     """
     with _name_violations(spec, view.name):
         mask = _require_array(output, "mask", np.dtype(np.bool_), 2)
@@ -324,19 +327,19 @@ def validate_mask(spec: ProviderSpec, view: View, output: object) -> Bool:
 def validate_filtered_pairs(
     answer: object, pairs: Sequence[tuple[str, str]]
 ) -> list[tuple[str, str]]:
-    """Validate the pairs that the hook ``mpsfm_filter_pairs`` of a plugin returns.
+    """Validate the image pairs that a plugin's hook ``mpsfm_filter_pairs`` selects.
 
     Args:
-        answer: Return value of the plugin's hook.
-        pairs: Candidate pairs of image names.
+        answer: Return value of the plugin's hook ``mpsfm_filter_pairs``.
+        pairs: Candidate pairs of image names that the plugin received.
 
     Returns:
-        The selected pairs as a list. Pairs that are no candidates remain in the list and have no
-        effect.
+        Selected pairs of image names as a list. Selected pairs that are no candidates remain in the
+        list and have no effect.
 
     Raises:
-        TypeError: The return value is not an iterable of pairs of image names.
-        ValueError: The plugin returns pairs, but no returned pair is a candidate.
+        TypeError: The hook's return value is not an iterable of pairs of image names.
+        ValueError: The plugin selects image pairs, but none of them is a candidate.
     """
     if not isinstance(answer, Iterable):
         raise TypeError(f"must return pairs of image names, got {_type(answer)}")
@@ -359,18 +362,18 @@ def validate_filtered_pairs(
 
 @contextmanager
 def provider_errors(spec: ProviderSpec, image: str) -> Iterator[None]:
-    """Convert exceptions of a provider to an error that names provider and image.
+    """Convert any exception of a provider to an MP-SfM error that names provider and image.
 
-    Errors of MP-SfM itself (missing weights, unreadable files) pass unchanged, because they already
-    name the next step.
+    Subclasses of MpsfmError, such as WeightsError for missing weights, are not converted, because
+    their messages already name the next step.
 
     Args:
-        spec: Specification of the provider.
-        image: Name of the image, pair or group that the provider processes.
+        spec: Specification of the provider, with its capabilities.
+        image: Name of the image that the provider processes, or names of several images.
 
     Raises:
         ProviderRunError: The provider raised an exception.
-        ProviderOutputError: The return value of the provider violates a rule.
+        ProviderOutputError: The return value of the provider violates a rule of the interface.
     """
     with _name_violations(spec, image):
         try:
@@ -387,7 +390,7 @@ def provider_errors(spec: ProviderSpec, image: str) -> Iterator[None]:
 
 @contextmanager
 def _name_violations(spec: ProviderSpec, image: str) -> Iterator[None]:
-    """Convert the violation of a rule to an error that names provider and image."""
+    """Convert a DataError about a provider's output to an error that names provider and image."""
     try:
         yield
     except DataError as error:
@@ -408,10 +411,10 @@ Checked = TypeVar(
 
 
 def _revalidate(output: object, expected: type[Checked], field: str) -> Checked:
-    """Require the type of a provider's output and validate its values again."""
+    """Require that a provider's output has the expected type, and validate its values again."""
     if not isinstance(output, expected):
         raise DataError(field, f"must be a {expected.__name__}, got {_type(output)}")
-    return replace(output)  # The constructor validates the values again.
+    return replace(output)  # The constructor validates the field values again.
 
 
 def _check_depth(spec: ProviderSpec, output: object, field: str) -> DepthPrior:
@@ -443,7 +446,7 @@ def _check_sparse(sparse: SparseMatches, features: tuple[Features, Features] | N
 
 
 def _require_undeclared(spec: ProviderSpec, capability: str, field: str) -> None:
-    """Raise an error if the field of a declared capability is None."""
+    """Raise DataError if the provider declares the capability of a field that is None."""
     if capability in spec.capabilities:
         raise DataError(field, f"lacks what the specification declares: {capability!r}")
 

@@ -1,1 +1,1 @@
-"""Uncertainty of priors: the model of the standard deviation and its calibration files."""
+"""Uncertainty models of depth and normal priors, and the files that store them."""

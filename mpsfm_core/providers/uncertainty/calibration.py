@@ -1,9 +1,10 @@
-"""Uncertainty model of a prior, which converts the std of a network to a calibrated std.
+"""Uncertainty models of priors, which convert the std of a network to a calibrated std.
 
-As in appendix C of the paper, the total std is the maximum of three terms: the scaled network std,
-a std proportional to depth, and a floor. Two extensions serve relative depth networks: a common
-depth offset, so that the mapper only estimates a scale per image, and a larger variance at depth
-edges.
+As in appendix C of the paper, the calibrated depth std is the maximum of three terms, which are the
+scaled network std, a std proportional to depth, and a floor. Two extensions serve networks that
+predict depth up to scale or up to scale and shift. One extension adds the same depth offset to all
+images, so that the mapper only estimates a scale per image. The other extension increases the depth
+variance at depth edges.
 """
 
 from __future__ import annotations
@@ -19,37 +20,39 @@ from mpsfm_core.geometry import log_depth_steps
 
 _MIN_VARIANCE = 1e-12
 _MIN_SHIFTED_RATIO = 0.01
-"""Smallest shifted depth or inverse depth relative to its median; pixels below are invalid."""
+"""Smallest valid depth or inverse depth after adding the offset ``shift``, as a fraction of the
+median. Pixels below this value are invalid."""
 
 
 class DepthCalibration(Options):
-    """Uncertainty model of depth priors.
+    """Uncertainty model of depth priors, which calibrates their standard deviation.
 
-    The std is ``max(std_scale * network_std, relative_std * depth, std_floor)``. The default values
-    are those of Metric3D v2 giant2 in the reference implementation. Plugins declare the values of
-    other networks. The variance describes the depth errors after each image has received its own
-    scale, as in the mapper. The error of that scale is excluded.
+    The calibrated depth std is ``max(std_scale * network_std, relative_std * depth, std_floor)``.
+    The default values are those of Metric3D v2 giant2 in the reference implementation. Plugins
+    declare the values of other networks. The calibrated variance describes the depth errors that
+    remain after the mapper has estimated a scale for the depth map of each image.
     """
 
     std_scale: float = Field(3.33, gt=0)
     """Factor of the network's depth std [reference prior_std_multiplier]. Raising the factor lowers
     the weight of the depth prior."""
     relative_std: float = Field(0.0263, ge=0)
-    """Smallest std relative to depth [reference depth_uncertainty]."""
+    """Smallest depth std divided by depth [reference depth_uncertainty]."""
     std_floor: float = Field(0.02, ge=0)
     """Smallest depth std in meters, for metric priors only [paper appendix C]."""
     use_network_variance: bool = True
     """False ignores the depth variance that the network predicts."""
     shift: float = 0.0
-    """Offset added to depth or inverse depth, in multiples of its median over the map; 0 for metric
-    networks."""
+    """Offset added to depth or inverse depth, in multiples of its median over the depth map. The
+    offset is 0 for metric networks."""
     shift_space: Literal["depth", "disparity"] = "depth"
-    """Quantity to which the offset is added: disparity for networks that predict affine-invariant
-    inverse depth."""
+    """Quantity to which the offset ``shift`` is added, either depth or, for networks that predict
+    inverse depth up to scale and shift, disparity."""
     edge_ratio: float | None = Field(None, gt=1)
-    """Ratio of neighboring depths above which a pixel is on a depth edge; null disables edges."""
+    """Depth ratio of neighboring pixels above which they are on a depth edge. Null treats no pixel
+    as a depth edge."""
     edge_std_scale: float = Field(1.0, ge=1)
-    """Factor of the depth std of pixels on a depth edge."""
+    """Factor by which the depth std of pixels on a depth edge is multiplied."""
 
     def apply(self, prior: DepthPrior) -> DepthPrior:
         """Return the depth prior with its calibrated variance, defined at every valid pixel."""
@@ -67,7 +70,7 @@ class DepthCalibration(Options):
         return DepthPrior(shifted.depth, variance.astype(np.float32), shifted.valid, shifted.metric)
 
     def shifted(self, prior: DepthPrior) -> DepthPrior:
-        """Return the depth prior with :attr:`shift` applied to depth and network variance."""
+        """Return the depth prior with the offset :attr:`shift` applied to depth and variance."""
         if self.shift == 0 or not prior.valid.any():
             return prior
         depth = np.where(prior.valid, prior.depth, np.float32(1)).astype(np.float64)
@@ -78,15 +81,16 @@ class DepthCalibration(Options):
     def shift_depth(
         self, depth: Float64, medians: tuple[float, float]
     ) -> tuple[Float64, Float64, Bool]:
-        """Apply the offset :attr:`shift` to depth values.
+        """Add the offset :attr:`shift` to depth values or to their inverse.
 
         Args:
-            depth: Depth values of a map, of any shape.
-            medians: Medians of depth and inverse depth over the map, see :func:`depth_medians`.
+            depth: Depth values of one depth map, in an array of any shape.
+            medians: Medians of depth and inverse depth over the depth map, see
+                :func:`depth_medians`.
 
         Returns:
-            Shifted depth, factor by which the shift changes the depth std, and validity, in the
-            shape of ``depth``.
+            Arrays in the shape of ``depth`` with the shifted depth, the factor by which the offset
+            changes the depth std, and the validity of the shifted depth.
         """
         in_depth = self.shift_space == "depth"
         quantity = depth if in_depth else 1 / depth
@@ -100,25 +104,27 @@ class DepthCalibration(Options):
 
 
 def depth_medians(prior: DepthPrior) -> tuple[float, float]:
-    """Return the medians of depth and of inverse depth over the valid pixels."""
+    """Return the medians of depth and of inverse depth over the valid pixels of a depth prior."""
     depth = prior.depth[prior.valid].astype(np.float64)
     return float(np.median(depth)), float(np.median(1 / depth))
 
 
 class NormalCalibration(Options):
-    """Uncertainty model of normal priors.
+    """Uncertainty model of normal priors, which calibrates their angular standard deviation.
 
-    The angular std is ``max(std_scale * network_std, std_floor_deg)``. ``std_default_deg`` replaces
-    the std of a network that predicts no variance.
+    The calibrated angular std of a normal is ``max(std_scale * network_std, std_floor_deg)``. The
+    option ``std_default_deg`` replaces ``std_scale * network_std`` if the network predicts no
+    variance.
     """
 
     std_scale: float = Field(1.0, gt=0)
-    """Factor of the network's angular std [reference prior_std_multiplier]."""
+    """Factor of the angular std that a normals network predicts [reference
+    prior_std_multiplier]."""
     std_floor_deg: float = Field(1.0, ge=0)
-    """Smallest angular std of normals [reference inherent_polar_noise]."""
+    """Smallest angular std of normals in degrees [reference inherent_polar_noise]."""
     std_default_deg: float = Field(7.6, gt=0)
-    """Angular std of normals if the network predicts no variance [reference: effect of its
-    floor]."""
+    """Angular std of normals in degrees if the network predicts no variance [reference: effect of
+    its floor]."""
     use_network_variance: bool = True
     """False ignores the angular variance that the network predicts."""
 

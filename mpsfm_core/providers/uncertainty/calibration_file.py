@@ -1,8 +1,8 @@
-"""Calibration files: the values of an uncertainty model and their provenance.
+"""Reading and writing of calibration files, which store an uncertainty model.
 
-A calibration file is YAML or JSON. The file contains either the bare values or a
-:class:`CalibrationFile`, as ``mpsfm calibrate`` writes it. A configuration refers to the file by
-``depth.calibration: FILE``. A plugin declares the file by
+A calibration file in YAML or JSON contains either only the values of an uncertainty model or a
+:class:`CalibrationFile`, which ``mpsfm calibrate`` writes. The option ``depth.calibration`` of a
+configuration may be the path of a calibration file. A plugin loads a calibration file by
 ``ProviderSpec(calibration=load_calibration(path))``.
 """
 
@@ -37,33 +37,33 @@ CALIBRATIONS: Mapping[str, type[DepthCalibration] | type[NormalCalibration]] = {
 
 
 class Provenance(Options):
-    """Provenance of a calibration: provider, data and quality of the fit."""
+    """Provenance of a calibration, with the provider, the images and the quality of the fit."""
 
     provider: str
     distribution: str
-    """Distribution package and version of the provider."""
+    """Pip package and version of the calibrated provider."""
     wrappers: tuple[str, ...] = ()
     options: dict[str, Any] = Field(default_factory=dict)
-    """Options of the provider; paths of files are reduced to their names."""
+    """Options of the calibrated provider, with file names instead of file paths."""
     weights: dict[str, str] = Field(default_factory=dict)
-    """SHA-256 of each weights file that the provider loaded, by file name or URI."""
+    """SHA-256 of each weights file that the calibrated provider loaded, by file name or URI."""
     truth: str
-    """Source of the ground truth."""
+    """Source of the ground-truth depth or normals."""
     data: str
-    """Names of the images that were used for the fit."""
+    """Names of the images to which the uncertainty model was fitted."""
     date: str
-    """Date of the fit in ISO 8601."""
+    """Date of the calibration in ISO 8601."""
     core: str
-    """Version of mpsfm-core."""
+    """Version of mpsfm-core that fitted the uncertainty model."""
     images: int
-    """Number of images that were used for the fit."""
+    """Number of images to which the uncertainty model was fitted."""
     pixels: int
-    """Number of pixels that were used for the fit."""
+    """Number of pixels to which the uncertainty model was fitted."""
     intervals_95: dict[str, tuple[float, float]] = Field(default_factory=dict)
-    """95 % confidence interval of each fitted value."""
+    """95 % confidence interval of each fitted value of the uncertainty model."""
     metrics: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """Quality metrics coverage, z_mad, nll and ause on held-out images, ``before`` and ``after``
-    the fit."""
+    """Quality metrics of the uncertainty on held-out images, ``before`` and ``after`` the fit, such
+    as the negative log likelihood ``nll``."""
     warnings: tuple[str, ...] = ()
 
 
@@ -77,7 +77,7 @@ class CalibrationFile(Options):
     @model_validator(mode="before")
     @classmethod
     def _by_kind(cls, values: Any) -> Any:
-        """Select the calibration class by provider kind, because both classes share field names."""
+        """Select the uncertainty model's class by ``kind``, because both classes share fields."""
         if isinstance(values, Mapping) and isinstance(values.get("calibration"), Mapping):
             model = CALIBRATIONS.get(values.get("kind", ""))
             if model is not None:
@@ -85,7 +85,7 @@ class CalibrationFile(Options):
         return values
 
     def write(self, path: Path) -> None:
-        """Write the calibration as JSON if the file name ends with ``.json``, else as YAML."""
+        """Write the calibration file as JSON if its name ends with ``.json``, else as YAML."""
         content = {VERSION: FORMAT, **self.model_dump(mode="json")}
         is_json = path.suffix == ".json"
         text = json.dumps(content, indent=2) + "\n" if is_json else write_yaml(content)
@@ -93,18 +93,18 @@ class CalibrationFile(Options):
 
 
 def read_values(path: Path, kind: str) -> Mapping[str, Any]:
-    """Read the values of a calibration file without validation.
+    """Read the uncertainty model's values from a calibration file without validation.
 
     Args:
-        path: The file.
+        path: Path of the calibration file.
         kind: Kind of the provider, such as ``depth``.
 
     Returns:
-        Values by name.
+        Values of the uncertainty model by name.
 
     Raises:
-        ConfigError: The file cannot be read, is not a mapping, has a newer format version, or is
-            for another provider kind.
+        ConfigError: The calibration file cannot be read, is not a mapping, has a newer format
+            version, or is for another provider kind.
     """
     try:
         content = parse_yaml(path.read_text(encoding="utf-8"), str(path))
@@ -124,17 +124,18 @@ def read_values(path: Path, kind: str) -> Mapping[str, Any]:
 
 
 def load_calibration(path: Path, kind: CalibratedKind = "depth") -> Calibration:
-    """Load the uncertainty model of a calibration file.
+    """Load the uncertainty model that a calibration file contains.
 
     Args:
-        path: The file.
+        path: Path of the calibration file.
         kind: Kind of the provider, such as ``depth``.
 
     Returns:
         The calibration.
 
     Raises:
-        ConfigError: The file is unreadable (see :func:`read_values`), or a value is wrong.
+        ConfigError: The calibration file is unreadable (see :func:`read_values`), or a value in it
+            is wrong.
     """
     try:
         return parse_settings(CALIBRATIONS[kind], read_values(path, kind))
