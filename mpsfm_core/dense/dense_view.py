@@ -1,4 +1,4 @@
-"""Posed views for stereo: gray values and input depth on one grid."""
+"""Views for multi-view stereo, with pose, gray values and the mapper's depth map."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 
 
 def dense_grid_size(size: tuple[int, int], max_size: int) -> tuple[int, int]:
-    """Compute (width, height) of the stereo grid of an image, at most `max_size` long."""
+    """Compute the (width, height) of stereo depth maps, whose longer side is `max_size`."""
     factor = min(1.0, max_size / max(size))
     return max(2, round(size[0] * factor)), max(2, round(size[1] * factor))
 
 
 @dataclass(frozen=True, eq=False)
 class PosedGrid:
-    """Pixel grid with intrinsics and pose."""
+    """Pixel grid of a stereo depth map, with intrinsics and pose."""
 
     camera: PinholeCamera
-    """Intrinsics on the stereo grid."""
+    """Intrinsics in pixels of the stereo depth map."""
     rotation: Float64
     """(3, 3) rotation of the pose ``cam_from_world``."""
     translation: Float64
@@ -36,14 +36,14 @@ class PosedGrid:
         return self.camera.height, self.camera.width
 
     def pixels_from(self, source: PosedGrid) -> tuple[Float64, Float64]:
-        """Compute the matrix and offset that project pixels with depth from another grid.
+        """Compute the transformation of pixels with depth from another view to this view.
 
         Args:
-            source: Grid of the pixels (x, y) with z-depth d.
+            source: Grid of the other view, whose pixels (x, y) have z-depth d.
 
         Returns:
             Matrix (3, 3) and offset (3,) such that ``d * matrix @ (x, y, 1) + offset`` is a
-            homogeneous pixel of the grid.
+            homogeneous pixel of this view.
         """
         rotation = self.rotation @ source.rotation.T
         translation = self.translation - rotation @ source.translation
@@ -53,25 +53,26 @@ class PosedGrid:
 
 @dataclass(frozen=True, eq=False)
 class DenseView(PosedGrid):
-    """Undistorted view and its refined depth, resampled to the stereo grid."""
+    """Undistorted view and its refined depth map, resampled to the size of stereo depth maps."""
 
     gray: Float32
     """(h, w) gray values of the view in [0, 1]."""
     usable: Bool
-    """(h, w) mask of pixels that neither the user nor the undistortion masks."""
+    """(h, w) bool, False at pixels masked by the user or outside the undistorted image."""
     log_depth: Float32
-    """(h, w) natural log of the input depth in world units; neighboring pixels fill holes."""
+    """(h, w) natural log of the input depth in world units; holes are filled from neighboring
+    pixels."""
     log_std: Float32
     """(h, w) std of ``log_depth``; ``UNKNOWN_LOG_STD`` in holes."""
 
     @classmethod
     def from_view(cls, image: RegisteredImage, view: View, max_size: int) -> DenseView:
-        """Resize a view and the depth map of its registered image to the stereo grid.
+        """Resize a view and the depth map of its registered image to stereo resolution.
 
         Args:
             image: Registered image with pose and depth map.
             view: Undistorted view of the registered image.
-            max_size: Maximum length of the grid's longer side in pixels.
+            max_size: Maximum length of the longer side of stereo depth maps in pixels.
         """
         rows, columns = view.image.shape[:2]
         width, height = dense_grid_size((columns, rows), max_size)
@@ -91,7 +92,7 @@ class DenseView(PosedGrid):
         )
 
     def downsample(self, factor: int) -> DenseView:
-        """Downsample the view to `factor` times fewer rows and columns."""
+        """Downsample images, depth and intrinsics of the view by a factor."""
         if factor == 1:
             return self
         width, height = (max(2, size // factor) for size in self.camera.size)
@@ -107,20 +108,21 @@ class DenseView(PosedGrid):
 
     @property
     def grid(self) -> PosedGrid:
-        """Intrinsics and pose of the grid without pixel data."""
+        """Intrinsics and pose of the view, without gray values and depth."""
         return PosedGrid(self.camera, self.rotation, self.translation)
 
 
 def resample_known_depth(depth: DepthPrior, width: int, height: int) -> tuple[Float32, Float32]:
-    """Resample a depth map and its std in log depth to a grid.
+    """Resample a depth map and its std of log depth to another resolution.
 
-    Linear interpolation across a depth edge would give a depth on neither surface. The nearest
-    sample replaces an interpolated value next to holes, or if both differ by more than the std.
+    Linear interpolation across a depth edge would give a depth on neither surface. The depth of the
+    nearest pixel therefore replaces an interpolated depth next to holes, and if both depths differ
+    by more than the std.
 
     Args:
         depth: Refined depth map with variance.
-        width: Number of columns of the grid.
-        height: Number of rows of the grid.
+        width: Number of columns of the resampled depth map.
+        height: Number of rows of the resampled depth map.
 
     Returns:
         Natural log of depth and its std, both (h, w).
@@ -136,8 +138,8 @@ def resample_known_depth(depth: DepthPrior, width: int, height: int) -> tuple[Fl
 
 
 def _log_depth_and_std(depth: DepthPrior) -> tuple[Float32, Float32]:
-    """Return log depth without holes and its std, both (h, w)."""
-    assert depth.variance is not None  # The mapper sets the depth variance.
+    """Return log depth (h, w) with filled holes, and the std (h, w) of log depth."""
+    assert depth.variance is not None  # The mapper's refined depth maps always have a variance.
     valid = depth.valid
     if not valid.any():
         zero = np.zeros(depth.shape, np.float32)
@@ -148,7 +150,7 @@ def _log_depth_and_std(depth: DepthPrior) -> tuple[Float32, Float32]:
 
 
 def _fill_holes(values: Float32, valid: Bool) -> Float32:
-    """Fill invalid pixels by pull-push: means over valid neighbors on ever coarser grids."""
+    """Fill invalid pixels by pull-push, with means over valid pixels on coarser grids."""
     if valid.all():
         return values
     width, height = ((size + 1) // 2 for size in values.shape[::-1])

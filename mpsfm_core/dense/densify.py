@@ -1,13 +1,13 @@
-"""Densification: replace refined depth maps by multi-view stereo depth where images overlap.
+"""Densification, which improves depth maps by multi-view stereo where images overlap.
 
-Input depth is the depth map of an image before densification. Densification has five stages:
-
-1. Select source views (:mod:`~mpsfm_core.dense.view_selection`).
-2. Match each view by plane-sweep stereo (:mod:`~mpsfm_core.dense.stereo`).
-3. Compare the depth maps of neighbors (:mod:`~mpsfm_core.dense.geometric_consistency`).
-4. Estimate the uncertainty of poses and scales (:mod:`~mpsfm_core.dense.epipolar_error`,
-   :mod:`~mpsfm_core.dense.scale_uncertainty`).
-5. Fuse stereo depth with input depth (:mod:`~mpsfm_core.dense.depth_posterior`).
+The input depth of an image is the mapper's refined depth map. Densification has five stages. The
+first stage selects source views (:mod:`~mpsfm_core.dense.view_selection`). The second stage
+computes stereo depth by plane-sweep stereo (:mod:`~mpsfm_core.dense.stereo`). The third stage
+checks the consistency of neighboring stereo depth maps
+(:mod:`~mpsfm_core.dense.geometric_consistency`). The fourth stage estimates the uncertainty of
+poses and depth scales (:mod:`~mpsfm_core.dense.epipolar_error`,
+:mod:`~mpsfm_core.dense.scale_uncertainty`). The fifth stage fuses stereo depth with input depth
+(:mod:`~mpsfm_core.dense.depth_posterior`).
 """
 
 from __future__ import annotations
@@ -53,26 +53,28 @@ from mpsfm_core.support.threads import thread_limit
 
 _T = TypeVar("_T", bound=np.generic)
 _NUM_SOURCES = 5
-"""Maximum number of source views per view; higher is more complete and slower [ours]."""
+"""Maximum number of source views per reference view. Raising it adds depth and takes longer
+[ours]."""
 _MATCH_STD_PX = 0.5
-"""Nominal std of a match in pixels, for the tolerance of the consistency check [ours]."""
+"""Assumed std of a stereo match in pixels, for the tolerance of the consistency check [ours]."""
 _MAX_COST = 0.9
-"""Maximum matching cost of a pixel with stereo depth; textureless images match anything [ours]."""
+"""Maximum matching cost of a pixel with valid stereo depth [ours]."""
 _MAX_SPLAT_STDS = 1.5
-"""Maximum difference of splatted and input depth, in stds of the input depth [ours].
+"""Maximum log depth difference of depth projected from neighbors, in stds of input depth [ours].
 
-A larger difference may mean that the splatted depth belongs to a surface past an edge."""
+With a larger difference, the projected depth may belong to another surface behind an edge."""
 _MAX_SPLAT_VIEWS = 16
-"""Maximum number of views whose depth is splatted into a view; bounds the run time."""
+"""Maximum number of neighboring views whose depth is projected into a view; bounds the run time."""
 _NUM_CACHED_NEIGHBORHOODS = 4
-"""Capacity of the view cache, as number of views with their source views."""
+"""Number of reference views that the view cache can hold together with their source views."""
 _SPLAT_STD_FACTOR = 3.0
-"""Std of splatted depth relative to the std of matched depth [ours]."""
+"""Ratio of the std of depth projected from neighbors to the std of the view's stereo depth
+[ours]."""
 
 
 @dataclass(frozen=True)
 class DenseReport:
-    """Source views, confirmed ratios and stereo masks of all densified images."""
+    """Source images, confirmed pixel ratios and stereo masks of all densified images."""
 
     sources: dict[str, list[str]]
     """Image name -> names of the source images for stereo."""
@@ -87,15 +89,15 @@ class DenseReport:
 
 
 class ArrayStore(Protocol):
-    """Function that stores large arrays in memory or on disk."""
+    """Callable that stores a large array in memory or on disk."""
 
     def __call__(self, array: NDArray[_T]) -> NDArray[_T]:
-        """Store an array in memory or on disk and return an array of equal values."""
+        """Store an array in memory or on disk, and return a stored array with equal values."""
         ...
 
 
 def store_in_memory(array: NDArray[_T]) -> NDArray[_T]:
-    """Return the array itself, which stays in memory."""
+    """Return the array unchanged, as an :class:`ArrayStore` without files."""
     return array
 
 
@@ -103,9 +105,9 @@ class StereoCheckpoints(Protocol):
     """Storage of the stereo depth of each image, so that an interrupted run can resume."""
 
     def load(self, name: str) -> StereoDepth | None:
-        """Return the stereo depth of an image, or None.
+        """Return the stored stereo depth of an image, or None if there is none.
 
-        The stored stereo depth must come from the same reconstruction, images and options.
+        Implementations must check that reconstruction, images and options have not changed.
         """
 
     def save(self, name: str, depth: StereoDepth) -> None:
@@ -124,22 +126,25 @@ def densify(
 ) -> tuple[Reconstruction, DenseReport]:
     """Refine the depth maps of a reconstruction by multi-view stereo.
 
-    Images without confirmed pose and images without overlap keep their depth maps. The result does
-    not depend on the number of threads.
+    Images without confirmed pose and images without overlap keep their depth maps. The densified
+    depth maps do not depend on the number of threads.
 
     Args:
         reconstruction: Posed images with refined depth maps.
-        view_of: Returns the undistorted view of an image name.
-        options: Options of stereo and fusion.
-        workers: Number of threads; None uses the thread limit of the process.
-        progress: Called with the number of images with stereo depth and the number of all images.
-        checkpoints: Stores stereo depth, so that an interrupted run can resume.
-        store_array: Stores large maps, including the depth maps of the result; must be thread-safe.
-        poses_use_depth: True if depth priors of the images constrained the poses. The scales of
-            image pairs may then depend on the priors alone, which adds a scale variance.
+        view_of: Function that returns the undistorted view of an image, by image name.
+        options: Options of multi-view stereo.
+        workers: Number of threads; None uses as many threads as the process may use.
+        progress: Callback that receives the number of finished images and the number of all images.
+        checkpoints: Storage of stereo depth, so that an interrupted run can resume (None stores
+            nothing).
+        store_array: Thread-safe function that stores large arrays, including the returned depth
+            maps.
+        poses_use_depth: True if depth priors constrained the poses. The scale of an image pair may
+            then depend on depth priors alone, so a scale variance is added to the depth variance.
 
     Returns:
-        The reconstruction with new depth maps, and the report.
+        The reconstruction with densified depth maps, and a report on source images and stereo
+        pixels.
     """
     image_rows = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
     images = [reconstruction.images[row] for row in image_rows]
@@ -221,7 +226,7 @@ def _confirmed_ratio(consistency: GeometricConsistency | None) -> float:
 
 
 class _ViewCache:
-    """Cache that loads views on the stereo grid on demand."""
+    """Cache of views at stereo resolution, which are loaded on demand."""
 
     def __init__(
         self,
@@ -249,7 +254,7 @@ class _MatchedImage(NamedTuple):
     parallax: Float32
     """:attr:`StereoDepth.parallax`."""
     supported: Bool
-    """(h, w) mask of unmasked pixels with a low matching cost."""
+    """(h, w) bool, True at pixels with low matching cost that the user does not mask."""
 
     def log_std(self, std_px: float | Float32) -> Float32:
         """Convert the std of a match in pixels to the std of log depth (h, w)."""
@@ -258,16 +263,16 @@ class _MatchedImage(NamedTuple):
 
     @property
     def parallax_px(self) -> Float32:
-        """(h, w) pixels that a projection in the source views moves per unit of log depth."""
+        """(h, w) motion of projections in the source views, in pixels per unit of log depth."""
         return resize_map(self.parallax, *self.grid.camera.size)
 
     def posed_depth(self) -> PosedDepth:
-        """Return the stereo depth map with its pose and nominal std."""
+        """Return the stereo depth map with its pose and the std of an assumed match error."""
         return PosedDepth(self.grid, self.log_depth, self.log_std(_MATCH_STD_PX))
 
 
 def _symmetric_neighbors(sources: Sequence[Sequence[int]]) -> list[list[int]]:
-    """Return for each view the source views, and the views that use the view as source."""
+    """Return the neighbors of each view, its source views and the views that use it as source."""
     neighbors = [set(views) for views in sources]
     for row, views in enumerate(sources):
         for view in views:
@@ -278,7 +283,7 @@ def _symmetric_neighbors(sources: Sequence[Sequence[int]]) -> list[list[int]]:
 def _compare_with_views(
     row: int, matched: Mapping[int, _MatchedImage], views: Sequence[int]
 ) -> dict[int, DepthDifferences]:
-    """Compare the low-cost stereo depth of an image with the depth maps of other views."""
+    """Compare the stereo depth of an image with the stereo depth of neighboring views."""
     depth = matched[row].posed_depth()
     return {
         view: compare_depths(depth, matched[view].posed_depth()).where(matched[row].supported)
@@ -300,7 +305,7 @@ def _store_consistency(
 def _measure_constraints(
     image: _MatchedImage, differences: Mapping[int, Float32], view: DenseView, options: DenseOptions
 ) -> ScaleConstraints:
-    """Measure the scale constraints between an image's pairs and the input depth of its view."""
+    """Measure how well an image constrains the relative scales of its stereo pairs."""
     known = view.log_std < UNKNOWN_LOG_STD
     std = float(np.median(view.log_std[known])) if known.any() else UNKNOWN_LOG_STD
     change = image.log_depth - view.log_depth
@@ -316,8 +321,8 @@ def _merge_stereo_depth(
 ) -> LogDepthMap:
     """Merge the consistent stereo depth of an image with depth projected from neighbors.
 
-    Pixels that another view confirms use the stereo depth of the image. Unconfirmed pixels use the
-    confirmed depth of neighbors if this depth is close to the input depth.
+    Pixels that another view confirms use the stereo depth of the image. Unconfirmed pixels use
+    confirmed depth projected from neighbors, if this depth is close to the input depth.
     """
     image, confirmed = matched[row], consistency[row].confirmed
     log_depth = image.log_depth + consistency[row].mean_change
@@ -345,7 +350,7 @@ def _replace_depth(
     scale_std: float,
     store_array: ArrayStore,
 ) -> RegisteredImage:
-    """Replace the depth map of an image, whose log scale has the std `scale_std`."""
+    """Replace the depth map of an image, and add the variance of the depth scale."""
     depth = np.exp(posterior.log_depth)
     variance = (posterior.log_std**2 + np.float32(scale_std**2)) * depth**2
     prior = DepthPrior.from_arrays(depth, variance, view.usable, metric=image.depth.metric)

@@ -1,9 +1,10 @@
-"""Depth completion: correct input depth at pixels without stereo measurement.
+"""Depth completion, which corrects refined depth at pixels without stereo depth.
 
-Two assumptions constrain a pixel without measurement. The ratio of input to true depth is smooth
-and close to 1. Surfaces are planar, and inverse depth of a plane is linear in the image. The
-variances of the smoothness and the planarity assumption are estimated at measured pixels. Both
-assumptions are linear in the ratio, so completion is one sparse linear least-squares problem.
+Two assumptions constrain the depth of a pixel without stereo depth. The first assumption is that
+the ratio of input depth to true depth is smooth and close to 1. The second assumption is that
+surfaces are planar, so that inverse depth is linear in the image. The variances of the smoothness
+and the planarity assumption are estimated at pixels with stereo depth. Both assumptions are linear
+in the ratio of input to true depth, so completion is a sparse linear least-squares problem.
 """
 
 from __future__ import annotations
@@ -18,23 +19,24 @@ from mpsfm_core.data import Bool, Float32, Float64
 from mpsfm_core.geometry.statistics import ONE_SIGMA
 
 _MAX_CORRECTION = 1.0
-"""Maximum correction of log depth; extrapolated planes can reach infinite depth [ours]."""
+"""Maximum correction of log depth, because extrapolated planes can reach infinite depth [ours]."""
 
 
 class MeasuredCorrection(NamedTuple):
-    """Measured corrections of the input depth on a coarse grid."""
+    """Log depth corrections of the refined depth map from stereo, on a coarse grid."""
 
     change: Float32
-    """(h, w) stereo minus input log depth."""
+    """(h, w) log of stereo depth minus log of input depth."""
     precision: Float32
-    """(h, w) inverse variance of ``change``, 0 at pixels without measurement."""
+    """(h, w) inverse variance of each log depth correction, 0 at pixels without stereo depth."""
 
 
 class PlanarityPrior(NamedTuple):
-    """Gaussian prior on second differences of inverse depth, relative to inverse depth."""
+    """Gaussian prior for planar surfaces, on relative second differences of inverse depth."""
 
     bends: csr_array
-    """(m, n) matrix from the n ratios of input to true depth to m relative second differences."""
+    """(m, n) matrix that maps n ratios of input to true depth to m relative second differences of
+    inverse depth."""
     weight: Float64
     """(m,) inverse variance of each relative second difference of inverse depth."""
 
@@ -44,15 +46,15 @@ def estimate_planarity(
 ) -> PlanarityPrior:
     """Estimate the weights of the planarity prior from the stereo depth of an image.
 
-    The std of a second difference is the std of measured second differences. If the input depth has
-    an equally large second difference, an edge is likely and the weight is halved. Edges at the rim
-    of a hole cannot be detected, so the weight at the rim is 0. Without measurements all weights
-    are 0.
+    The prior std of second differences is estimated from the stereo depth. If the input depth has
+    an equally large second difference at a pixel, a depth edge is likely and the planarity weight
+    is halved. Depth edges at the rim of a hole cannot be detected, so the planarity weight at the
+    rim is 0. Without stereo depth all planarity weights are 0.
 
     Args:
-        log_depth: (h, w) input log depth; neighboring pixels fill holes.
+        log_depth: (h, w) log of input depth, with holes filled from neighboring pixels.
         hole: (h, w) mask of pixels without input depth.
-        correction: Measured corrections on the grid of the input depth.
+        correction: Corrections of log depth by stereo, at the pixels of the input depth.
         min_std: Minimum std of log depth.
     """
     second = _second_differences(*log_depth.shape)
@@ -74,16 +76,17 @@ def estimate_planarity(
 def solve_depth_correction(
     field: tuple[Float32, Float32, Float32], planarity: PlanarityPrior, measured: MeasuredCorrection
 ) -> Float32:
-    """Solve for the correction of the input log depth at every pixel.
+    """Solve for the correction of the log of input depth at every pixel.
 
     Args:
-        field: Precisions (h, w) of the Gaussian Markov random field of the ratio of input to true
-            depth: coupling with the east neighbor, the south neighbor, and 1.
+        field: Three precision maps (h, w) of the Gaussian Markov random field of the ratio of input
+            to true depth. The precisions are those of the difference to the right neighbor, of the
+            difference to the lower neighbor, and of the deviation from 1.
         planarity: Planarity prior of the image from :func:`estimate_planarity`.
-        measured: Measured corrections.
+        measured: Corrections of log depth by stereo.
 
     Returns:
-        (h, w) correction of the input log depth.
+        (h, w) correction of the log of input depth.
     """
     height, width = measured.change.shape
     east, south, mass = (each.astype(np.float64) for each in field)
@@ -117,7 +120,7 @@ def _differences(n: int) -> csr_array:
 def _second_differences(height: int, width: int) -> csr_array:
     """Build the matrix (m, n) of all second differences of a map with n pixels.
 
-    The weights of row, column and mixed differences make the sum of squares invariant to rotation
+    Mixed differences have the weight sqrt(2), so that the sum of squares is rotation invariant
     (Frobenius norm of the Hessian).
     """
     down, across = _differences(height), _differences(width)

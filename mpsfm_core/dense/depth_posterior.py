@@ -1,10 +1,10 @@
-"""Gaussian fusion of stereo depth with input depth, and the posterior std.
+"""Gaussian fusion of stereo depth with the mapper's refined depth, and posterior std.
 
 :mod:`mpsfm_core.dense.depth_completion` corrects input depth at pixels without stereo measurement.
-The error of input log depth is a Gaussian Markov random field (Lindgren et al., 2011) on the
-pixels. The posterior std of input depth is the declared std far from stereo measurements and lower
-near measurements. Planarity does not lower the std, because unmeasured surfaces often start behind
-an edge.
+The error of the log of input depth is modeled as a Gaussian Markov random field on the pixels
+(Lindgren et al., 2011). The posterior std of input depth is lower near pixels with stereo depth,
+and equals the prior std far from such pixels. The planarity prior does not lower the posterior std,
+because surfaces without stereo depth often start behind an edge.
 """
 
 from __future__ import annotations
@@ -24,21 +24,21 @@ from mpsfm_core.geometry.statistics import ONE_SIGMA
 from mpsfm_core.optimize.depth_variance import compute_inverse_diagonal
 
 _DOWNSAMPLING = 8
-"""Downsampling factor of the grid of the random field."""
+"""Downsampling factor of the pixel grid on which the random field of depth errors is solved."""
 _MIN_MEASURED_RATIO = 0.3
-"""Minimum ratio of stereo pixels in a block; single pixels may match by chance [ours]."""
+"""Minimum ratio of pixels with stereo depth in a used block; single pixels may be wrong [ours]."""
 _MIN_KNOWN_ERROR_RATIO = 0.5
-"""Minimum ratio of the input depth's std to its distance from stereo depth [ours].
+"""Minimum ratio of the input depth's estimated std to its distance from stereo depth [ours].
 
-The relative accuracy of the stereo depth's std is about 1/8."""
+The std of stereo depth is itself only known to about 1/8."""
 MIN_STD = 1e-4
-"""Minimum std of log depth, more accurate than any sensor."""
+"""Minimum std of log depth, below that of any depth sensor."""
 UNKNOWN_LOG_STD = 1.0
 """Std of log depth in holes, whose depth is filled from neighboring pixels."""
 
 
 class LogDepthMap(NamedTuple):
-    """Map of log depth with std."""
+    """Map of log depth and its std."""
 
     log_depth: Float32
     """(h, w) natural log of z-depth in world units."""
@@ -47,7 +47,7 @@ class LogDepthMap(NamedTuple):
 
     @property
     def known(self) -> Bool:
-        """(h, w) mask of pixels whose std is finite."""
+        """(h, w) mask of pixels with depth, whose std is finite."""
         return np.isfinite(self.log_std)
 
 
@@ -55,8 +55,8 @@ def fuse_known_depth(measured: LogDepthMap, known: LogDepthMap) -> LogDepthMap:
     """Fuse stereo depth with input depth at the same pixels.
 
     The variance of input depth is estimated as the mean squared distance to stereo depth minus
-    the variance of stereo depth. The estimated variance may be far below the declared variance,
-    so that sensor depth keeps its accuracy. Holes of the input depth are ignored.
+    the variance of stereo depth. The estimated variance of accurate sensor depth may be far below
+    the variance that its prior declares. Filled holes of the input depth are not fused.
     """
     compared = measured.known & (known.log_std < UNKNOWN_LOG_STD)
     if not compared.any():
@@ -81,10 +81,10 @@ def fuse_known_depth(measured: LogDepthMap, known: LogDepthMap) -> LogDepthMap:
 def compute_depth_posterior(
     known: LogDepthMap, measured: LogDepthMap, correlation_px: float
 ) -> LogDepthMap:
-    """Compute log depth and std at every pixel from input and stereo depth.
+    """Compute log depth and its std at every pixel from input depth and stereo depth.
 
     Args:
-        known: Depth before stereo; neighboring pixels fill holes.
+        known: Input depth, with holes filled from neighboring pixels.
         measured: Stereo depth after :func:`fuse_known_depth`.
         correlation_px: Correlation length of the error of input depth in pixels.
     """
@@ -117,7 +117,7 @@ def compute_depth_posterior(
 
 
 def _calibrated_std(known: LogDepthMap, measured: LogDepthMap, std: Float32) -> Float32:
-    """Scale a declared std so that it fits the distances between input and stereo depth.
+    """Scale the std of input depth to match the distances between input and stereo depth.
 
     Holes stay unknown.
     """
@@ -130,23 +130,24 @@ def _calibrated_std(known: LogDepthMap, measured: LogDepthMap, std: Float32) -> 
 
 
 def _error_correlation(pixel_std: Float32, block_std: Float32) -> Float32:
-    """Return the assumed correlation of a pixel's error with its block, in [0, 1].
+    """Return the assumed correlation in [0, 1] of a pixel's depth error with its block's error.
 
-    The correlation is low if the stds of pixel and block differ much.
+    The error correlation is low if the depth stds of pixel and block differ much.
     """
     correlation: Float32 = np.minimum(pixel_std / block_std, block_std / pixel_std) ** 2
     return correlation
 
 
 def _random_field(std: Float32, length: float) -> tuple[Float32, Float32, Float32]:
-    """Compute the couplings (east, south) and the mass of a Gaussian Markov random field.
+    """Compute the precision maps of a Gaussian Markov random field with a marginal std.
 
-    In the plane the variance of the field is about ``log(3 length) / (2 pi coupling)``, and the
-    mass is ``coupling / length^2``.
+    The function returns the precisions (couplings) of differences to the right and lower neighbor,
+    and the precision (mass) of each value. On an unbounded grid the variance of the field is about
+    ``log(3 length) / (2 pi coupling)`` if the mass is ``coupling / length^2``.
 
     Args:
-        std: (h, w) marginal std of the field.
-        length: Correlation length of the field in pixels.
+        std: (h, w) marginal std of the random field.
+        length: Correlation length of the random field in pixels.
     """
     strength = (np.log(3 * length) / (2 * np.pi * std**2)).astype(np.float32)
     east, south = np.zeros_like(strength), np.zeros_like(strength)

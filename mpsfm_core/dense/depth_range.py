@@ -7,11 +7,11 @@ import numpy as np
 from mpsfm_core.data import DepthPrior, Float64
 
 _GRID = (8, 8)
-"""Shape of the prior's depth map; the map is constant, so the shape has no influence."""
+"""Shape of the constant depth map of the prior, which has no influence on the results."""
 _RANGE_PERCENTILES = (2.0, 98.0)
-"""Percentiles of the point depths that bound the depth range; points outside may be outliers."""
+"""Percentiles of the points' depths that bound the depth range, without possible outliers."""
 _RANGE_STDS = 1.5
-"""Half width of the depth range in stds; the search range of stereo is slightly wider."""
+"""Half width of the depth range in stds of the depth prior."""
 _MIN_LOG_STD = 0.1
 """Minimum std of the prior's log depth."""
 

@@ -1,9 +1,9 @@
-"""Pose errors of image pairs, measured as offsets of matched patches from epipolar lines.
+"""Pose errors of image pairs, estimated from patch offsets to epipolar lines.
 
 The depth of a pixel moves its projection along the epipolar line only. The offset of a matched
 patch perpendicular to the epipolar line is therefore a pose error. Pose errors along the epipolar
 line are not observable, because the stereo depth absorbs them. If few patches match, the two images
-hardly show the same surface.
+probably show different surfaces.
 """
 
 from __future__ import annotations
@@ -21,26 +21,26 @@ from mpsfm_core.geometry.statistics import ONE_SIGMA
 MAX_PATCHES = 100
 """Maximum number of patches per image pair [ours]."""
 PATCH_RADIUS_PX = 7
-"""Patch radius and maximum offset of a match, in pixels of the depth map [ours]."""
+"""Radius and maximum offset of a matched patch, both in pixels of the depth map [ours]."""
 MIN_CORRELATION = 0.8
 """Minimum normalized cross-correlation (NCC) of a matched patch [ours]."""
 _NOISE_CORRELATION_PX = 1.5
-"""Correlation length of the image noise after downsampling, in pixels."""
+"""Correlation length of image noise in the downsampled view, in pixels."""
 _LOG_DEPTH_STEP = 1e-2
-"""Step of log depth for the numeric direction of the epipolar line."""
+"""Step of log depth for numeric differentiation, which gives the direction of the epipolar line."""
 
 
 class PatchOffsets(NamedTuple):
     """Offsets of matched patches from their epipolar lines."""
 
     epipolar_px: Float64
-    """(n,) signed distances of matched patches to epipolar lines, pixels of the source view."""
+    """(n,) signed distances of matched patches to epipolar lines, in pixels of the source view."""
     matched_ratio: float
-    """Ratio of the sampled patches that match, in [0, 1]."""
+    """Ratio in [0, 1] of the sampled patches that match in the source view."""
 
 
 def estimate_pose_error_px(pairs: Iterable[PatchOffsets]) -> float:
-    """Estimate the std of epipolar offsets over image pairs in pixels; 0 without matches."""
+    """Estimate the std of epipolar offsets of all image pairs in pixels (0 without matches)."""
     offsets = np.abs(np.concatenate([np.zeros(0), *(pair.epipolar_px for pair in pairs)]))
     return float(np.quantile(offsets, ONE_SIGMA)) if len(offsets) else 0.0
 

@@ -1,4 +1,4 @@
-"""Fusion of the depth maps of all images into one point cloud without duplicate surfaces."""
+"""Fusion of all depth maps into a point cloud without duplicate surfaces."""
 
 # mypy: allow-untyped-decorators
 
@@ -19,42 +19,43 @@ from mpsfm_core.support.jit import kernel
 from mpsfm_core.support.threads import parallel_map
 
 _MAX_NEIGHBORS = 8
-"""Maximum number of overlapping images that vote on the points of one image."""
+"""Maximum number of overlapping images whose depth confirms or contradicts an image's points."""
 _MIN_PIXEL_RATIO = 0.25
-"""Minimum ratio of pixels that count as certain, because networks may declare large stds [ours]."""
+"""Minimum ratio of an image's pixels with a relative depth std low enough for fusion [ours]."""
 _DUPLICATE_DISTANCE = 0.02
-"""Relative distance below which consistent points are duplicates at any std [ours]."""
+"""Distance relative to depth below which consistent points are duplicates at any std [ours]."""
 _DOMINANT_STD_RATIO = 0.5
-"""Ratio of two stds below which the more certain of two consistent points is used at any distance
-[ours]."""
+"""Ratio of depth stds of two consistent points below which only the more certain point is used, at
+any distance [ours]."""
 
 _T = TypeVar("_T")
 
 
 class _ConsistencyVotes(NamedTuple):
-    """Votes of neighboring images on n points of one image."""
+    """Number of images that confirm, contradict or duplicate n points of an image."""
 
     consistent: Bool
-    """(n,) mask of points that as many images confirm as contradict, or more."""
+    """(n,) mask of points that at least as many images confirm as contradict."""
     duplicate: Bool
-    """(n,) mask of points that an image with lower depth std also contains."""
+    """(n,) mask of points that another image observes with lower depth std."""
     views: UInt8
-    """(n,) number of images with consistent depth, including the image of the point."""
+    """(n,) number of images whose depth is consistent with each point, including its own image."""
 
 
 class FusedPointCloud(NamedTuple):
-    """Fused point cloud with n points."""
+    """Point cloud of n points, fused from the depth maps of all images."""
 
     points: Float64
     """(n, 3) float64 positions of the points, world frame."""
     colors: UInt8
     """(n, 3) uint8 RGB colors of the points."""
     normals: Float32
-    """(n, 3) float32 unit normals facing the camera of the point, world frame; 0 if undefined."""
+    """(n, 3) float32 unit normals of the points in the world frame, facing the camera (0 if
+    undefined)."""
     std: Float32
     """(n,) float32 std of each point's depth, world units."""
     views: UInt8
-    """(n,) uint8 number of images with consistent depth, including the image of the point."""
+    """(n,) uint8 number of images whose depth is consistent with each point."""
 
 
 def fuse_depth_maps(
@@ -65,14 +66,15 @@ def fuse_depth_maps(
 ) -> FusedPointCloud:
     """Fuse depth maps into one point cloud; the point with the lowest std replaces duplicates.
 
-    Uncertain pixels, inconsistent pixels and images without confirmed pose are left out. If the
-    cloud exceeds `options.dense_max_points`, each map is subsampled randomly.
+    The point cloud omits pixels with large depth std, inconsistent pixels, and images without
+    confirmed pose. If the cloud exceeds `options.dense_max_points`, each map is subsampled
+    randomly.
 
     Args:
         reconstruction: Posed images with depth maps.
-        view_of: Returns the undistorted view of an image name, for the colors.
-        options: Options of the run's results, such as the point cloud size.
-        seed: Seed of the random subsampling.
+        view_of: Function that returns the undistorted view of an image name, for the colors.
+        options: Options of the results, such as the maximum number of points.
+        seed: Random seed of the subsampling of depth maps.
     """
     images = reconstruction.confirmed_images
 
@@ -102,7 +104,7 @@ def fuse_depth_maps(
 def compute_consistent_masks(
     images: Sequence[RegisteredImage], options: ResultOptions
 ) -> list[Bool]:
-    """Compute the mask (h, w) of certain and consistent pixels of each image."""
+    """Compute for each image the mask (h, w) of pixels with low depth std and consistent depth."""
 
     def build_mask(row: int, pixels: Int64, votes: _ConsistencyVotes) -> Bool:
         mask = np.zeros(images[row].depth.shape, np.bool_)
@@ -117,13 +119,13 @@ def _vote_on_images(
     options: ResultOptions,
     select: Callable[[int, Int64, _ConsistencyVotes], _T],
 ) -> list[_T]:
-    """Vote on the certain pixels of each image and return the selection of each image.
+    """Compute the consistency votes on each image's points, and apply a selection function.
 
     Args:
         images: Images with confirmed poses.
-        options: Options of the run's results, such as the point cloud size.
-        select: Called with the image's index, the flat indices of its certain pixels, and their
-            votes.
+        options: Options of the results, such as the maximum number of points.
+        select: Function that receives an image index, the flat indices of its pixels with low depth
+            std, and the votes on these pixels.
     """
     max_relative_std = max(options.dense_max_relative_std, _relative_std_of_best_pixels(images))
     usable = [_certain_pixels(image, max_relative_std) for image in images]
@@ -149,7 +151,7 @@ _EMPTY = FusedPointCloud(
 
 
 def _relative_std_of_best_pixels(images: Sequence[RegisteredImage]) -> float:
-    """Compute the median over images of the `_MIN_PIXEL_RATIO` quantile of relative depth std."""
+    """Compute the 0.25 quantile of relative depth std in each image, and return the median."""
     quantiles = [
         np.quantile(np.sqrt(_variance(image)[valid]) / image.depth.depth[valid], _MIN_PIXEL_RATIO)
         for image in images
@@ -165,12 +167,12 @@ def _certain_pixels(image: RegisteredImage, max_relative_std: float) -> Bool:
 
 
 def _variance(image: RegisteredImage) -> Float32:
-    assert image.depth.variance is not None  # The mapper sets the depth variance.
+    assert image.depth.variance is not None  # Refined depth maps always have a variance.
     return image.depth.variance
 
 
 def _unproject_pixels(image: RegisteredImage, pixels: Int64) -> tuple[Float64, Float64]:
-    """Unproject flat pixel indices to world points (n, 3) with depth variances (n,)."""
+    """Unproject pixels, given as flat indices, to world points (n, 3) with depth variances (n,)."""
     height, width = image.depth.shape
     camera = image.camera.resized(width, height)
     xy = pixel_centers(width, height).reshape(-1, 2)[pixels]
@@ -190,8 +192,8 @@ def _vote_on_points(
     Args:
         points: (n, 3) points of the image, world frame.
         variance: (n,) variance of the points' depth.
-        voters: Neighboring images, masks of their certain pixels, and True if the image wins at
-            equal variance.
+        voters: Neighboring images, masks of their pixels with low depth std, and True if the
+            neighbor's point is kept when two duplicate points have equal variance.
         sigmas: Largest difference of consistent depths in stds.
     """
     votes = np.zeros(len(points), np.int64)
@@ -222,9 +224,9 @@ def _vote(
     views: UInt8,
     duplicate: Bool,
 ) -> None:
-    """Add the votes of one image to `votes`, `views` and `duplicate`.
+    """Compare points with the depth map of a neighboring image, and add the image's votes.
 
-    A point projects to the homogeneous pixel ``matrix @ point + offset`` of the voter.
+    The homogeneous pixel of a point in the neighboring image is ``matrix @ point + offset``.
     """
     height, width = depth.shape
     for k in range(len(points)):
@@ -240,7 +242,7 @@ def _vote(
             continue
         difference, voter_variance = depth[row, column] - z, depth_variance[row, column]
         limit = sigmas * math.sqrt(variance[k] + voter_variance)
-        if difference > limit:  # The point is in front of the voter's surface.
+        if difference > limit:  # The point is in front of the neighboring image's surface.
             votes[k] -= 1
         if abs(difference) > limit:
             continue
@@ -254,13 +256,13 @@ def _vote(
 
 
 def _compute_normals(image: RegisteredImage) -> Float32:
-    """Compute world normals (h, w, 3) of a depth map; zero at holes and borders."""
+    """Compute normals (h, w, 3) of a depth map in the world frame, zero at holes and borders."""
     height, width = image.depth.shape
     camera = image.camera.resized(width, height)
     local = unproject(camera, pixel_centers(width, height), image.depth.depth)
     normals = np.zeros((height, width, 3), np.float32)
     across, down = local[1:-1, 2:] - local[1:-1, :-2], local[2:, 1:-1] - local[:-2, 1:-1]
-    normal = np.cross(down, across)  # The cross product faces the camera.
+    normal = np.cross(down, across)  # The cross product is a surface normal that faces the camera.
     valid = image.depth.valid
     usable = valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1] & valid[:-2, 1:-1]
     length = np.linalg.norm(normal, axis=-1, keepdims=True)

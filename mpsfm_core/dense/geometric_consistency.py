@@ -1,4 +1,4 @@
-"""Geometric consistency: check whether the depth maps of several views agree."""
+"""Geometric consistency check between the depth maps of several views."""
 # mypy: allow-untyped-decorators
 
 from __future__ import annotations
@@ -17,18 +17,17 @@ from mpsfm_core.geometry.statistics import ONE_SIGMA
 from mpsfm_core.support.jit import kernel
 
 _MAX_DIFFERENCE_STDS = 3.0
-"""Largest difference of consistent depths in stds."""
+"""Maximum difference of consistent depths, in stds of the difference."""
 _MIN_TOLERANCE, _MAX_TOLERANCE = 0.005, 0.05
-"""Minimum and maximum tolerance of log depth differences, for inexact poses and large stds
-[ours]."""
+"""Minimum and maximum difference in log depth of consistent depths, whatever their std [ours]."""
 _ERROR_CORRELATION = 0.3
 """Correlation of the errors of consistent depth maps [tuned: benchmarks.dense]."""
 _COINCIDENCE_RATIO = 0.5
-"""Ratio of near misses to consistent pixels above which the consistency may be chance [ours]."""
+"""Ratio of nearly consistent to consistent pixels above which consistency may be chance [ours]."""
 _MIN_PATCH_RATIO = 0.25
-"""Minimum ratio of matched patches that confirms an image pair with many near misses [ours].
+"""Minimum ratio of matched patches in an image pair with many nearly consistent pixels [ours].
 
-Pairs with correct poses reach 0.2 to 0.8 on the scene hololens_room."""
+In image pairs with correct poses, 0.2 to 0.8 of the patches match."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,15 +35,16 @@ class GeometricConsistency:
     """Consistency of one depth map with the depth maps of other views."""
 
     views: NDArray[np.uint16]
-    """(h, w) number of views with consistent depth. A single consistent view confirms a pixel,
-    because two wrong depths are rarely equal."""
+    """(h, w) number of views with consistent depth. A single consistent view confirms the depth of
+    a pixel, because two wrong depths are rarely equal."""
     mean_change: Float32
-    """(h, w) mean of all consistent log depths minus the log depth of the map."""
+    """(h, w) mean of the consistent log depths of all views minus the log depth of this view."""
     match_std_px: float
     """Std of a stereo match in pixels, estimated from depth differences (NaN without consistent
     pixels)."""
     pose_std_px: float = 0.0
-    """Std of a match from pose errors in pixels; depth differences do not contain this error."""
+    """Std of a stereo match in pixels due to pose errors, which depth differences do not
+    contain."""
 
     @property
     def confirmed(self) -> Bool:
@@ -53,10 +53,10 @@ class GeometricConsistency:
 
     @property
     def std_px(self) -> Float32:
-        """(h, w) std of the mean of consistent depths in pixels.
+        """(h, w) std of the mean of consistent depths, as std of a stereo match in pixels.
 
-        The errors of depth maps are correlated, so depth differences underestimate the error of the
-        mean.
+        Because the errors of depth maps are correlated, depth differences alone underestimate this
+        std.
         """
         views = self.views.astype(np.float32)
         correlation = _ERROR_CORRELATION
@@ -66,7 +66,7 @@ class GeometricConsistency:
 
 
 class PosedDepth(NamedTuple):
-    """Depth map of a view with pose and std."""
+    """Log depth map of a view with pose and std."""
 
     grid: PosedGrid
     log_depth: Float32
@@ -76,12 +76,13 @@ class PosedDepth(NamedTuple):
 
 
 class DepthDifferences(NamedTuple):
-    """Differences from a depth map to the depth map of another view."""
+    """Log depth differences between the depth maps of two views."""
 
     log_depth: Float32
-    """(h, w) difference of log depth, NaN at inconsistent pixels and outside of the second view."""
+    """(h, w) difference of log depth, NaN at inconsistent pixels and outside the second view."""
     near_miss: Bool
-    """(h, w) mask of near misses, whose depths differ by one to two times the tolerance."""
+    """(h, w) mask of nearly consistent pixels, whose depths differ by one to two times the
+    tolerance."""
 
     @property
     def agree(self) -> Bool:
@@ -89,7 +90,7 @@ class DepthDifferences(NamedTuple):
         return np.isfinite(self.log_depth)
 
     def where(self, usable: Bool) -> DepthDifferences:
-        """Return the depth differences within a mask (h, w)."""
+        """Return the depth differences at the pixels of a mask (h, w)."""
         return DepthDifferences(
             np.where(usable, self.log_depth, np.float32(np.nan)), self.near_miss & usable
         )
@@ -97,10 +98,11 @@ class DepthDifferences(NamedTuple):
     def is_coincidental(self, matched_patch_ratio: float) -> bool:
         """Return True if the consistency of two depth maps may be chance.
 
-        Consistency by chance has as many near misses as consistent pixels.
+        If depths agree by chance, nearly consistent pixels are as frequent as consistent pixels.
 
         Args:
-            matched_patch_ratio: Ratio of patches at consistent pixels whose gray values match.
+            matched_patch_ratio: Ratio of patches at consistent pixels whose gray values match in
+                both views.
         """
         near_miss, agree = int(self.near_miss.sum()), int(self.agree.sum())
         return near_miss > _COINCIDENCE_RATIO * agree and matched_patch_ratio < _MIN_PATCH_RATIO
@@ -120,12 +122,12 @@ def evaluate_consistency(
 ) -> GeometricConsistency:
     """Merge the depth differences to several views and estimate the std of a match.
 
-    A depth difference contains the errors of two matches.
+    A depth difference contains the errors of two stereo matches.
 
     Args:
-        parallax: (h, w) pixels that a projection moves per unit of log depth.
-        differences: :attr:`DepthDifferences.log_depth` of each view, (h, w).
-        pose_std_px: :attr:`GeometricConsistency.pose_std_px`.
+        parallax: (h, w) motion in pixels of a point's projection per unit of log depth.
+        differences: Log depth differences (h, w) to each view, see :class:`DepthDifferences`.
+        pose_std_px: Std of a stereo match in pixels due to pose errors.
     """
     views, change, moves_px = np.zeros(parallax.shape, np.uint16), np.zeros_like(parallax), []
     for difference in differences:
@@ -143,7 +145,8 @@ def splat_depth(grid: PosedGrid, sources: Iterable[tuple[PosedGrid, Float32, Boo
 
     Args:
         grid: Target grid.
-        sources: Grid, log depth (h, w) and mask (h, w) of each source view.
+        sources: Grid, log depth (h, w), and mask (h, w) of the projected pixels of each source
+            view.
 
     Returns:
         Log depth (h, w), infinite where no pixel projects.
@@ -166,7 +169,7 @@ def _compare(
     differences: Float32,
     near_miss: Bool,
 ) -> None:
-    """Write log depth differences and near misses for :func:`compare_depths`."""
+    """Compute log depth differences and nearly consistent pixels of two depth maps."""
     height, width = log_depth.shape
     rows, columns = source.shape
     for i in range(height):
@@ -193,7 +196,7 @@ def _compare(
 
 @kernel()
 def _splat(depth: Float32, mask: Bool, matrix: Float64, offset: Float64, splatted: Float32) -> None:
-    """Project the masked log depths of one view for :func:`splat_depth`."""
+    """Project the masked pixels of one view into a z-buffer of log depth."""
     height, width = depth.shape
     rows, columns = splatted.shape
     for i in range(height):

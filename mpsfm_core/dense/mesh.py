@@ -37,7 +37,7 @@ from mpsfm_core.support.jit import kernel
 _BLOCK_SIZE = 64
 """Number of voxels along each side of a TSDF block."""
 _TRUNCATION_VOXELS = 3.0
-"""Minimum truncation distance of the TSDF in voxels, a cell and its neighbors."""
+"""Minimum truncation distance of the TSDF in voxels."""
 _TRUNCATION_STDS = 3.0
 """Minimum truncation distance of the TSDF in depth stds, so that noise does not split a surface."""
 _MERGE_DISTANCE = 1e-3
@@ -58,7 +58,7 @@ class TriangleMesh(NamedTuple):
 
 
 class _WeightedDepth(NamedTuple):
-    """Depth map with TSDF weights."""
+    """Depth map with inverse variances, for TSDF integration."""
 
     image: RegisteredImage
     intrinsics: Float64
@@ -83,9 +83,8 @@ class _WeightedDepth(NamedTuple):
     def find_visible(self, vertices: Float64, tolerance: float) -> tuple[Int64, Float64]:
         """Find the mesh vertices on the surface of the depth map.
 
-        Behind the edge of an object the TSDF has a false surface, because only some images have
-        depth there. No depth map contains the false surface of the TSDF, so the vertices on the
-        false surface are rejected.
+        Behind object edges the TSDF contains false surfaces, because only some images have depth
+        there. No depth map contains these false surfaces, so this test rejects their vertices.
 
         Args:
             vertices: (n, 3) positions of the vertices, world frame.
@@ -119,17 +118,17 @@ class _WeightedDepth(NamedTuple):
 def mesh_depth_maps(
     reconstruction: Reconstruction, view_of: Callable[[str], View], options: MeshOptions
 ) -> TriangleMesh:
-    """Mesh the surface of all depth maps; unobserved regions stay open.
+    """Extract a triangle mesh from all depth maps; unobserved regions remain open.
 
-    Uncertain and inconsistent pixels are left out, as in the fused point cloud.
+    The mesh omits pixels with large depth std and inconsistent pixels, as the point cloud does.
 
     Args:
         reconstruction: Posed images with depth maps.
-        view_of: Returns the undistorted view of an image name, for the colors.
-        options: Options of the mesh.
+        view_of: Function that returns the undistorted view of an image name, for the colors.
+        options: Options of mesh extraction.
 
     Raises:
-        InputError: scikit-image is not installed, no pixel is certain, or no surface is found.
+        InputError: scikit-image is missing, no pixel has consistent depth, or no surface is found.
     """
     marching_cubes, simplify = _import_libraries()
     images = reconstruction.confirmed_images
@@ -188,7 +187,7 @@ def _import_libraries() -> tuple[Any, Any]:
 def _weight_depth(image: RegisteredImage, mask: Bool) -> _WeightedDepth:
     height, width = image.depth.shape
     variance = image.depth.variance
-    assert variance is not None  # The mapper sets the depth variance.
+    assert variance is not None  # The mapper's refined depth maps always have a variance.
     min_variance = np.finfo(np.float32).tiny
     weight = np.where(mask, 1 / np.maximum(variance, min_variance), 0).astype(np.float32)
     depth = np.where(mask, image.depth.depth, 0).astype(np.float32)
@@ -199,8 +198,8 @@ def _find_surface_blocks(maps: Sequence[_WeightedDepth], voxel: float) -> Int64:
     """Return the sorted integer coordinates (b, 3) of the TSDF blocks that contain points."""
     blocks_per_map = [np.zeros((0, 3), np.int64)]
     for map_ in maps:
-        # A point at a block face counts for both blocks, because the surface may pass on either
-        # side.
+        # A point near a face between two TSDF blocks belongs to both, because the surface may be on
+        # either side.
         points = map_.points / (voxel * _BLOCK_SIZE)
         shifted = [np.floor(points + (corner - 0.5) / _BLOCK_SIZE) for corner in _CORNERS]
         blocks_per_map.append(np.unique(np.concatenate(shifted).astype(np.int64), axis=0))
@@ -218,7 +217,7 @@ def _extract_block_surface(
     """Integrate the TSDF of one block and extract its triangles.
 
     Returns:
-        World vertices (n, 3) and triangles (m, 3), or None without a surface.
+        Vertices (n, 3) in the world frame and triangles (m, 3), or None without a surface.
     """
     origin: Float64 = (block * (voxel * _BLOCK_SIZE)).astype(np.float64)
     size = _BLOCK_SIZE + 1
@@ -234,9 +233,10 @@ def _extract_block_surface(
     if not (field[observed] < 0).any() or not (field[observed] > 0).any():
         return None
     try:
-        # Triangles are counterclockwise as seen from positive distances, the side of the cameras.
+        # Triangles are counterclockwise when seen from the side of the cameras, where signed
+        # distances are positive.
         vertices, triangles, *_ = marching_cubes(field, 0.0, mask=observed)
-    except (ValueError, RuntimeError):  # No observed cell contains a surface.
+    except (ValueError, RuntimeError):  # No observed voxel of the TSDF block contains a surface.
         return None
     return origin + voxel * vertices.astype(np.float64), triangles.astype(np.int64)
 
@@ -257,7 +257,7 @@ def _integrate(
     """Integrate one depth map into the TSDF of a block.
 
     Args:
-        origin: (3,) world position of the first voxel.
+        origin: (3,) position of the block's first voxel in the world frame.
         voxel: Side length of a voxel in world units.
         rotation: (3, 3) rotation of ``cam_from_world``.
         translation: (3,) of ``cam_from_world``.
@@ -265,8 +265,8 @@ def _integrate(
         depth: (h, w) z-depth in world units, 0 at holes.
         pixel_weight: (h, w) weights.
         truncation: Truncation distance of the TSDF in world units.
-        total: (n, n, n) weighted sum of signed distances, updated in the call.
-        weight: (n, n, n) sum of weights, updated in the call.
+        total: (n, n, n) weighted sum of signed distances of each voxel, updated in place.
+        weight: (n, n, n) sum of weights of each voxel, updated in place.
     """
     height, width = depth.shape
     a, b, c = total.shape
@@ -312,7 +312,7 @@ def _merge_surfaces(
 
 
 def _remove_islands(vertices: Float64, triangles: Int64, truncation: float) -> Int64:
-    """Remove connected components no larger than the TSDF band, which may be noise."""
+    """Remove connected mesh components no larger than the TSDF truncation band (noise)."""
     edges = np.concatenate([triangles[:, :2], triangles[:, 1:]])
     links = coo_array((np.ones(len(edges), np.bool_), edges.T), shape=(len(vertices),) * 2)
     count, component = connected_components(links, directed=False)
@@ -325,7 +325,7 @@ def _remove_islands(vertices: Float64, triangles: Int64, truncation: float) -> I
 
 
 def _remove_unused_vertices(vertices: Float64, triangles: Int64) -> tuple[Float64, Int64]:
-    """Remove the vertices that no triangle uses."""
+    """Remove mesh vertices that no triangle uses."""
     rows, vertex_ids = np.unique(triangles, return_inverse=True)
     return vertices[rows], vertex_ids.reshape(triangles.shape)
 

@@ -1,6 +1,6 @@
 """Options of densification and meshing.
 
-Default values without a source tag are choices of MP-SfM that `benchmarks.dense` evaluates.
+`benchmarks.dense` evaluates the default values, which are choices of MP-SfM.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ class DenseOptions(Options):
     enabled: bool = True
     """Run multi-view stereo; if False, the results contain the refined depth maps of the mapper."""
     max_size: int = Field(640, ge=64)
-    """Maximum of the longer side of the depth maps in pixels; higher is finer and slower."""
+    """Maximum length of a depth map's longer side in pixels; raising it is finer and slower."""
     correlation_px: float = expert(40.0, gt=0)
     """Correlation length of the error of the refined depth, in pixels of the depth map."""
 
@@ -27,6 +27,6 @@ class MeshOptions(Options):
     voxel_px: float = Field(2.0, gt=0)
     """Voxel size in pixels of the depth maps at their median depth.
 
-    Smaller voxels resolve noise instead of surface, and memory grows with the third power."""
+    Smaller voxels reproduce noise of the depth maps and need more memory."""
     max_triangles: int = Field(500_000, ge=4)
     """Maximum number of triangles (about 20 bytes each on disk); a larger mesh is simplified."""

@@ -2,10 +2,10 @@
 
 The depth of an image pair is known up to the length of its baseline. The log scales of pairs that
 share an image are linked by pixels that both pairs confirm, and by the input depth of the image.
-The declared std of input depth links the scale of each depth map to the world. The log scales of
-pairs, input depth maps and the world form a Gaussian network, in which a constraint limits the
-difference of two log scales. The reported std is the marginal std of a scale relative to the mean
-of all pairs.
+The std of input depth limits the log scale of each depth map relative to the world. The log scales
+of pairs, input depth maps and the world form a Gaussian network, in which a constraint limits the
+difference of two log scales. The estimated scale std is the marginal std of a log scale relative to
+the mean over all image pairs.
 """
 
 from __future__ import annotations
@@ -23,26 +23,27 @@ from mpsfm_core.data import Float32, Float64, Int64
 from mpsfm_core.geometry.statistics import ONE_SIGMA
 
 _MIN_CONSTRAINT_STD = 1e-6
-"""Minimum std of a log scale constraint; avoids infinite precision."""
+"""Minimum std of a constraint between two log scales, which avoids infinite precision."""
 _SCALE_CORRELATION = 0.5
 """Correlation of the scale errors of input depth maps in one component.
 
-The scale errors are correlated because one network predicts all depth maps of the scene [ours]."""
+Scale errors are correlated because one network predicts all depth maps of the scene [ours]."""
 _BLOCK_COLUMNS = 256
-"""Number of columns of the inverse precision matrix that are solved together; bounds the memory."""
+"""Number of columns of the covariance matrix that are computed together; bounds the memory."""
 
 
 class ScaleConstraints(NamedTuple):
-    """Scale constraints that one image measures between its k pairs and its input depth."""
+    """Constraints between the depth scales of an image's k stereo pairs and its input depth."""
 
     sources: list[int]
-    """(k,) index of the second image of each pair."""
+    """(k,) index of the second image of each stereo pair."""
     pixels: Int64
-    """(k,) number of pixels whose depth each pair confirms."""
+    """(k,) number of pixels of the image whose depth each stereo pair confirms."""
     shared: Float64
-    """(k, k) symmetric precision of the log scale difference of two pairs, from shared pixels."""
+    """(k, k) precision of the log scale difference of two stereo pairs, from pixels confirmed by
+    both."""
     known: Float64
-    """(k,) precision of the log scale difference between the input depth and each pair."""
+    """(k,) precision of the log scale difference between the input depth and each stereo pair."""
     known_std: float
     """Declared std of the input depth map's log scale."""
 
@@ -53,17 +54,17 @@ def measure_scale_constraints(
     known_std: float,
     correlation_px: float,
 ) -> ScaleConstraints:
-    """Measure the scale constraints between an image's pairs and its input depth.
+    """Measure constraints between the depth scales of an image's stereo pairs and input depth.
 
-    All pairs that confirm a pixel have equal variance; the depth error that the pairs have in
-    common cancels. The squared mean difference of shared pixels is a lower bound of the variance.
-    Errors of input depth are correlated within the region of a pair. The std of the input depth is
-    therefore its distance to the stereo depth in the region.
+    All stereo pairs that confirm a pixel are assumed to have equal depth variance. The variance of
+    a scale difference is at least the squared mean log depth difference at the pixels that both
+    pairs confirm. Errors of input depth are correlated within the pixels that a stereo pair
+    confirms. The std of input depth is therefore its distance to stereo depth at these pixels.
 
     Args:
-        differences: Source image -> (h, w) differences from
+        differences: Source image -> (h, w) log depth differences from
             :func:`~mpsfm_core.dense.geometric_consistency.compare_depths`.
-        change: (h, w) stereo minus input log depth.
+        change: (h, w) log of stereo depth minus log of input depth.
         known_std: Declared std of the input log depth.
         correlation_px: Correlation length of depth errors in pixels; a square of this side counts
             as one observation.
@@ -89,12 +90,12 @@ def measure_scale_constraints(
 def estimate_scale_stds(images: Mapping[int, ScaleConstraints]) -> dict[int, float]:
     """Estimate the std of the log scale of each image's stereo depth.
 
-    The scale variance of an image is the mean over its pairs, weighted by the number of confirmed
-    pixels. An image without pairs has the scale variance of its input depth. If no image has a
-    pair, all stds are 0.
+    The scale variance of an image is the mean over its stereo pairs, weighted by their numbers of
+    confirmed pixels. An image without stereo pairs has the scale variance of its input depth. If no
+    image has a stereo pair, all scale stds are 0.
 
     Args:
-        images: Image index -> constraints, with the indices of :attr:`ScaleConstraints.sources`.
+        images: Image index -> scale constraints of the image.
     """
     pair_ids: dict[tuple[int, int], int] = {}
     pairs = {
@@ -136,16 +137,16 @@ def estimate_scale_stds(images: Mapping[int, ScaleConstraints]) -> dict[int, flo
 def _world_precision(precision: csr_array, maps: list[int], stds: list[float]) -> Float64:
     """Compute the precision of each unknown log scale relative to the world.
 
-    The precision of image pairs is 0. Depth maps of one component have correlated scale errors,
-    which reduces the precision of each map.
+    The log scales of stereo pairs have no constraint to the world, so their precision is 0. Depth
+    maps of one component have correlated scale errors, which reduces the precision of each map.
 
     Args:
         precision: (n, n) precision of the constraints between unknown log scales.
-        maps: Indices of the unknowns that are log scales of input depth maps.
+        maps: Indices of the unknown log scales that belong to input depth maps.
         stds: Declared std of each input depth map's log scale.
 
     Returns:
-        (n,) precision relative to the world, 0 for image pairs.
+        (n,) precision of each log scale relative to the world, 0 for stereo pairs.
     """
     components = connected_components(precision, directed=False)[1][maps]
     component_sizes = np.bincount(components)[components]

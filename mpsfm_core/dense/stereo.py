@@ -1,9 +1,9 @@
-"""Multi-view stereo: plane-sweep along the input surface, coarse to fine.
+"""Multi-view stereo by plane-sweep along the surface of the input depth, coarse to fine.
 
-A stereo label is an offset of log depth from the input surface. A sweep warps all pixels of one
-label into a source view, so that NCC windows follow the slant of the surface. Semi-global matching
-(Hirschmueller, PAMI 2008) aggregates the costs. The next finer pyramid level searches a few labels
-around the coarse result.
+Each depth hypothesis (label) is an offset of log depth from the surface of the input depth map. The
+sweep warps all pixels of a label into a source view with their own depth, so that NCC windows
+follow the slant of the surface. Semi-global matching (Hirschmueller, PAMI 2008) aggregates the
+matching costs. The next finer pyramid level searches a few labels around the coarse depth.
 """
 
 from __future__ import annotations
@@ -32,13 +32,14 @@ _MAX_LABELS = 96
 _WINDOW_RADIUS = 3
 """Radius of the NCC window in pixels of the pyramid level [ours]."""
 _GRAY_NOISE = 2.0
-"""Std of image noise in gray levels of 255; higher treats more texture as noise [ours]."""
+"""Std of image noise in gray levels of 255. Raising it treats more texture as noise [ours]."""
 _MERGED_VIEW_RATIO = 0.5
-"""Ratio of the views that see a point whose costs are averaged, the lowest costs first [ours].
+"""Ratio of source views whose matching costs are averaged, the lowest costs first [ours].
 
-The views with the highest costs count as occluded. A higher ratio is less robust to occlusion."""
+The source views with the highest matching costs are treated as occluded. Raising this ratio is less
+robust to occlusion."""
 _PRIOR_WEIGHT = 0.02
-"""Weight of the squared deviation from the input depth in stds; costs are in [0, 1] [ours]."""
+"""Matching cost per squared deviation from the input depth, in stds of the input depth [ours]."""
 _SMALL_STEP_PENALTY = 0.04
 """Penalty P1 of semi-global matching for neighboring pixels one label apart [ours]."""
 _LARGE_STEP_PENALTY = 1.6
@@ -46,10 +47,10 @@ _LARGE_STEP_PENALTY = 1.6
 _LEVELS = (2, 1)
 """Downsampling factors of the pyramid levels, coarse to fine."""
 _FINE_LABELS = 5
-"""Number of labels on each side of the coarse depth; a label is about a pixel of parallax
-[ours]."""
+"""Number of labels on each side of the coarse depth, about a pixel of parallax apart [ours]."""
 _UNSEEN_COST = 0.6
-"""Matching cost of a depth outside of all source views, similar to a wrong match [ours]."""
+"""Matching cost of a depth that projects outside all source views, similar to a wrong match
+[ours]."""
 _GRAY_EDGE = 10 / 255
 """Difference of gray values that halves the penalty P2 of a depth step [ours]."""
 _MAX_PRIOR = 9.0
@@ -57,7 +58,7 @@ _MAX_PRIOR = 9.0
 _OUT_OF_RANGE_COST = 4.0
 """Cost of a depth outside the search range, several times the worst matching cost [ours]."""
 _PARALLAX_SAMPLES = 8
-"""Number of parallax samples along each side of the image."""
+"""Number of samples of the parallax along each side of the image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +70,7 @@ class StereoDepth:
     cost: Float32
     """(h, w) matching cost: mean of ``1 - NCC`` over the best views, in [0, 1]."""
     parallax: Float32
-    """(8, 8) pixels that a projection in the source views moves per unit of log depth."""
+    """(8, 8) motion in pixels of a point's projection in the source views per unit of log depth."""
 
 
 def match_stereo_depth(view: DenseView, sources: Sequence[DenseView]) -> StereoDepth:
@@ -98,7 +99,7 @@ def _sweep(
     surface: Float32,
     offsets: Float64,
 ) -> tuple[Float32, Float32]:
-    """Search the best offset from a surface at each pixel.
+    """Search the log depth offset from a surface with the lowest matching cost at each pixel.
 
     Args:
         view: Reference view.
@@ -141,7 +142,8 @@ def _sweep(
 def _search_range(view: DenseView) -> Float32:
     """Compute the half width (h, w) of the search range in log depth.
 
-    The median std is a lower bound of each pixel's std. At holes all labels are in range.
+    The median std of input depth is a lower bound of each pixel's std. At holes of the input depth,
+    the search range contains all labels.
     """
     known = view.log_std[view.log_std < UNKNOWN_LOG_STD]
     median_std = np.median(known) if len(known) else UNKNOWN_LOG_STD
@@ -150,9 +152,9 @@ def _search_range(view: DenseView) -> Float32:
 
 
 def _measure_parallax(view: DenseView, sources: Sequence[DenseView]) -> Float32:
-    """Compute :attr:`StereoDepth.parallax`, the maximum over the source views.
+    """Compute how far projections in the source views move per unit of log depth (8, 8).
 
-    The parallax of distant points has a small positive minimum.
+    The parallax is the maximum over the source views, and at least a small positive value.
     """
     width, height = view.camera.size
     samples = _PARALLAX_SAMPLES

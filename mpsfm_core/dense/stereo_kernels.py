@@ -1,7 +1,7 @@
-"""Compiled loops of multi-view stereo: costs along a surface and semi-global matching.
+"""Compiled kernels of multi-view stereo, for matching costs and semi-global matching.
 
-Images and depth maps are float32 grids of one size. Stereo labels are offsets of log depth from a
-base surface.
+All images and depth maps are float32 arrays of equal size. Stereo labels are offsets of log depth
+from a base surface.
 """
 # mypy: allow-untyped-decorators
 
@@ -18,9 +18,9 @@ _FASTMATH = {"contract", "reassoc", "arcp"}
 """LLVM fast-math flags that allow reordered sums but preserve NaN and infinity."""
 
 UNSEEN = 255
-"""Matching cost of a label whose projection is outside of the source view."""
+"""Matching cost (uint8 code) of a label whose projection is outside the source view."""
 MAX_COST = 250
-"""Matching cost of a label with an NCC of 0 or less; the unit of costs is 1 / 250."""
+"""Matching cost of a label with an NCC of 0 or less, where 250 corresponds to cost 1."""
 
 
 @kernel(fastmath=_FASTMATH)
@@ -42,13 +42,13 @@ def compute_ncc_costs(
     Args:
         reference: (h, w) gray values of the reference view.
         base: (h, w) depth of the base surface, 0 where unknown.
-        offsets: (k,) offsets of log depth.
+        offsets: (k,) labels, offsets of log depth from the base surface.
         source: (H, W) gray values of the source view.
-        matrix: (3, 3); pixel (x, y) of depth d projects to the homogeneous pixel
-            ``d * matrix @ (x, y, 1) + offset``.
-        offset: (3,) offset of the projection.
-        radius: Radius of the window in pixels.
-        noise: Variance of gray values that counts as noise.
+        matrix: (3, 3) matrix such that pixel (x, y) of depth d projects to the homogeneous pixel
+            ``d * matrix @ (x, y, 1) + offset`` of the source view.
+        offset: (3,) offset in the projection to the source view.
+        radius: Radius of the NCC window in pixels.
+        noise: Variance of gray values due to image noise.
         costs: (k, h, w) uint8 output, the cost of each label.
     """
     height, width = reference.shape
@@ -118,12 +118,12 @@ def compute_ncc_costs(
 
 @kernel(fastmath=_FASTMATH)
 def merge_view_costs(costs: UInt8, ratio: float, unseen: float, merged: Float32) -> None:
-    """Average the lowest costs over the source views, for each pixel and label.
+    """Average the lowest matching costs over the source views, for each pixel and label.
 
     Args:
-        costs: (v, k, h, w) costs of v views.
-        ratio: Ratio of the views that see a pixel to average, rounded up.
-        unseen: Cost in [0, 1] of a pixel that is outside of all source views.
+        costs: (v, k, h, w) matching costs of k labels in v source views.
+        ratio: Ratio of the source views to average, among those that contain the pixel.
+        unseen: Matching cost in [0, 1] of a pixel that projects outside all source views.
         merged: (h, w, k) float32 output, the merged costs in [0, 1].
     """
     views, labels, height, width = costs.shape
@@ -162,7 +162,7 @@ def _aggregate_path(
     column_step: int,
     total: Float32,
 ) -> None:
-    """Add the costs of one path direction of semi-global matching to `total`."""
+    """Add the path costs of one direction of semi-global matching to `total`."""
     height, width, labels = costs.shape
     before = np.zeros((width, labels), np.float32)
     here = np.zeros((width, labels), np.float32)
@@ -209,12 +209,12 @@ def aggregate_costs(
     """Aggregate costs by semi-global matching along eight directions.
 
     Args:
-        costs: (h, w, k) costs of k labels.
-        guide: (h, w) gray values.
-        small: Penalty P1 of a step of one label.
-        large: Penalty P2 of a larger step.
+        costs: (h, w, k) matching costs of k labels at each pixel.
+        guide: (h, w) gray values of the reference view.
+        small: Penalty P1 for neighboring pixels one label apart.
+        large: Penalty P2 for neighboring pixels more than one label apart.
         edge: Difference of gray values that halves P2.
-        total: (h, w, k) float32 output, to which the sum over the directions is added.
+        total: (h, w, k) float32 output, to which the path costs of all directions are added.
     """
     for row_step in (-1, 0, 1):
         for column_step in (-1, 0, 1):
@@ -230,10 +230,10 @@ def select_labels(
 
     Args:
         total: (h, w, k) aggregated costs.
-        costs: (h, w, k) costs before aggregation.
+        costs: (h, w, k) matching costs before aggregation.
         offsets: (k,) offsets of log depth of the labels, evenly spaced.
-        offset: (h, w) float32 output, offset of the selected label in log depth.
-        cost: (h, w) float32 output, cost of the selected label before aggregation.
+        offset: (h, w) float32 output, log depth offset of the selected label.
+        cost: (h, w) float32 output, matching cost of the selected label before aggregation.
     """
     height, width, labels = total.shape
     step = offsets[1] - offsets[0]

@@ -1,4 +1,4 @@
-"""Selection of source views for stereo by common surface and triangulation angle."""
+"""Selection of source views for stereo by common visible surface and triangulation angle."""
 
 # mypy: allow-untyped-decorators
 
@@ -18,22 +18,22 @@ from mpsfm_core.support.jit import kernel
 _GRID_ROWS = 16
 """Number of rows of the pixel grid on which the overlap of views is measured."""
 _FULL_SCORE_DEG, _WIDE_DEG = 8.0, 15.0
-"""Minimum and maximum triangulation angle in degrees of the full score [ours].
+"""Minimum and maximum triangulation angle in degrees with the maximum view score [ours].
 
 The view selection score of MVSNet has its maximum at 5 degrees."""
 _MIN_GAIN = 0.02
-"""Minimum mean gain per pixel of a source view [ours]."""
+"""Minimum mean increase of the score per pixel by an additional source view [ours]."""
 _OCCLUSION_STDS = 1.5
-"""Distance behind the visible surface, in stds of log depth, of an occluded point [ours]."""
+"""Minimum distance of an occluded point behind the visible surface, in stds of log depth [ours]."""
 
 
 class _SampledViews(NamedTuple):
-    """Poses and depth of m views, sampled on pixel grids with ``_GRID_ROWS`` rows."""
+    """Poses and depth maps of m views, sampled on coarse pixel grids."""
 
     params: Float64
-    """(m, 4) intrinsics (fx, fy, cx, cy) of the grids."""
+    """(m, 4) intrinsics (fx, fy, cx, cy) in pixels of the coarse grids."""
     columns: Int64
-    """(m,) number of columns of the grids."""
+    """(m,) number of columns of each view's pixel grid."""
     rotations: Float64
     """(m, 3, 3) rotations of ``cam_from_world``."""
     translations: Float64
@@ -41,18 +41,18 @@ class _SampledViews(NamedTuple):
     centers: Float64
     """(m, 3) camera centers, world frame."""
     log_depth: Float64
-    """(m, rows, max columns) natural log of depth at the pixels of the grids."""
+    """(m, rows, max columns) natural log of depth at the pixels of the coarse grids."""
     log_std: Float64
     """(m,) median std of log depth of each view."""
     points: list[Float64]
-    """(n, 3) world points of each view's grid."""
+    """(n, 3) world points of the grid pixels of each view."""
 
 
 def select_source_views(images: Sequence[RegisteredImage], max_sources: int) -> list[list[int]]:
     """Select up to `max_sources` source views for each image, the most useful first.
 
-    Each step of the greedy selection adds the view with the largest gain. Pixels that selected
-    views already cover count less.
+    Each step of the greedy selection adds the view with the largest score increase. Pixels that
+    already selected views cover have a lower weight in the score.
     """
     if not images:
         return []
@@ -81,7 +81,7 @@ def _sample_views(images: Sequence[RegisteredImage]) -> _SampledViews:
         valid = sample_nearest(image.depth.valid, map_xy)
         depth = np.where(valid, depth, np.median(depth[valid]) if valid.any() else 1.0)
         variance = image.depth.variance
-        assert variance is not None  # The mapper sets the depth variance.
+        assert variance is not None  # The mapper's refined depth maps always have a variance.
         if valid.any():
             relative_std = np.sqrt(sample_nearest(variance, map_xy)) / depth
             log_std[row] = np.median(relative_std[valid])
@@ -123,13 +123,13 @@ def _score_points(
     log_std: Float64,
     scores: Float64,
 ) -> None:
-    """Score in [0, 1] how well each view measures each point of the reference view.
+    """Compute a score in [0, 1] of each view for stereo at each point of the reference view.
 
-    The score is the product of terms for triangulation angle and relative distance, and 0 for
-    occluded points.
+    The view score is the product of a term for the triangulation angle and a term for the ratio of
+    distances. Occluded points have the score 0.
 
     The arrays from `params` to `log_std` are the fields of :class:`_SampledViews`. `points` are the
-    (n, 3) world points of the view `reference`. `scores` (m, n) is the output.
+    (n, 3) world points of the view `reference`. The array `scores` (m, n) is the output.
     """
     rows = log_depth.shape[1]
     for source in range(len(params)):
