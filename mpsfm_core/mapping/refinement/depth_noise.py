@@ -1,10 +1,9 @@
 """Measurement of the noise of depth priors from the agreement of image pairs.
 
 A depth prior declares a variance for each pixel. The depth of a matched keypoint is projected into
-the other image of the pair, and compared with the depth prior of that image. These residuals show
+the other image of the pair, and compared with the depth prior of that image. The differences show
 whether the declared variance is too large or too small, and how much errors of neighboring pixels
-correlate. Bundle adjustment treats observations as independent, so that correlated observations
-need a larger variance.
+correlate.
 
 Bundle adjustment treats observations as independent, so correlated observations need a larger
 variance.
@@ -24,24 +23,24 @@ from mpsfm_core.geometry.statistics import MAD_TO_STD, group_medians
 from mpsfm_core.mapping.scene.scene import Scene
 
 CELLS = 4
-"""Rows and columns of the grid of image cells within which errors of depth are correlated.
-[ours]"""
+"""Rows and columns of a grid of image cells; errors of depth in the same cell are treated as
+correlated. [ours]"""
 MIN_RESIDUALS = 25
-"""Minimum number of residuals for a measurement. With fewer residuals the declared variance
-applies. [ours]"""
+"""Minimum number of depth residuals for a measurement of the noise. With fewer residuals, the
+declared variance of the depth prior applies. [ours]"""
 MIN_INDEPENDENT = 0.05
 """Minimum share of the variance of depth that is independent between pixels. [ours]"""
 POSE_UNKNOWNS = 6
-"""Degrees of freedom per additional pose."""
+"""Degrees of freedom of the pose of one more image."""
 MULTIPLIER_RANGE = (0.1, 10.0)
-"""Range of the multiplier of the declared standard deviation. [ours]"""
+"""Range of the factor between the measured and the declared standard deviation of depth. [ours]"""
 MIN_CONSTRAINED_ANGLE_DEG = 2.0
-"""Minimum triangulation angle of a point that rays constrain well without depth. Two images
-suffice, because a wrong pose moves the points of the whole image, while a local error is an error
-of the prior. [ours]"""
+"""Minimum triangulation angle of a point that rays constrain well without depth. Observations in
+two images suffice, because a wrong pose moves all points of an image, while an error of a few
+points is an error of the prior. [ours]"""
 NUM_NEIGHBORS = 7
-"""Number of nearest well-constrained points whose median error is used. Four of these points must
-contradict a prior to change its noise. [ours]"""
+"""Number of nearest well-constrained points whose median error measures the depth prior. Four of
+seven points must contradict a depth prior to change its noise. [ours]"""
 MAX_NEIGHBOR_DISTANCE = 1 / 8
 """Maximum distance between a pixel and a well-constrained point, relative to the width of the depth
 map. Errors of depth priors do not correlate at larger distances. [ours]"""
@@ -53,42 +52,42 @@ class DepthNoise(NamedTuple):
     """Measured noise of the depth priors, relative to the declared variance."""
 
     multiplier: float = 1.0
-    """Factor between the measured and the declared standard deviation."""
+    """Factor between the measured and the declared standard deviation of depth."""
     correlation: float = 1.0
     """Correlation of the depth errors in one image cell, in [0, 1]."""
     design_effect: float = 1.0
-    """Ratio of the variance of a mean to that of independent observations (Kish, Survey Sampling,
-    1965)."""
+    """Ratio of the variances of the mean of correlated and of independent observations (Kish,
+    Survey Sampling, 1965)."""
 
     @property
     def std_factor(self) -> float:
-        """Factor on the declared std such that observations can be treated as independent."""
+        """Factor on the declared std of depth that allows to treat observations as independent."""
         return self.multiplier * float(np.sqrt(self.design_effect))
 
     @property
     def loss_factor(self) -> float:
-        """Factor on a loss scale for residuals in units of the corrected std.
+        """Factor on the scale of the depth loss, for residuals in units of the corrected std.
 
-        An outlier differs from its neighbors, so the loss scale refers to the independent part of
-        the error.
+        The loss scale refers to the part of the depth error that is independent between neighbors,
+        because an outlier differs from its neighbors.
         """
         if self.design_effect == 1.0:
-            return 1.0  # the errors are independent, or were not measured
+            return 1.0  # the depth errors are independent, or were not measured
         independent = max(1.0 - self.correlation, MIN_INDEPENDENT)
         return float(np.sqrt(independent / self.design_effect))
 
     def independent_pixels(self, num_pixels: int) -> float:
-        """Return the effective number of independent measurements in a map of ``num_pixels``."""
+        """Return the effective number of independent depths in a depth map of ``num_pixels``."""
         return num_pixels / (1.0 + (num_pixels / CELLS**2 - 1.0) * self.correlation)
 
 
 def measure_depth_noise(scene: Scene) -> DepthNoise:
     """Measure the noise of the scaled depth priors from all pairs of registered images.
 
-    The median residual of a pair is subtracted, because it may be caused by the depth scales, which
-    bundle adjustment estimates. The variance is the sum of squares divided by the degrees of
-    freedom, which are the effective number of residuals minus the fitted scales and poses. The
-    declared variance counts as one additional residual (a unit information prior).
+    The median residual of each image pair is subtracted, because bundle adjustment estimates the
+    depth scales. The variance is the sum of squared residuals divided by the degrees of freedom,
+    which are the effective number of residuals minus the fitted scales and poses. The declared
+    variance counts as one additional residual (a unit information prior).
 
     Returns:
         The measured noise, or the declared noise if too few residuals exist.
@@ -109,7 +108,7 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
 
 
 def find_well_constrained_keypoints(scene: Scene, image: int) -> Bool:
-    """Return (k,) True for keypoints whose points rays constrain well without depth."""
+    """Return a mask (k,) of the keypoints whose 3D points rays constrain well without depth."""
     points = scene.tracks.point_of[scene.graph.keypoints_of(image)]
     is_observed = points >= 0
     is_constrained = np.zeros(len(points), dtype=np.bool_)
@@ -123,18 +122,20 @@ def measure_local_depth_noise(
 ) -> Float32:
     """Measure the standard deviation of a depth prior relative to its declaration, per pixel.
 
-    The error at a grid node is the median error of the nearest well-constrained points. The median
-    error counts as one observation, and ``min_factor`` as another one (a unit information prior).
-    Missing neighbors count as errors of ``min_factor``.
+    The depth error at a grid node is the median error of the nearest well-constrained points. The
+    median error counts as one observation, and ``min_factor`` as a second observation (a unit
+    information prior). A missing neighbor counts as a depth error of ``min_factor``.
 
     Args:
         scene: The scene.
         image: A registered image.
-        is_constrained: (k,) bool, keypoints from :func:`find_well_constrained_keypoints`.
-        min_factor: Measured factor of the whole scene, which is the lower bound of the result.
+        is_constrained: (k,) bool mask of the keypoints from
+            :func:`find_well_constrained_keypoints`.
+        min_factor: Measured noise factor of the whole scene, which is the lower bound of the local
+            factor.
 
     Returns:
-        (h, w) float32 factor on the declared standard deviation.
+        (h, w) float32 factor on the declared standard deviation of depth.
     """
     graph, tracks, depth_map = scene.graph, scene.tracks, scene.maps[image]
     rows, columns = depth_map.valid.shape
@@ -159,7 +160,7 @@ def measure_local_depth_noise(
 
 
 def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
-    """Return whitened log-depth differences (m,) of matches, and the group of each match.
+    """Return whitened log-depth differences (m,) of matches, and the group (m,) of each match.
 
     A group contains the matches of one cell of the first image with one second image.
     """

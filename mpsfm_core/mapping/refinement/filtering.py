@@ -11,7 +11,7 @@ from mpsfm_core.mapping.options import TriangulationOptions
 from mpsfm_core.mapping.scene.scene import Scene
 
 MIN_IMAGE_POINTS = 3
-"""Minimum number of points that determine the pose of an image."""
+"""Minimum number of observed 3D points that determine the pose of an image."""
 
 
 def filter_points(
@@ -19,14 +19,13 @@ def filter_points(
 ) -> int:
     """Remove outlier observations, and points that neither parallax nor depth determines.
 
-    A point with a small triangulation angle is only kept if one of its images has valid depth at
-    the point.
+    A point with a small triangulation angle is only kept if one of its images has a valid depth
+    prior at the point.
 
     Args:
         scene: The scene.
         options: The options ``max_error_px`` and ``min_angle_deg`` are used.
-        images: Filter only points that at least one of these images observes. None filters all
-            points.
+        images: Images whose observed points are filtered, or None to filter all points.
 
     Returns:
         The number of removed observations.
@@ -49,7 +48,7 @@ def filter_points(
 
 
 def _find_points(scene: Scene, images: list[int] | None) -> Int64:
-    """Return the points (m,), ascending, that some images observe, or all points for None."""
+    """Return the ascending points (m,) that given images observe, or all points for None."""
     tracks = scene.tracks
     if images is None:
         return np.arange(len(tracks.xyz))
@@ -65,7 +64,7 @@ def find_lost_images(scene: Scene) -> list[int]:
 
 
 def find_disconnected_images(scene: Scene) -> list[int]:
-    """Return the registered images that shared points do not connect to the largest component."""
+    """Return the registered images that no chain of shared points connects to the largest part."""
     observations = scene.tracks.observations()
     points = scene.tracks.point_of[observations]
     images = scene.graph.image_of[observations]

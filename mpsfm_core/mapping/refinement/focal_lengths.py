@@ -1,9 +1,9 @@
 """Self-calibration: decide which guessed focal lengths bundle adjustment may change.
 
-Bundle adjustment estimates log focal lengths with a normal prior whose standard deviation depends
-on the source of the guess: EXIF, a network, or a default. A camera takes its estimate if the
-observations determine it better than the prior, and if a lens of this focal length exists. Other
-cameras keep their guess, and the remaining ones are estimated again without them.
+Bundle adjustment estimates log focal lengths with a normal prior, whose standard deviation depends
+on the source of the guess (EXIF, a network, or a default). A camera takes the estimated focal
+length if the observations determine it better than the prior, and if a lens of this focal length
+exists. Cameras that keep the guess are fixed, and the remaining focal lengths are estimated again.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ from mpsfm_core.geometry.focal_length import is_plausible_equivalent
 from mpsfm_core.mapping.scene.focal_outcome import FocalOutcome
 
 MAX_STD_RATIO = 0.5
-"""Ratio of posterior and prior standard deviation of a log focal length above which the guess
-stays. At 0.5, the observations add three times the information of the prior. [ours]"""
+"""Ratio of posterior and prior standard deviation of a log focal length above which a camera keeps
+the guess. At a ratio of 0.5, the observations add three times the information of the prior.
+[ours]"""
 
 
 def decide_focal_outcome(
@@ -22,7 +23,7 @@ def decide_focal_outcome(
     """Decide whether a camera takes its estimated focal length.
 
     Args:
-        equivalent_mm: The estimate as 35 mm equivalent.
+        equivalent_mm: The estimated focal length as 35 mm equivalent.
         posterior_std: Standard deviation of the log focal length given observations and prior.
         prior_std: Standard deviation of the log focal length given the prior.
     """

@@ -1,13 +1,13 @@
 """Measurement of the keypoint noise, which decides between normal and heavy-tailed errors.
 
-Two models of the epipolar errors of matches are compared by their likelihood. If the errors are
-normal, a loss near least squares is statistically efficient. If the errors have heavy tails, as
-those of learned keypoints often have, the Cauchy loss of the options is used. A Cauchy loss of
-scale ``c`` is the likelihood of Student's t distribution with ``nu`` degrees of freedom and scale
-``s``, ``c^2 = nu s^2``.
+A normal and a Student's t distribution of the epipolar errors of matches are compared by their
+likelihood. If the keypoint errors are normally distributed, a loss near least squares is
+statistically efficient. If the keypoint errors have heavy tails, as often for learned keypoints,
+the Cauchy loss of the options is used. A Cauchy loss of scale ``c`` is the likelihood of Student's
+t distribution with ``nu`` degrees of freedom and scale ``s``, ``c^2 = nu s^2``.
 
 Reprojection errors of points would be biased, because a robustly fitted point passes through some
-of its keypoints. Epipolar errors do not depend on points, but only on the poses.
+of its keypoints. Epipolar errors do not depend on 3D points, but only on poses.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from mpsfm_core.data import Float64, Int64
 from mpsfm_core.mapping.scene.scene import Scene
 
 MAX_MATCHES = 4000
-"""Maximum number of matches that are evaluated, evenly spaced. [ours]"""
+"""Maximum number of evenly spaced matches that measure the keypoint noise. [ours]"""
 MIN_MATCHES = 100
-"""Minimum number of matches for a measurement. With fewer matches the loss of the options applies.
-[ours]"""
+"""Minimum number of matches for a measurement of the keypoint noise. With fewer matches, the
+reprojection loss of the options applies. [ours]"""
 MAX_RESIDUAL = 4.0
-"""Maximum residual in standard deviations of a keypoint. Larger residuals are filtered as outliers.
-[COLMAP filter_max_reproj_error]"""
+"""Maximum epipolar error in standard deviations of the keypoint position. Matches with larger
+errors are outliers. [COLMAP filter_max_reproj_error]"""
 EFFICIENT_SCALE = 3.644
-"""Scale of the Cauchy loss with 98 % efficiency, in standard deviations of normal errors of two
-coordinates (2.549 has 95 %, Holland and Welsch, Communications in Statistics A6, 1977). [tuned:
+"""Scale of the Cauchy loss with 98 % efficiency for normal errors, in standard deviations of the
+keypoint position (Holland and Welsch, Communications in Statistics A6, 1977). [tuned:
 benchmarks.everyday]"""
 DEGREES_OF_FREEDOM = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0])
-"""Degrees of freedom of Student's t distribution among which the best fit is selected."""
+"""Candidate degrees of freedom of the Student's t distribution that fits the epipolar errors."""
 
 
 def measure_loss_scale(scene: Scene, default_scale: float) -> float:
@@ -41,11 +41,11 @@ def measure_loss_scale(scene: Scene, default_scale: float) -> float:
 
     Args:
         scene: The scene.
-        default_scale: Scale of the loss for heavy-tailed errors, and if there are not enough
-            matches.
+        default_scale: Scale of the Cauchy loss for heavy-tailed errors or too few matches.
 
     Returns:
-        The scale in standard deviations of a keypoint, at least ``default_scale``.
+        Scale of the Cauchy loss in standard deviations of the keypoint position, at least
+        ``default_scale``.
     """
     residuals = compute_epipolar_residuals(scene)
     if len(residuals) < MIN_MATCHES:
@@ -58,7 +58,7 @@ def measure_loss_scale(scene: Scene, default_scale: float) -> float:
 
 
 def compute_normal_log_likelihood(residuals: Float64, std: float) -> float:
-    """Compute the mean log likelihood of residuals under a truncated normal distribution.
+    """Compute the mean log likelihood of Sampson errors under a truncated normal distribution.
 
     Args:
         residuals: (m,) float64 residuals below ``MAX_RESIDUAL``.
@@ -69,7 +69,7 @@ def compute_normal_log_likelihood(residuals: Float64, std: float) -> float:
 
 
 def compute_student_log_likelihood(residuals: Float64, scale: float) -> float:
-    """Compute the mean log likelihood under the best truncated Student's t distribution.
+    """Compute the mean log likelihood of Sampson errors under the best truncated t distribution.
 
     Args:
         residuals: (m,) float64 residuals below ``MAX_RESIDUAL``.
@@ -80,9 +80,9 @@ def compute_student_log_likelihood(residuals: Float64, scale: float) -> float:
 
 
 def compute_epipolar_residuals(scene: Scene) -> Float64:
-    """Compute the Sampson errors (m,), below ``MAX_RESIDUAL``, of matches of registered images.
+    """Compute the Sampson errors (m,) of matches of registered images, without outliers.
 
-    Sampson errors are in standard deviations of a keypoint.
+    Sampson errors are in standard deviations of the keypoint position.
     """
     source, target = _sample_matches(scene)
     centers, images = scene.centers(), scene.graph.image_of
@@ -96,7 +96,7 @@ def compute_epipolar_residuals(scene: Scene) -> Float64:
 
 
 def _sample_matches(scene: Scene) -> tuple[Int64, Int64]:
-    """Return the keypoints of matches between registered images, each match once."""
+    """Return the two keypoints of each match between registered images, each match once."""
     graph = scene.graph
     is_used = scene.registered[graph.image_of[graph.source]]
     is_used &= scene.registered[graph.image_of[graph.target]] & (graph.source < graph.target)
@@ -116,7 +116,7 @@ def _propagate_variance(scene: Scene, keypoints: Int64, normals: Float64) -> Flo
 
 @cache
 def _log_norms(scale: float) -> Float64:
-    """Return the log normalization of each truncated t distribution, by the midpoint rule."""
+    """Integrate each truncated t distribution by the midpoint rule, and return log integrals."""
     num_steps = 4000
     residuals = (np.arange(num_steps) + 0.5) * MAX_RESIDUAL / num_steps
     log_densities = np.log1p((residuals[:, None] / scale) ** 2) * -(DEGREES_OF_FREEDOM + 1) / 2

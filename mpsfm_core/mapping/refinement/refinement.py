@@ -1,8 +1,9 @@
 """Local and global refinement by bundle adjustment and depth integration (paper 3.3).
 
-The paper alternates both, each with the result of the other. A map that was refined with points
-agrees with them and keeps them where they are. Therefore bundle adjustment uses the scaled priors,
-and maps are refined with its result, unless ``bundle_depth`` is ``refined``.
+The paper alternates bundle adjustment and depth integration. A depth map that was refined with
+points agrees with these points, and so keeps them from moving in the next bundle adjustment.
+Therefore bundle adjustment uses the scaled depth priors, unless the option ``bundle_depth`` is
+``refined``.
 """
 
 from __future__ import annotations
@@ -38,12 +39,12 @@ MAX_LOCAL_TRACK_LENGTH = 15
 """Track length above which a point stays fixed in local bundle adjustment.
 [COLMAP max_num_observations]"""
 MAX_LOCAL_REFINEMENTS = 2
-"""Iterations of local refinement. [COLMAP ba_local_max_refinements]"""
+"""Maximum number of iterations of local refinement. [COLMAP ba_local_max_refinements]"""
 MAX_LOCAL_CHANGE = 0.001
 """Share of changed observations below which local refinement stops.
 [COLMAP ba_local_max_refinement_change]"""
 MAX_GLOBAL_REFINEMENTS = 5
-"""Iterations of global refinement. [COLMAP ba_global_max_refinements]"""
+"""Maximum number of iterations of global refinement. [COLMAP ba_global_max_refinements]"""
 MAX_GLOBAL_CHANGE = 0.0005
 """Share of changed observations below which global refinement stops.
 [COLMAP ba_global_max_refinement_change]"""
@@ -51,27 +52,30 @@ FINAL_DEPTH_SCALE = 0.125
 """Factor on the scale of the depth loss in the final robust refinement.
 [reference final_robustification]"""
 MAX_DEPTH_RATIO = 1.5
-"""Largest ratio of a point's depth and the map for which the observation of depth counts.
-[reference scale_filter]"""
+"""Largest ratio between the depth of a point and the depth map for which bundle adjustment uses the
+depth. [reference scale_filter]"""
 MIN_ANCHOR_ANGLE_DEG = 2.0
 """Smallest triangulation angle of a point that constrains depth integration.
 [reference robust_triangles]"""
 MAX_NOISE_CHANGE = 1.25
-"""Factor of the measured noise above which the integrators are set up again. [ours]"""
+"""Change factor of the measured depth noise above which depth integration is set up again.
+[ours]"""
 MIN_SCALE_POINTS = 20
-"""Number of well triangulated points from which a shared scale is estimated again. [ours]"""
+"""Smallest number of well triangulated points for which the depth scale shared by several images is
+estimated again. [ours]"""
 
 
 class Refiner:
     """Bundle adjustment and depth integration of a scene.
 
     Attributes:
-        fixed: (n,) bool, images whose pose never changes.
-        noise: Measured noise of the depth priors; global refinement updates it.
-        loss_scale: Scale of the reprojection loss, in standard deviations of a keypoint; global
-            refinement updates it.
+        fixed: (n,) bool mask of the images whose pose never changes.
+        noise: Measured noise of the depth priors, which global refinement updates.
+        loss_scale: Scale of the reprojection loss in standard deviations of the keypoint position,
+            which global refinement updates.
         adapts_reprojection_loss: Whether global refinement may widen the reprojection loss. While
-            images are registered one by one, the narrow loss protects against wrong matches.
+            images are registered one by one, a narrow reprojection loss protects against wrong
+            matches.
     """
 
     def __init__(self, scene: Scene, options: MapperOptions, scores: Float64) -> None:
@@ -95,22 +99,24 @@ class Refiner:
 
     @property
     def std_factor(self) -> float:
-        """Factor on the declared standard deviation of depth for decisions.
+        """Factor on the declared standard deviation of depth in the depth consistency check.
 
-        The factor is at least 1, because priors that agree at points may be worse between them.
+        The factor is at least 1, because depth priors that are accurate at points may be worse
+        between points.
         """
         return max(1.0, self.noise.multiplier)
 
     def estimate_scale(self, image: int, others: list[int]) -> None:
         """Estimate the scale of a depth prior from the points that the image observes.
 
-        The scale is the median ratio of point depth and prior (paper eq. 1). If a registered image
-        has depth in the same unit, its scale is taken.
+        The scale is the median ratio of point depth and prior (paper eq. 1). The scale of a
+        registered image whose depth prior has the same unit is reused.
 
         Args:
             image: A registered image.
-            others: Images whose scales a metric prior is compared with. Points whose scale differs
-                by more than ``MAX_DEPTH_RATIO`` are ignored; without points the mean is taken.
+            others: Images whose mean scale a metric prior is compared with. Points whose scale
+                differs from the mean by more than ``MAX_DEPTH_RATIO`` are ignored. Without points,
+                the image takes the mean scale.
         """
         scene = self.scene
         depth_map = scene.maps[image]
@@ -131,7 +137,7 @@ class Refiner:
             depth_map.set_scale(float(np.exp(np.median(log_scales))))
 
     def estimate_scales(self, images: list[int]) -> None:
-        """Estimate the scales of several images; an image without points takes the median."""
+        """Estimate the depth scales of images, or the median scale for images without points."""
         for image in images:
             self.estimate_scale(image, [])
         scales = [scene_map.scale for scene_map in self.scene.maps if scene_map.active]
@@ -140,9 +146,9 @@ class Refiner:
                 self.scene.maps[image].set_scale(float(np.median(scales)))
 
     def estimate_shared_scales(self) -> None:
-        """Estimate the scales that several images share, from well triangulated points.
+        """Estimate the depth scales that several images share, from well triangulated points.
 
-        Scales of single images are parameters of bundle adjustment.
+        Depth scales of single images are parameters of bundle adjustment.
         """
         scene, tracks = self.scene, self.scene.tracks
         is_stable = scene.track_angles_deg() >= MIN_ANCHOR_ANGLE_DEG
@@ -169,7 +175,7 @@ class Refiner:
     def integrate(self, images: list[int]) -> None:
         """Refine the depth maps of images with the current points.
 
-        Images whose scale is unknown are skipped.
+        Images whose depth scale is unknown are skipped.
         """
         if not self.options.integrate:
             return
@@ -187,17 +193,17 @@ class Refiner:
         depth_scale: float = 1.0,
         max_iterations: int | None = None,
     ) -> None:
-        """Adjust the poses and depth scales of images, and the points that they observe.
+        """Adjust poses and depth scales of images, and the points that the images observe.
 
-        Other images that observe these points stay fixed.
+        Other images that observe the same points stay fixed.
 
         Args:
             variable: Images to adjust.
-            local: Keep points with long tracks fixed.
+            local: Keep points with long tracks fixed (local bundle adjustment).
             focal: Also refine guessed focal lengths that the observations determine.
             reprojection_scale: Factor on the scale of the reprojection loss.
             depth_scale: Factor on the scale of the depth loss.
-            max_iterations: Maximum number of iterations; None takes the option.
+            max_iterations: Maximum number of iterations, or None to use the option.
         """
         scene, tracks = self.scene, self.scene.tracks
         observations = tracks.observations()
@@ -261,9 +267,9 @@ class Refiner:
             depth_map.set_scale(depth_map.scale * float(np.exp(result.log_scales[row])))
 
     def refine_locally(self, image: int) -> None:
-        """Adjust the local bundle of an image and update its tracks until little changes.
+        """Adjust the local bundle of an image and update its tracks until few tracks change.
 
-        The depth map of the image is not refined again; global refinement does that.
+        Only global refinement refines the depth map of the image again.
         """
         options = self.options
         bundle = find_local_bundle(self.scene, image, options.local_images - 1, self.scores)
@@ -279,7 +285,7 @@ class Refiner:
                 break
 
     def refine_globally(self, *, final: bool = False) -> None:
-        """Adjust all images and update all tracks until little changes; refine depth maps.
+        """Adjust all images and update all tracks until few tracks change, then refine depth maps.
 
         Args:
             final: Sharpen the depth loss by ``FINAL_DEPTH_SCALE``.
@@ -303,11 +309,11 @@ class Refiner:
         self.integrate(images)
 
     def discard_integrator(self, image: int) -> None:
-        """Discard the cached integrator of a deregistered image."""
+        """Discard the cached depth integrator of a deregistered image."""
         self._integrators.pop(image, None)
 
     def reset(self) -> None:
-        """Discard all measurements and integrators, for an empty scene."""
+        """Discard all noise measurements and depth integrators, for an empty scene."""
         self._integrators.clear()
         self.noise = self._integrator_noise = DepthNoise()
         self.loss_scale = self.options.bundle.reprojection_scale
@@ -333,12 +339,12 @@ class Refiner:
         depth_map.set_refined(refined)
 
     def _guessed(self, images: Int64) -> Bool:
-        """Return (m,) bool, images whose focal length is a guess."""
+        """Return a bool mask (m,) of the images whose focal length is a guess."""
         known = [self.scene.problem.images[i].focal_known for i in images]
         return ~np.array(known, dtype=np.bool_)
 
     def can_refine_focals(self) -> bool:
-        """Return whether enough images are registered and a focal length is a guess."""
+        """Return whether enough images are registered to refine a guessed focal length."""
         images = self.scene.registered_images()
         if not self.options.refine_focal or len(images) < MIN_FOCAL_IMAGES:
             return False
@@ -347,15 +353,16 @@ class Refiner:
     def _adjust_with_focals(
         self, problem: BundleProblem, options: BundleOptions, representatives: Int64
     ) -> BundleResult:
-        """Adjust guessed focal lengths too, and apply those that the observations determine.
+        """Run bundle adjustment with guessed focal lengths, and apply well-determined estimates.
 
-        Cameras whose estimate is refused keep their focal length; the adjustment is then repeated
-        without them. The outcome of each camera is recorded in the scene.
+        Cameras whose estimated focal length is refused keep the guess, and bundle adjustment is
+        repeated with their focal lengths fixed. The outcome of each camera is recorded in the
+        scene.
 
         Args:
-            problem: The problem with constant focal lengths.
-            options: Options of the adjustment.
-            representatives: (k,) an image of each camera of the problem.
+            problem: The bundle adjustment problem with constant focal lengths.
+            options: Options of bundle adjustment.
+            representatives: (k,) index of one image of each camera of the problem.
         """
         scene = self.scene
         images = [scene.problem.images[image] for image in representatives]
@@ -371,7 +378,8 @@ class Refiner:
             refused = np.zeros_like(variable)
             for row in map(int, np.flatnonzero(variable)):
                 focal_px = float(result.intrinsics[row, 0])
-                # the prior bounds the posterior, also if the reduced system was singular
+                # the prior variance bounds the posterior variance, also if the reduced system was
+                # singular
                 std = min(float(result.std_log_focals[row]), float(prior_stds[row]))
                 equivalent_mm = compute_equivalent_mm(focal_px, *images[row].camera.size)
                 outcome = decide_focal_outcome(equivalent_mm, std, prior_stds[row])
@@ -393,7 +401,7 @@ class Refiner:
             self.loss_scale = measure_loss_scale(self.scene, bundle.reprojection_scale)
 
     def _measure_noise(self) -> None:
-        """Measure the noise of the priors; discard integrators that assumed a different noise."""
+        """Measure the depth noise, and discard depth integrators that assumed another noise."""
         if not self.options.measure_depth_noise:
             return
         self.noise = measure_depth_noise(self.scene)
@@ -403,7 +411,7 @@ class Refiner:
             self._integrators.clear()
 
     def _integrator(self, image: int) -> DepthIntegrator:
-        """Return the integrator of an image, with the variance scaled by the measured noise."""
+        """Return the depth integrator of an image, with variance scaled by the measured noise."""
         depth_map, step = self.scene.maps[image], self._step(image)
         camera = subsample_camera(depth_map.camera, step)
         integrator = self._integrators.get(image)
@@ -439,7 +447,7 @@ class Refiner:
         return keypoints, z
 
     def _depth_observations(self, observations: Int64, refined: bool) -> tuple[Float64, Float64]:
-        """Return log depth of the maps at observations, NaN if unusable, and its std."""
+        """Return log depth of depth maps at observations, NaN if unusable, and its std."""
         scene, tracks = self.scene, self.scene.tracks
         _, z = scene.project(observations, tracks.xyz[tracks.point_of[observations]])
         if refined:
@@ -455,21 +463,22 @@ class Refiner:
         return log_depth, np.maximum(log_std, 1e-6)
 
     def _has_free_scale(self, variable: list[int]) -> Bool:
-        """Return (n,) bool, images whose depth scale is a parameter of bundle adjustment."""
+        """Return a bool mask (n,) of images whose depth scale bundle adjustment estimates."""
         if not self.options.free_scales:
             return np.zeros(self.scene.num_images, dtype=np.bool_)
         return self.scene.mask(variable) & ~self._shares_scale
 
     def _expected_log_scales(self, images: Int64) -> tuple[Float64, Float64]:
-        """Return the expected change of the log scales of images, and its standard deviation.
+        """Return the expected change of the log depth scales of images, and its prior std.
 
-        Metric priors share one unit: the mean log scale of the registered images. The mean keeps
-        the unit of the world, which nothing else fixes; a median would move it. The standard
-        deviation is the spread of these log scales, with the declared noise as one more sample (a
-        unit information prior). Relative priors have an infinite standard deviation.
+        Metric depth priors share one unit, so their log scales are expected to equal the mean log
+        scale of the registered images. A mean, unlike a median, keeps the free unit of the world
+        constant. The standard deviation is the spread of the log scales of the registered images,
+        with the declared noise as one more sample (a unit information prior). The log scale of a
+        relative depth prior has an infinite standard deviation.
 
         Returns:
-            ``(expected, std)``, both (m,).
+            Expected changes (m,) of the log scales, and standard deviations (m,).
         """
         maps, scene = self.scene.maps, self.scene
         is_metric = np.array(
@@ -495,10 +504,10 @@ class Refiner:
         return near
 
     def _covariances(self, observed_by: list[int]) -> tuple[Float64, Float64]:
-        """Return point covariances from reprojection errors alone, and triangulation angles.
+        """Return point covariances without depth observations, and triangulation angles.
 
         Args:
-            observed_by: Images; only the values of points that one of them observes are valid.
+            observed_by: Images whose observed points get valid covariances and angles.
 
         Returns:
             Covariances (p, 3, 3) and angles in degrees (p,).

@@ -2,7 +2,8 @@
 
 Each match to a registered image gives one correspondence between a keypoint of the new image and a
 3D point. The point is triangulated, or lifted from the depth of the registered image (paper section
-3.2). If that depth is unknown, the point may be anywhere on a part of the matched keypoint's ray.
+3.2). If the depth of the registered image is unknown, the point may be anywhere on a part of the
+matched keypoint's ray.
 """
 
 from __future__ import annotations
@@ -16,45 +17,48 @@ from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.scene.scene import Scene
 
 MIN_DEPTH_RATIO = 1e-3
-"""Lower bound of the near point's depth, relative to the depth of the point."""
+"""Lower bound of the depth of the nearest possible point, relative to the depth of the most likely
+point."""
 RAY_MATCH_WEIGHT = 0.5
-"""Weight of a match of unknown depth: it constrains one of two image coordinates. [tuned:
-benchmarks.accuracy on hololens_room, where sensor depth covers half of the keypoints]"""
+"""Weight of a match of unknown depth, because the match only constrains one of two image
+coordinates. [tuned: benchmarks.accuracy on hololens_room, where sensor depth covers half of the
+keypoints]"""
 
 
 class PoseCorrespondences(NamedTuple):
     """2D-3D correspondences of one image with registered images."""
 
     keypoints: Int64
-    """(m,) global keypoints of the image."""
+    """(m,) global keypoint numbers of the image that is to be registered."""
     matched_keypoints: Int64
-    """(m,) global keypoints of registered images that they match."""
+    """(m,) global numbers of the matched keypoints in registered images."""
     points: Float64
-    """(m, 3) most likely 3D points, world frame."""
+    """(m, 3) most likely 3D points, in the world frame."""
     near_points: Float64
     """(m, 3) nearest 3D points on the rays of the matched keypoints that depth allows."""
     far_points: Float64
-    """(m, 3) farthest 3D points; equal to the near points if the point is triangulated."""
+    """(m, 3) farthest 3D points that depth allows, equal to the nearest if the point is
+    triangulated."""
     references: Int64
-    """(m,) registered images of the matched keypoints."""
+    """(m,) indices of the registered images with the matched keypoints."""
     depth_known: Bool
-    """(m,) False if the point may be anywhere between the image's nearest and farthest depth."""
+    """(m,) False if the 3D point may have any depth that occurs in the registered image."""
     weights: Float64
     """(m,) match scores in (0, 1], times :attr:`depth_weights`."""
 
     @property
     def depth_weights(self) -> Float64:
-        """(m,) 1 for points of known depth, else :data:`RAY_MATCH_WEIGHT`."""
+        """(m,) weights of the matches, 1 if the depth is known, else :data:`RAY_MATCH_WEIGHT`."""
         return _depth_weights(self.depth_known)
 
     @property
     def triangulated(self) -> Bool:
-        """(m,) bool, correspondences with a triangulated point, whose depth range is empty."""
+        """(m,) bool mask of the correspondences with a triangulated point."""
         is_point: Bool = (self.near_points == self.far_points).all(axis=1)
         return is_point
 
     def select(self, rows: Int64 | Bool) -> PoseCorrespondences:
-        """Return the correspondences of some rows, given as indices or as a mask."""
+        """Return the correspondences that row indices or a bool mask select."""
         fields: list[Any] = [values[rows] for values in self]
         return PoseCorrespondences(*fields)
 
@@ -62,16 +66,18 @@ class PoseCorrespondences(NamedTuple):
 def find_correspondences(
     scene: Scene, image: int, references: list[int], options: RegistrationOptions
 ) -> PoseCorrespondences:
-    """Collect the 2D-3D correspondences of an image with some registered images.
+    """Collect the 2D-3D correspondences of an image with the given registered images.
 
     A match uses the triangulated point of its keypoint if the triangulation angle suffices.
-    If not, lifting uses the part of the keypoint's ray that the depth prior allows.
+    Otherwise the 3D point lies on the part of the matched keypoint's ray that the depth prior
+    allows.
 
     Args:
         scene: The scene with the registered images.
         image: The image to register.
         references: Registered images whose matches are used.
-        options: ``lifting``, ``min_point_angle_deg`` and ``max_depth_deviation`` apply.
+        options: Registration options ``lifting``, ``min_point_angle_deg`` and
+            ``max_depth_deviation``.
     """
     graph, tracks = scene.graph, scene.tracks
     edges = graph.edges_of(image)
@@ -106,17 +112,17 @@ def find_correspondences(
 
 
 def _depth_weights(depth_known: Bool) -> Float64:
-    """Return (m,) the weights of matches by whether their depth is known."""
+    """Return weights (m,) of matches, which are lower if the depth is unknown."""
     return np.where(depth_known, 1.0, RAY_MATCH_WEIGHT)
 
 
 def _depth_ranges(
     scene: Scene, keypoints: Int64, options: RegistrationOptions
 ) -> tuple[Float64, Float64, Bool]:
-    """Return depth, half range of log depth, and whether the depth is known, each (m,).
+    """Return the depth (m,) of keypoints, half its log range (m,), and a mask (m,) of known depth.
 
-    A keypoint of unknown depth gets the range of the known depths in its image, and depth 0 if the
-    image has none.
+    A keypoint of unknown depth gets the range of the known depths in its image, or depth 0 if no
+    depth of the image is known.
     """
     depth, known = scene.depth_at(keypoints)
     log_range = options.max_depth_deviation * scene.keypoint_log_std[keypoints]

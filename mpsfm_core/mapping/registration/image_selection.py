@@ -14,10 +14,11 @@ def compute_pair_scores(scene: Scene, criterion: str) -> Float64:
 
     Args:
         scene: The scene with its verified pairs.
-        criterion: "match-scores" sums the matcher's scores, and any other value counts the matches.
+        criterion: Ranking criterion, where "match-scores" sums the match scores and any other value
+            counts the matches.
 
     Returns:
-        (n, n) symmetric float64 scores, 0 for images without verified matches.
+        (n, n) symmetric float64 matching scores, 0 for images without verified matches.
     """
     scores = np.zeros((scene.num_images, scene.num_images))
     for row, pair in enumerate(scene.problem.pairs):
@@ -34,12 +35,12 @@ def rank_next_images(
 
     Args:
         scene: The scene with the registered images.
-        scores: (n, n) from :func:`compute_pair_scores`.
-        candidates: (n,) bool, images that may be registered.
+        scores: (n, n) matching scores from :func:`compute_pair_scores`.
+        candidates: (n,) bool mask of the images that may be registered.
         options: The option ``next_view`` selects the ranking criterion.
 
     Returns:
-        Each candidate with the registered image that it matches best.
+        Candidate images, each with the registered image that it matches best.
     """
     images = np.flatnonzero(candidates & ~scene.registered)
     registered = scene.registered_images()
@@ -54,7 +55,7 @@ def rank_next_images(
 
 
 def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: Float64) -> list[int]:
-    """Return the image and the registered images that share most 3D points with it.
+    """Return an image and the registered images that share most 3D points with the image.
 
     If fewer than ``num_neighbors`` images share points, the best matching images are added.
     COLMAP's ``FindLocalBundle`` also ranks by shared points.

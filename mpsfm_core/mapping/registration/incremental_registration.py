@@ -23,7 +23,8 @@ from mpsfm_core.mapping.registration.pose_support import ScoredPose, score_pose
 from mpsfm_core.mapping.triangulation import triangulate_image
 
 NUM_WIDE_REFERENCES = 10
-"""Number of reference images for the re-registration of misregistered images. [ours]"""
+"""Number of best matching reference images for the re-registration of misregistered images.
+[ours]"""
 
 
 class IncrementalRegistration:
@@ -39,12 +40,12 @@ class IncrementalRegistration:
         self._event_log = maintenance.event_log
 
     def register_next_image(self, candidates: Bool, *, wide: bool = False) -> bool:
-        """Register one more image; relax the thresholds until one is registered.
+        """Register the next image, and relax the thresholds until an image is registered.
 
         Args:
-            candidates: (n,) bool, images that may be registered.
-            wide: If an image fails with its usual references, also use the images that match it
-                best, before the thresholds relax.
+            candidates: (n,) bool mask of the images that may be registered.
+            wide: If an image cannot be registered by its local bundle, also use its best matching
+                images, before the acceptance thresholds relax.
 
         Returns:
             False if no image can be registered at the most relaxed thresholds.
@@ -65,7 +66,8 @@ class IncrementalRegistration:
     def deregister_contradicted_image(self) -> bool:
         """Deregister the image whose depth several rejected images contradict.
 
-        Each image is deregistered once. Returns False if there is no such image.
+        Each image is deregistered at most once. The method returns False if no image is
+        contradicted.
         """
         contradicted = self._history.pop_contradicted_image(self._scene.registered)
         if contradicted is None or self._maintenance.size <= 2:
@@ -77,10 +79,10 @@ class IncrementalRegistration:
         return True
 
     def _register_first_possible(self, ranked: Sequence[tuple[int, int]], *, wide: bool) -> bool:
-        """Register the first image that passes verification.
+        """Register the first of the ranked images that passes verification.
 
         Args:
-            ranked: Images, each with the registered image that it matches best.
+            ranked: Ranked images, each with the registered image that it matches best.
             wide: See :meth:`register_next_image`.
         """
         for image, best_match in ranked:
@@ -96,10 +98,10 @@ class IncrementalRegistration:
         return False
 
     def _register_contradicted_image(self, candidates: Bool) -> bool:
-        """Register an image that contradicts the depth, if global refinement removes the conflict.
+        """Register an image if only global refinement makes its depth consistent.
 
-        At a loop closure, drift makes a correct pose contradict the depth of the scene. Returns
-        False if no image can be registered.
+        At a loop closure, drift makes a correct pose contradict the depth of the scene. The method
+        returns False if no image can be registered.
         """
         self._thresholds.reset()
         scores = np.where(self._history.excluded_references, self._scores, 0)
@@ -116,7 +118,8 @@ class IncrementalRegistration:
     def _select_references(self, image: int, best_match: int, *, wide: bool = False) -> list[int]:
         """Select the registered images whose points and depth determine the pose of an image.
 
-        They are the local bundle of the best match, or the best matching images if ``wide``.
+        The selected images are the local bundle of the best match, or the best matching images if
+        ``wide``.
         """
         scores, options = self._scores, self._options.registration
         if wide:
@@ -128,7 +131,7 @@ class IncrementalRegistration:
         return [k for k in references if not self._history.excluded_references[image, k]]
 
     def _would_fail_again(self, image: int, references: list[int]) -> bool:
-        """Return whether the attempt would repeat the last one, whose best pose lacks support."""
+        """Return whether a registration attempt would repeat the last failed attempt."""
         if not self._history.is_exhausted(image, references):
             return False
         best = self._history.get_last_pose(image)
@@ -137,7 +140,7 @@ class IncrementalRegistration:
     def _estimate_poses(
         self, image: int, references: list[int], correspondences: PoseCorrespondences
     ) -> list[ScoredPose]:
-        """Estimate poses of an image, best first; the best pose of the last attempt competes."""
+        """Estimate poses of an image, best first, including the best pose of the last attempt."""
         options, history = self._options.registration, self._history
         poses = []
         last_pose = history.get_last_pose(image)
@@ -162,11 +165,11 @@ class IncrementalRegistration:
         Args:
             image: The image to register.
             references: Registered images whose matches are used.
-            refine_globally: Refine all images before the depth check. This takes long, so the pose
-                needs a high inlier ratio.
+            refine_globally: Refine all images before the depth check. Because global refinement is
+                slow, the pose needs a high inlier ratio.
 
         Returns:
-            None if the image is registered, else why not; the scene is then unchanged.
+            None if the image is registered, else the rejection reason, with the scene unchanged.
         """
         scene = self._scene
         with self._event_log.timed("registration"):
@@ -211,7 +214,8 @@ class IncrementalRegistration:
         """Register an image with a pose, triangulate, refine locally and check depth consistency.
 
         Returns:
-            None if the pose passes, else why it is rejected; the caller then restores the scene.
+            None if the pose passes verification, else the rejection reason. The caller restores the
+            scene of a rejected pose.
         """
         scene, options = self._scene, self._options
         with self._event_log.timed("local refinement"):
@@ -246,7 +250,7 @@ class IncrementalRegistration:
     def _exclude_references(
         self, image: int, pose: ScoredPose, correspondences: PoseCorrespondences
     ) -> None:
-        """Exclude the references whose matches alone support a pose that contradicts the depth."""
+        """Exclude reference images whose matches support a pose with contradicting depth."""
         options = self._options.registration
         for reference in map(int, np.unique(correspondences.references)):
             rows = correspondences.references == reference

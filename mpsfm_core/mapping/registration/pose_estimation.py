@@ -1,7 +1,8 @@
 """Absolute pose estimation of an image (paper section 3.2).
 
-Many hypotheses are generated and scored by their support. The best distinct ones are refined to
-maximize their support, and the best of those are refined by local bundle adjustment.
+Many pose hypotheses are generated and scored by their support. The best distinct hypotheses are
+refined to maximize their support, and a few of the refined poses are refined by local bundle
+adjustment.
 """
 
 from __future__ import annotations
@@ -28,14 +29,15 @@ from mpsfm_core.mapping.triangulation import triangulate_image
 from mpsfm_core.support.threads import thread_limit
 
 MIN_POSE_DISTANCE_DEG = 3.0
-"""Smallest angle between distinct poses; closer ones converge to the same pose. [ours]"""
+"""Smallest angle between the rotations of distinct poses; closer poses converge to the same pose.
+[ours]"""
 MIN_FOCAL_SUPPORT_RATIO = 1.05
-"""Smallest ratio of the support with an estimated focal length and with the guess. One parameter
-more always increases the support a little. [ours]"""
+"""Smallest ratio between the support with an estimated and with a guessed focal length. An
+additional parameter always increases the support a little. [ours]"""
 
 
 class AbsolutePoseEstimator:
-    """Estimator of absolute poses; it leaves the scene unchanged."""
+    """Estimator of absolute poses of images, which leaves the scene unchanged."""
 
     def __init__(self, scene: Scene, refiner: Refiner, options: MapperOptions) -> None:
         self.scene = scene
@@ -47,13 +49,14 @@ class AbsolutePoseEstimator:
     ) -> list[ScoredPose]:
         """Estimate a few distinct poses of an image and refine them by bundle adjustment.
 
-        A single pose with a high inlier ratio is returned without bundle adjustment, because its
-        registration adjusts it anyway.
+        A single pose with a high inlier ratio is returned without bundle adjustment, because
+        registration runs bundle adjustment anyway.
 
         Args:
             image: The image to register.
             correspondences: Its 2D-3D correspondences.
-            attempt: Number of earlier attempts at the image; see :func:`estimate_candidate_poses`.
+            attempt: Number of earlier registration attempts of the image (see
+                :func:`estimate_candidate_poses`).
         """
         options = self._options.registration
         poses = self.estimate_unrefined_poses(image, correspondences, attempt=attempt)
@@ -75,7 +78,7 @@ class AbsolutePoseEstimator:
     def refine_poses(
         self, image: int, poses: Sequence[ScoredPose], correspondences: PoseCorrespondences
     ) -> list[ScoredPose]:
-        """Refine poses by bundle adjustment; a pose that loses support stays unrefined."""
+        """Refine poses by bundle adjustment, except poses that lose support."""
         snapshot = self.scene.snapshot()
         return [self._refine_pose(image, pose, correspondences, snapshot) for pose in poses]
 
@@ -106,17 +109,18 @@ def estimate_candidate_poses(
 ) -> list[ScoredPose]:
     """Estimate a few distinct poses of an image, best support first.
 
-    If no pose has a high inlier ratio, random halves of the matches give further hypotheses. They
-    escape a single wrong match and poor local minima of few matches.
+    If no pose has a high inlier ratio, random halves of the matches give further hypotheses.
+    Hypotheses from random halves of the matches escape a single wrong match and poor local minima.
 
     Args:
         scene: The scene with the registered images.
         image: The image to register.
         correspondences: Its 2D-3D correspondences.
-        options: Thresholds and numbers of hypotheses.
+        options: Inlier thresholds and numbers of pose hypotheses.
         seed: Seed of RANSAC.
-        attempt: Number of earlier attempts at the image. Each of the first attempts draws other
-            halves; from ``max_resampled_attempts`` on none are drawn.
+        attempt: Number of earlier registration attempts of the image. Each of the first
+            ``max_resampled_attempts`` attempts draws other halves of the matches, and later
+            attempts draw no halves.
     """
     poses: list[ScoredPose] = []
     generator = PoseHypothesisGenerator(scene, image, correspondences, options, seed)
@@ -139,7 +143,7 @@ def estimate_candidate_poses(
 
 
 def _discard_needless_focals(poses: Sequence[ScoredPose]) -> list[ScoredPose]:
-    """Discard poses whose estimated focal length hardly increases the support of the guess."""
+    """Discard poses whose estimated focal length hardly increases the support of the pose."""
     support = max((pose.support for pose in poses if pose.focal_px is None), default=0.0)
     min_support = MIN_FOCAL_SUPPORT_RATIO * support
     return [pose for pose in poses if pose.focal_px is None or pose.support > min_support]
@@ -148,7 +152,7 @@ def _discard_needless_focals(poses: Sequence[ScoredPose]) -> list[ScoredPose]:
 def select_distinct_poses(
     poses: Sequence[ScoredPose], max_poses: int | None = None
 ) -> list[ScoredPose]:
-    """Return the best supported poses whose rotations differ from those of all better poses."""
+    """Return the best supported poses with rotations that differ from all better poses."""
     poses = sorted(poses, key=lambda pose: -pose.support)
     rotations = np.array([pose.rotation for pose in poses]).reshape(-1, 3, 3)
     angles_deg = rotation_angle_deg(rotations[:, None] @ rotations.transpose(0, 2, 1))

@@ -1,10 +1,10 @@
 """Support of a pose by 2D-3D correspondences, and its local maximization.
 
-A correspondence projects to a segment in the new image: the projection of the matched keypoint's
-ray between the nearest and farthest depth that the prior allows. It supports a pose (is an inlier)
-if the keypoint is close to this segment and the resulting depth agrees with the new image's prior.
-The support is the weighted MSAC score ``sum_i w_i (1 - r_i^2)`` with ``r_i`` the larger of both
-residuals relative to its threshold, truncated at 1.
+The ray of a matched keypoint, between the nearest and farthest depth that the depth prior allows,
+projects to a segment in the new image. A correspondence is an inlier if its keypoint is close to
+this segment and the resulting depth agrees with the new image's depth prior. The support of a pose
+is the weighted MSAC score ``sum_i w_i (1 - r_i^2)``, where ``r_i`` is the larger of the
+reprojection and depth residuals relative to their thresholds, truncated at 1.
 """
 
 from __future__ import annotations
@@ -21,32 +21,33 @@ from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.optimize.resection import RaySegments, measure_segments, refine_pose
 
 REFINEMENT_SCALES = np.maximum(5.0 * 0.8 ** np.arange(12), 1.0)
-"""Factors of the inlier threshold in successive Gauss-Newton steps. They start large because a
-RANSAC pose from lifted points can be off by pixels. [ours]"""
+"""Factors of the inlier threshold in successive Gauss-Newton steps. The factors start large because
+a RANSAC pose from lifted points can have reprojection errors of many pixels. [ours]"""
 
 
 @dataclass(frozen=True, eq=False)
 class ScoredPose:
-    """Pose of an image and its support by the reference image that supports it most."""
+    """Pose of an image with its support by 2D-3D correspondences."""
 
     rotation: Float64
     """(3, 3) ``cam_from_world``."""
     translation: Float64
     """(3,) ``cam_from_world``."""
     source: str
-    """Name of the estimator."""
+    """Name of the method that estimated the pose."""
     support: float
-    """Weighted MSAC score; hypotheses are compared by it."""
+    """Weighted MSAC score by which pose hypotheses are compared."""
     num_inliers: int
-    """Inliers; those of unknown depth count by their depth weight."""
+    """Number of inliers, where inliers of unknown depth count by their weight."""
     inlier_ratio: float
     """Weighted share of the correspondences that are inliers, in [0, 1]."""
     focal_px: float | None = None
-    """``fx`` that was estimated with the pose; None for that of the scene."""
+    """Focal length ``fx`` that was estimated with the pose, or None for the focal length of the
+    scene."""
 
     @property
     def hypothesis(self) -> PoseHypothesis:
-        """The pose without its support."""
+        """The estimated pose without its support."""
         return PoseHypothesis(self.rotation, self.translation, self.source, self.focal_px)
 
 
@@ -60,9 +61,10 @@ def score_pose(
 
     Args:
         scene: The scene with the registered images.
-        correspondences: Correspondences of the image.
+        correspondences: 2D-3D correspondences of the image.
         hypothesis: The pose.
-        options: ``max_support_error_px`` and ``max_depth_deviation`` are the inlier thresholds.
+        options: Options with the inlier thresholds ``max_support_error_px`` and
+            ``max_depth_deviation``.
     """
     residuals = _compute_residuals(scene, correspondences, hypothesis, options)
     inlier = residuals < 1
@@ -92,9 +94,9 @@ def maximize_support(
     pose: ScoredPose,
     options: RegistrationOptions,
 ) -> ScoredPose:
-    """Locally optimize a pose: minimize the distances of keypoints to their segments.
+    """Refine a pose by minimizing the distances of keypoints to their projected ray segments.
 
-    The objective is Tukey's biweight (see :func:`mpsfm_core.optimize.resection.refine_pose`). The
+    The robust loss is Tukey's biweight (see :func:`mpsfm_core.optimize.resection.refine_pose`). The
     pose is returned unchanged if there are no correspondences.
     """
     if not len(correspondences.keypoints):
@@ -136,7 +138,7 @@ def _compute_residuals(
     pose: PoseHypothesis,
     options: RegistrationOptions,
 ) -> Float64:
-    """Return (m,) the residuals of a pose relative to their thresholds, truncated at 1."""
+    """Return the residuals (m,) of a pose relative to their thresholds, truncated at 1."""
     if not len(correspondences.keypoints):
         return np.empty(0)
     segments = _make_segments(scene, correspondences, options)
@@ -157,10 +159,10 @@ def _compute_depth_residuals(
     is_near: Bool,
     options: RegistrationOptions,
 ) -> Float64:
-    """Return (m,) residuals of log depth to the new image's prior, relative to the threshold.
+    """Return residuals (m,) of log depth to the new image's prior, relative to the threshold.
 
-    The scale of the prior is the median ratio over the keypoints near their segments. The residual
-    is NaN if a depth is unknown.
+    The scale of the depth prior is the median depth ratio over the keypoints near their projected
+    segments. The depth residual is NaN if a depth is unknown.
     """
     residuals = np.full(len(depths), np.nan)
     image = int(scene.graph.image_of[correspondences.keypoints[0]])

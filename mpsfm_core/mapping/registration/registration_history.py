@@ -1,4 +1,4 @@
-"""Record of registration attempts, which avoids repetition and detects misregistered images."""
+"""Record of registration attempts that avoids repeated failures."""
 
 from __future__ import annotations
 
@@ -28,9 +28,8 @@ class RegistrationHistory:
     """Record of the registration attempts within one component.
 
     Attributes:
-        excluded_references: (n, n) bool, True if image ``i`` must not be registered with reference
-            image ``j``, because their matches led to a pose that contradicts the depth of the
-            scene.
+        excluded_references: (n, n) bool mask of the images ``i`` that must not be registered with
+            reference image ``j``, because their matches led to a pose with contradicting depth.
     """
 
     def __init__(self, num_images: int, options: RegistrationOptions) -> None:
@@ -51,9 +50,10 @@ class RegistrationHistory:
         return self._last_attempts[image].pose if image in self._last_attempts else None
 
     def is_exhausted(self, image: int, references: list[int]) -> bool:
-        """Return True if a search with the same reference images would repeat the last search.
+        """Return True if pose estimation with these reference images would repeat the last one.
 
-        The first searches for an image differ, because each draws other subsets of the matches.
+        The first pose estimations of an image differ, because each draws other random halves of the
+        matches.
         """
         is_resampled = self._num_searches[image] >= self._options.max_resampled_attempts
         last = self._last_attempts.get(image)
@@ -73,16 +73,16 @@ class RegistrationHistory:
     def pop_contradicted_image(self, registered: Bool) -> tuple[int, int] | None:
         """Return the registered image that most rejected images contradict, and their number.
 
-        The depth check rejects the new image, but the pose of the registered image may be the wrong
-        one. Each registered image is returned at most once. Returning an image clears its record of
-        contradictions.
+        If the depth of a new and a registered image contradict each other, the pose of the
+        registered image may be wrong. Each registered image is returned at most once. Returning an
+        image clears its record of contradictions.
 
         Args:
-            registered: (n,) bool, the images that are registered at present.
+            registered: (n,) bool mask of the images that are registered at present.
 
         Returns:
-            The image and the number, or None if fewer than :data:`MIN_CONTRADICTING_IMAGES` images
-            contradict every registered image.
+            The contradicted image and the number of rejected images, or None if fewer than
+            :data:`MIN_CONTRADICTING_IMAGES` rejected images contradict each registered image.
         """
         counts = {
             image: int((~registered[list(new_images)]).sum())
@@ -105,7 +105,7 @@ class RegistrationHistory:
         self._rejected_poses[_pose_key(image, pose)] = reason
 
     def clear_pose_rejections(self) -> None:
-        """Allow rejected poses again after the scene has changed."""
+        """Allow rejected poses again after poses or points of the scene have changed."""
         self._rejected_poses.clear()
 
     def clear(self) -> None:

@@ -1,7 +1,7 @@
-"""Tentative registration of images that no verification confirms.
+"""Tentative registration of images whose poses cannot be verified.
 
-Images outside the largest component are registered where their matches fit best. They observe no
-points and change neither the points nor the other poses.
+Images outside the largest component are registered in the best supported poses. Tentatively
+registered images observe no points and change neither points nor other poses.
 """
 
 from __future__ import annotations
@@ -35,20 +35,20 @@ def register_tentatively(
     problem: MappingProblem,
     options: MapperOptions,
 ) -> Reconstruction:
-    """Register all further images that have matches with the reconstruction.
+    """Register all remaining images that have matches with the reconstruction.
 
-    The image with the best supported pose comes next, until none has matches. Tentatively
-    registered images serve as references of the following ones.
+    The image with the best supported pose is registered next, until no remaining image has matches.
+    Tentatively registered images serve as reference images of later images.
 
     Args:
         reconstruction: The largest component.
-        components: The other components. If one of their images is registered, the whole component
-            moves along.
-        problem: The problem that was reconstructed.
+        components: The other components. If one image of such a component is registered, the whole
+            component is registered with the same transformation.
+        problem: The mapping problem that was reconstructed.
         options: Options of the mapper.
 
     Returns:
-        The reconstruction with the further images, whose ``confirmed`` is False.
+        The reconstruction with the tentatively registered images, whose ``confirmed`` is False.
     """
     registration = _TentativeRegistration(reconstruction, components, problem, options)
     registered = registration.register_all()
@@ -64,7 +64,7 @@ def register_tentatively(
 
 
 class _TentativeRegistration:
-    """Registration of further images into a copy of the reconstructed scene."""
+    """Registration of images without verification into a copy of the reconstructed scene."""
 
     def __init__(
         self,
@@ -87,7 +87,7 @@ class _TentativeRegistration:
         self.scene.resume(reconstruction)
 
     def register_all(self) -> list[int]:
-        """Register one image or component after another; return the registered images."""
+        """Register one image or component after another, and return the registered images."""
         before = self.scene.registered.copy()
         while best := self._find_next_image():
             image, pose = best
@@ -97,7 +97,7 @@ class _TentativeRegistration:
         return [int(image) for image in np.flatnonzero(self.scene.registered & ~before)]
 
     def _register_image(self, image: int, pose: ScoredPose) -> None:
-        """Register an image, and scale its depth prior by points that are discarded afterwards."""
+        """Register an image, and scale its depth prior by temporary points."""
         scene, depth_map = self.scene, self.scene.maps[image]
         before = scene.snapshot()
         scene.register(image, pose.rotation, pose.translation, pose.focal_px)
@@ -137,7 +137,7 @@ class _TentativeRegistration:
         return best
 
     def _estimate_pose(self, image: int, best_match: int) -> ScoredPose | None:
-        """Estimate the pose of an image, or reuse it if the reference images are the same."""
+        """Estimate the pose of an image, or reuse the last pose from the same reference images."""
         scene, options = self.scene, self._options
         references = find_local_bundle(scene, best_match, options.num_neighbors, self._scores)
         if image not in self._poses or self._poses[image][0] != references:

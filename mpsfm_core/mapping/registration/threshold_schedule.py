@@ -11,11 +11,11 @@ RELAXATION_FACTOR = 1.2
 
 
 class ThresholdSchedule:
-    """Acceptance thresholds that relax stepwise, and are reset when an image is registered.
+    """Acceptance thresholds of poses that relax stepwise until an image is registered.
 
     As the inlier thresholds relax, the depth threshold tightens by the same factor, because a pose
-    with fewer inliers needs a better depth agreement. The reference implementation relaxes all
-    thresholds.
+    with fewer inliers needs a better depth agreement. The reference implementation of the paper
+    relaxes all thresholds.
     """
 
     def __init__(self, options: RegistrationOptions) -> None:
@@ -24,24 +24,24 @@ class ThresholdSchedule:
 
     @property
     def min_inliers(self) -> int:
-        """Minimum number of inliers that a pose needs at the present step."""
+        """Minimum number of inliers of a pose at the present step of the schedule."""
         return int(self._options.min_inliers / self._factor)
 
     @property
     def min_inlier_ratio(self) -> float:
-        """Minimum inlier ratio that a pose needs at the present step."""
+        """Minimum inlier ratio of a pose at the present step of the schedule."""
         return self._options.min_pose_inlier_ratio / self._factor
 
     def tighten_violations(self, max_violations: float) -> float:
-        """Return the limit of the violation ratio at the present step from its initial value."""
+        """Return the depth violation limit at the present step for an initial limit."""
         return max_violations / self._factor
 
     def check_support(self, pose: ScoredPose, *, confident: bool = False) -> Reason | None:
         """Return the reason why a pose has too little support, or None if the support suffices.
 
         Args:
-            pose: The pose with its inliers.
-            confident: Also require the inlier ratio ``confident_inlier_ratio`` of the options.
+            pose: The pose with its number of inliers and its inlier ratio.
+            confident: Also require the inlier ratio of the option ``confident_inlier_ratio``.
         """
         min_inliers = self.min_inliers
         min_ratio = self._options.confident_inlier_ratio if confident else self.min_inlier_ratio
