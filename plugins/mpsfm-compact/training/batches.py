@@ -23,7 +23,7 @@ from training.network import CANONICAL_FOCAL
 from training.samples import HEIGHT, ROUGH, SURFACE, WIDTH, Shard
 
 _SIZES = ((256, 192), (256, 192), (256, 192), (192, 256), (224, 224))
-"""Possible widths and heights of the network input, one drawn per batch. Each size has 0.05
+"""Possible widths and heights of the network input, one drawn per batch. All input sizes have 0.05
 megapixels."""
 _ZOOM = 1.6
 """Maximum zoom of the augmentation. Small zooms are more frequent, because inference does not zoom.

@@ -17,7 +17,7 @@ from training.network import CompactNetwork
 
 _OPSET = 18
 _SMALL = 1024
-"""Weight arrays with fewer values than this are stored as float32 instead of float16."""
+"""Minimum number of values of weight arrays that are stored as float16 instead of float32."""
 
 
 class Exported(nn.Module):

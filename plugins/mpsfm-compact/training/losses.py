@@ -21,8 +21,8 @@ _WEIGHTS = {
     "validity": 0.1,
     "focal": 0.1,
 }
-"""Weight of each loss term. With these weights, the initial gradients of all terms have a similar
-norm in shared layers.
+"""Weight of each loss term. The weights give the gradients of all loss terms a similar initial norm
+in shared layers.
 """
 _EMPTY_WEIGHT = 3.0
 """Loss weight of pixels without a surface, which are rare."""
@@ -34,7 +34,7 @@ def losses(out: Mapping[str, Tensor], batch: Batch) -> dict[str, Tensor]:
     The depth terms are the absolute log-depth error after aligning the scale of each image, the
     log-scale error of metric samples, and the error of log-depth differences at four pixel
     distances. The term of the predicted std is the negative Laplace log-likelihood of residuals of
-    measured depth. This term has no gradient with respect to the predicted depth.
+    measured depth. The std term has no gradient with respect to the predicted depth.
     """
     known = batch.known
     measured = known & (batch.kind == SURFACE)

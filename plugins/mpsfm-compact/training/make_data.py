@@ -107,11 +107,11 @@ def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str
 
     ``photos`` is a folder of folders with JPEGs and ``licence.json``, which has the horizontal
     field of view ``hfov_deg`` by file name (default 60). ``teacher`` is the ONNX file of the depth
-    network, for example FastDepth. The network has the input (1, 3, 224, 224), RGB in 0..1, and the
-    output (1, 1, 224, 224). ``names`` are prefixes of the images or image folders to label.
+    network, for example FastDepth. The depth network has the input (1, 3, 224, 224), RGB in 0..1,
+    and the output (1, 1, 224, 224). ``names`` are prefixes of the images or image folders to label.
 
     The depth network assumes the camera of NYU Depth v2, so its depth is multiplied by the ratio of
-    the focal lengths. All pixels have the kind ROUGH, which excludes the depth edges of these
+    the focal lengths. All pixels have the kind ROUGH, which excludes depth edges of predicted
     labels from the loss.
     """
     teach = _teacher(teacher, 224)
@@ -129,9 +129,9 @@ def make_labelled(output: Path, photos: Path, teacher: Path, names: Sequence[str
 def make_sky(output: Path, photos: Path, teacher: Path, names: Sequence[str]) -> None:
     """Label the sky in images with a segmentation network, and leave depth unknown.
 
-    ``teacher`` is the ONNX file of the segmentation network. The network has the input (1, 3, 384,
-    384), RGB in 0..1, and its output (1, 1, 384, 384) is the sky probability. The image folders are
-    organized as for :func:`make_labelled`.
+    ``teacher`` is the ONNX file of the segmentation network. The segmentation network has the input
+    (1, 3, 384, 384), RGB in 0..1, and its output (1, 1, 384, 384) is the sky probability. The image
+    folders are organized as for :func:`make_labelled`.
     """
     teach = _teacher(teacher, 384)
 

@@ -27,17 +27,17 @@ tripod heights of 1.3, 1.3, 1.5 and 1.6 m.
 _UPWARDS = 0.95
 """Minimum cosine between the predicted normal of a floor pixel and the up direction."""
 _BELOW = 0.12
-"""Minimum sine of the angle of floor rays below the horizon. This minimum limits the distance of
-floor pixels to 12 m."""
+"""Minimum sine of the angle of floor rays below the horizon. The minimum angle limits the distance
+of floor pixels to 12 m."""
 _SAME = 0.35
-"""Maximum difference of the log camera height among floor pixels. The pixels of table tops exceed
-this difference."""
+"""Maximum difference of the log camera height among floor pixels. The pixels of table tops differ
+by more in log camera height."""
 _ENOUGH = 0.04
 """Minimum share of floor pixels in a perspective image that yield a camera height."""
 _USUAL = 0.3
-"""Maximum difference of the log camera height of one image from the median of its panorama. Beyond
-this difference, the supposed floor is a table or bed, and the median height of the panorama is
-used.
+"""Maximum difference of the log camera height of one image from the median of its panorama. An
+image with a larger difference shows a table or bed instead of the floor, and gets the median height
+of the panorama.
 """
 _OUTDOORS = 0.3
 """Minimum share of sky above the horizon in an outdoor panorama. Outdoors, only ground pixels get

@@ -22,8 +22,8 @@ class Schedule:
     """Number of training steps, learning rates, and sampling shares of the data sources.
 
     The learning rate is constant after ``warmup`` steps, and falls linearly to zero over the last
-    ``cooldown`` of ``steps``. A run can therefore be extended beyond ``steps`` from its last
-    checkpoint.
+    ``cooldown`` of ``steps``. Before the cooldown, the learning rate does not depend on ``steps``,
+    so a training run can be extended later.
     """
 
     steps: int

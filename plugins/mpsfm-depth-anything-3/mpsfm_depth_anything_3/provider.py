@@ -100,7 +100,7 @@ def network_of(name: str) -> Any:
 def as_published(network: Any) -> torch.nn.Module:
     """Return the Depth Anything 3 network with the tensor names of its published weights.
 
-    A tensor that several network parts share is stored once.
+    The weights files store a tensor that several network parts share only once.
     """
     return torch.nn.ModuleDict({"model": network})
 

@@ -1,8 +1,8 @@
 """Mean and variance of the predictions for an image and its mirror (paper, appendix B).
 
-The covariance of depth or normals is the unbiased sample covariance of the two predictions. For two
-predictions, this covariance is the sum of the outer products of their deviations from the mean. If
-the network predicts a variance, the fused variance is the larger one of predicted and sample
+The covariance of depth or normals is the unbiased sample covariance of the two predictions. The
+sample covariance of two predictions is the sum of the outer products of their deviations from the
+mean. If the network predicts a variance, the fused variance is the maximum of predicted and sample
 variance. The errors of the predictions for an image and its mirror are correlated, so the variance
 is not halved for the mean of both.
 """
@@ -15,7 +15,7 @@ from mpsfm_core import DepthPrior, NormalPrior
 from mpsfm_core.data import Bool, Float32, Float64
 
 _SMALLEST_RELATIVE_STD = 1e-4
-"""Minimum std of depth relative to depth. This minimum keeps the variance positive if both
+"""Minimum std of depth relative to depth. The minimum std keeps the variance positive if both
 predictions agree."""
 _SMALLEST_STD_RAD = 1e-3
 
@@ -23,8 +23,8 @@ _SMALLEST_STD_RAD = 1e-3
 def fuse_depth(first: DepthPrior, second: DepthPrior) -> DepthPrior:
     """Fuse two depth maps of a view into one prior that is valid where both maps are valid.
 
-    The mean is weighted by the inverse network variances if both maps have them [reference], else
-    both maps have the same weight.
+    The mean depth is weighted by the inverse network variances if both maps have variances
+    [reference], else both maps have the same weight.
     """
     valid = first.valid & second.valid
     depths = _stack(first.depth, second.depth, valid)
@@ -44,10 +44,11 @@ def fuse_depth(first: DepthPrior, second: DepthPrior) -> DepthPrior:
 def fuse_normals(first: NormalPrior, second: NormalPrior) -> NormalPrior:
     """Fuse two normal maps of a view into one prior that is valid where both maps are valid.
 
-    The mean normal is the normalized sum of both normals. Both normals deviate from the mean by
-    half of their angle, in opposite directions. Their covariance in the tangent plane therefore has
-    the eigenvalues ``angle**2 / 2`` and 0. A :class:`NormalPrior` has one variance for both tangent
-    directions, which is half of the trace, ``angle**2 / 4``.
+    The mean normal is the normalized sum of both normals. Both normals deviate from the mean normal
+    by half of the angle between them, in opposite directions. The covariance of both normals in the
+    tangent plane has the eigenvalues ``angle**2 / 2`` and 0, where ``angle`` is the angle between
+    the normals. A :class:`NormalPrior` has one variance for both tangent directions, which is half
+    of the trace, ``angle**2 / 4``.
     """
     valid = first.valid & second.valid
     total = first.normals.astype(np.float64) + second.normals

@@ -15,7 +15,7 @@ from torch.nn.functional import scaled_dot_product_attention
 
 
 class FusedCrossBlock(nn.Module):
-    """Replacement of kornia's :class:`CrossBlock` that has the same layers under the same names."""
+    """Replacement of kornia's cross-attention block with the same layers and layer names."""
 
     def __init__(self, block: CrossBlock) -> None:
         super().__init__()

@@ -32,7 +32,7 @@ class KorniaFeatures(ABC):
     """Base class of the feature providers that run a detector of kornia."""
 
     multiple = 1
-    """The sides of the network input are rounded to multiples of this number of pixels."""
+    """The sides of the detector's network input are rounded to multiples of ``multiple`` pixels."""
 
     def __init__(self, options: FeatureOptions, context: ProviderContext) -> None:
         use_threads(context)

@@ -16,8 +16,8 @@ from mpsfm_kornia.attention import fuse_cross_attention
 from mpsfm_kornia.options import LightGlueOptions
 from mpsfm_kornia.runtime import load_state, load_weights
 
-# These dictionaries list all settings that determine LightGlue's shape, because other packages are
-# known to overwrite kornia's class-level defaults.
+# The dictionaries below list all settings that determine LightGlue's shape, because other packages
+# are known to overwrite kornia's class-level defaults.
 _LIGHTGLUE = {"input_dim": 128, "descriptor_dim": 256, "n_layers": 9, "num_heads": 4}
 LIGHTGLUE_256 = {**_LIGHTGLUE, "input_dim": 256}
 _LIGHTERGLUE = {"input_dim": 64, "descriptor_dim": 96, "n_layers": 6, "num_heads": 1}
@@ -67,7 +67,8 @@ class LightGlueMatcher:
             Mutual matches, with LightGlue's confidence as score.
 
         Raises:
-            ProviderError: The descriptors do not have the dimension that this LightGlue requires.
+            ProviderError: The descriptors do not have the dimension that this LightGlue network
+            requires.
         """
         features_a, features_b = require_features(
             "LightGlue matches features", features_a, features_b

@@ -71,7 +71,8 @@ KNOWN_HASHES = {
         LOFTR,
     )
 }
-"""SHA-256 hash of each default weights file. Other weights files that users select need no hash."""
+"""SHA-256 hash of each default weights file. Weights files of users need no entry in this table of
+hashes."""
 
 
 class FeatureOptions(Options):
@@ -216,7 +217,7 @@ class AdalamOptions(Options):
     """Minimum ratio of a neighborhood's inlier density to the density expected by chance."""
     scale_ratio: float | None = Field(1.5, gt=1)
     """Maximum ratio of the scale changes of two matches in a neighborhood. null sets no limit.
-    This limit has no effect on features without a scale.
+    The limit of the scale change has no effect on features without a scale.
     """
 
 

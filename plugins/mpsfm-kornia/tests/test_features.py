@@ -155,7 +155,7 @@ def test_missing_wheel_is_named(tmp_path):
 
 
 def test_sift_finds_blobs_where_they_are(context):
-    """Check SIFT's blob positions within half a pixel, the accuracy of kornia's octaves."""
+    """Check that SIFT detects blobs within half a pixel, the accuracy of kornia's octaves."""
     centers = np.array([(60.3, 50.7), (200.1, 120.4), (130.8, 180.2), (250.5, 60.5)])
     xy = pixel_centers(320, 240)
     blobs = [np.exp(-((xy - center) ** 2).sum(-1) / (2 * 4.0**2)) for center in centers]

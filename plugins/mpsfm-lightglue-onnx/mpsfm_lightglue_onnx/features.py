@@ -21,12 +21,12 @@ class OnnxFeatures:
     """Base class of the feature extractors that LightGlue-ONNX exports.
 
     The input ``image`` (1, c, h, w) of the ONNX file has values in [0, 1]. The output ``keypoints``
-    (1, n, 2) is in pixels of ``image``, with the center of the first pixel at (0, 0). The other
-    outputs are ``scores`` (1, n) and ``descriptors`` (1, n, d).
+    (1, n, 2) is in pixels of ``image``, with the center of the first pixel at (0, 0). Further
+    outputs of the ONNX file are keypoint ``scores`` (1, n) and ``descriptors`` (1, n, d).
     """
 
     multiple = 8
-    """The sides of the network input are rounded to multiples of this number of pixels."""
+    """The sides of the detector's network input are rounded to multiples of ``multiple`` pixels."""
 
     def __init__(self, options: FeatureOptions, context: ProviderContext, model: str) -> None:
         self._model = Model(context.resolve_weights(model, options.sha256), context)

@@ -12,8 +12,8 @@ from mpsfm_core import Features, PinholeCamera, View
 from mpsfm_core.data.errors import ConfigError, ProviderError
 from mpsfm_core.providers.registry import Registry
 
-# Network with keypoints at given pixels of its input. Every descriptor is the color of the first
-# keypoint.
+# Detector network with keypoints at given pixels of its input. Every keypoint descriptor is the
+# color of the first keypoint.
 DETECTOR = """
 detector (float[b,CHANNELS,h,w] image) => (
     int64[b,n,2] keypoints, float[b,n] scores, float[b,n,CHANNELS] descriptors) {

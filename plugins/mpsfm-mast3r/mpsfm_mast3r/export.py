@@ -41,8 +41,8 @@ _NARROW = {
 classes and heads of MASt3R, which need 12 decoder blocks.
 """
 _POSITIONS = 256
-"""Number of patches along an image side for which rotary embeddings are stored in the file. This
-number limits image sides to 4096 pixels."""
+"""Number of patches along an image side for which rotary embeddings are stored in the file. 256
+patches of 16 pixels limit image sides to 4096 pixels."""
 _SIDES = (((96, 128), (128, 64)), ((64, 160), (64, 160)))
 _KEYS = ("pts3d", "conf", "desc", "desc_conf")
 _OUTPUTS = [f"{key}_{side}" for side in (1, 2) for key in _KEYS]

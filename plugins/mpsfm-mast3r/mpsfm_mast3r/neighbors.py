@@ -27,8 +27,8 @@ def find_nearest(queries: Float32, base: Float32) -> Int64:
 def find_reciprocal(a: Float32, b: Float32, start: Int64) -> Int64:
     """Find index pairs (m, 2) of mutual nearest neighbors, starting at the rows ``start`` of a.
 
-    The search iterates from a row to its nearest neighbor and back until the pair is stable (fast
-    reciprocal matching, Leroy et al., ECCV 2024).
+    The search iterates from a descriptor to its nearest neighbor and back until the pair is stable
+    (fast reciprocal matching, Leroy et al., ECCV 2024).
     """
     pairs = [np.empty((0, 2), dtype=np.int64)]
     current = start

@@ -112,7 +112,8 @@ class OnnxPairNetwork(PairNetwork):
     """MASt3R in an ONNX file.
 
     The inputs are ``img1`` and ``img2``. The outputs are ``pts3d_1`` (1, h, w, 3), ``conf_1`` (1,
-    h, w), ``desc_1`` (1, h, w, d), ``desc_conf_1`` (1, h, w), and the same for the second view.
+    h, w), ``desc_1`` (1, h, w, d), ``desc_conf_1`` (1, h, w), and ``pts3d_2`` to ``desc_conf_2``
+    for the second view.
     """
 
     def __init__(self, options: Mast3rOptions, context: ProviderContext) -> None:

@@ -28,7 +28,7 @@ class DenseSearch(SizeOptions):
 
     subsample: int = Field(8, ge=1)
     """Step in pixels of the network input between the pixels from which the reciprocal search
-    starts. Larger steps are faster and find fewer matches. [reference]"""
+    starts. A search from fewer start pixels is faster and finds fewer matches. [reference]"""
 
 
 class SparseSearch(SizeOptions):

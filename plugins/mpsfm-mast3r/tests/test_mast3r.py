@@ -16,8 +16,8 @@ from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 SIZE = (80, 60)  # size of test views, resized to 64 x 48
 
-# The network returns the red channel as z and green as certainty for its first input, and 90 for
-# both for its second input. Descriptors are the unit vectors of (red, green, blue).
+# The network returns the red channel as z and green as certainty for its first input. For the
+# second input, z and certainty are 90. Descriptors are the unit vectors of (red, green, blue).
 STAND_IN = """
 mast3r (float[b,3,h1,w1] img1, float[b,3,h2,w2] img2) => (
     float[b,h1,w1,3] pts3d_1, float[b,h1,w1] conf_1, float[b,h1,w1,3] desc_1,

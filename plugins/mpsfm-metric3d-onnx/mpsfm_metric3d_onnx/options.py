@@ -39,8 +39,8 @@ class Metric3dOptions(Options):
     sha256: str | None = None
     """Expected SHA-256 hash of the file ``weights``."""
     confidence: bool = False
-    """Set to true if the ONNX file has the output ``confidence``. The depth variance is then
-    computed from this confidence, and calibrated as in the reference. The public ONNX files have no
+    """Set to true if the ONNX file has the output ``confidence``. The depth variance is computed
+    from this ``confidence``, and calibrated as in the reference. The public ONNX files have no
     output ``confidence``.
     """
 

@@ -1,4 +1,5 @@
-"""Provider contract tests of one Metric3D size. All sizes share the tested code."""
+"""Provider contract tests of one Metric3D size. All network sizes of Metric3D share the tested
+code."""
 
 import pytest
 

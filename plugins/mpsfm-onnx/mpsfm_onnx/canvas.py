@@ -75,7 +75,8 @@ class Canvas:
         """Cut an output (h, w, c) of the whole network input to the part that covers the view.
 
         The returned map covers the view exactly, and is NaN where the network input crops the view.
-        If the image border is not between two output pixels, the output is sampled bilinearly.
+        If the image border is not between two pixels of the network output, the output is sampled
+        bilinearly.
         """
         height, width = planes.shape[:2]
         scale = (width / self.size[0], height / self.size[1])

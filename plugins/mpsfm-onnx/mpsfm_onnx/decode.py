@@ -55,7 +55,7 @@ def decode_depth(
         factor: Multiplier of depth and std that corrects for focal length and network unit.
         std: The depth uncertainty tensor (h, w), or None.
         std_rule: Description of the depth uncertainty tensor.
-        valid: Mask (h, w) of valid pixels that the network predicts, or None.
+        valid: Mask (h, w) of the pixels that the network predicts to be valid, or None.
 
     Returns:
         The depth prior, at the resolution of the network output.
@@ -167,8 +167,8 @@ def compute_expected_angle(kappa: Float64) -> Float64:
 
     The density of normals over the sphere is ``(k^2 + 1) exp(-k a) / (2 pi (1 + exp(-k pi)))``,
     where a is the angle to the mean normal (Bae et al., ICCV 2021, DSINE and Metric3D v2). The mean
-    angle of this density is ``2k / (k^2 + 1) + pi e / (1 + e)`` with ``e = exp(-k pi)``. For large
-    k, the mean angle overestimates the std by 15 %.
+    angle to the mean normal is ``2k / (k^2 + 1) + pi e / (1 + e)`` with ``e = exp(-k pi)``. For
+    large k, the mean angle overestimates the std by 15 %.
     """
     k = np.maximum(kappa, 0)
     tail = np.exp(-k * np.pi)

@@ -100,12 +100,12 @@ class DepthOutput(Options):
     output: Literal["depth", "disparity", "log-depth", "ray-length", "points"] = "depth"
     """Meaning of v. If ``output`` is ``depth``, ``disparity`` or ``log-depth``, depth is ``v``, ``1
     / v`` or ``exp(v)`` for the scaled and shifted value v. If ``output`` is ``ray-length``, the
-    value is the distance to the camera center along the ray. If ``output`` is ``points``, the
-    tensor has channels x, y, z with an unknown shift of z, which is estimated from the known
+    tensor value is the distance to the camera center along the ray. If ``output`` is ``points``,
+    the tensor has channels x, y, z with an unknown shift of z, which is estimated from the known
     intrinsics. Pixels whose value is not positive are invalid, except for ``log-depth``.
     """
     channel: int = Field(0, ge=0)
-    """Channel of the depth tensor. ``points`` ignores this option."""
+    """Channel of the depth tensor. The channel is ignored if ``output`` is ``points``."""
     scale: float = 1.0
     shift: float = 0.0
     """Scale and shift of the tensor values. Scale and shift convert the values to meters (or 1 /
@@ -263,7 +263,7 @@ def load_description(name: str) -> Description:
         if name not in shipped_descriptions():
             known = shipped_descriptions()
             raise ConfigError(
-                f"no network description {name!r}{did_you_mean(name, known)}; there are "
+                f"no network description is named {name!r}{did_you_mean(name, known)}; there are "
                 f"{', '.join(known)}, or give a YAML file"
             )
     elif not path.is_file():

@@ -19,7 +19,8 @@ from mpsfm_onnx.model import Model
 class NetworkOutput:
     """Outputs of a network for a view, as maps (h, w, c) and single numbers, by tensor name.
 
-    All maps cover exactly the view. ``canvas`` is the position of the view on the network input.
+    All output maps cover exactly the view. ``canvas`` is the position of the view on the network
+    input.
     """
 
     maps: dict[str, Float32]

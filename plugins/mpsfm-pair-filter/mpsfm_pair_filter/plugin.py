@@ -38,7 +38,8 @@ def read_scores(path: Path) -> Mapping[frozenset[str], float]:
     """Read scores by unordered pairs of image names, keeping the lowest of repeated pairs.
 
     Raises:
-        InputError: The file cannot be read, or a line does not have two names and a number.
+        InputError: The CSV file cannot be read, or a line does not have two image names and a
+        score.
     """
     scores: dict[frozenset[str], float] = {}
     try:

@@ -24,8 +24,9 @@ TIMELINE = "step"
 class RerunViewer:
     """Viewer that writes the recording ``OUTPUT/scene.rrd``.
 
-    Each recorded scene is a step of rerun's timeline ``step``. If ``z_is_up`` is set, the world is
-    recorded with z up. If ``z_is_up`` is False, y is down, as in the camera frame.
+    Each recorded scene is a step of rerun's timeline ``step``. If ``z_is_up`` is True, the z axis
+    of the recorded world points up. If ``z_is_up`` is False, the y axis of the recorded world
+    points down, as in the camera frame.
     """
 
     def __init__(self, output: Path, pictures: Pictures, z_is_up: bool = False) -> None:

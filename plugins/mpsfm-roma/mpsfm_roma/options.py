@@ -15,7 +15,7 @@ class RomaOptions(Options):
     sha256: str | None = None
     """Expected SHA-256 hash of the file ``model``."""
     height: int = Field(672, ge=14, multiple_of=14)
-    """Height of the network input in pixels. Images are stretched to the input size.
+    """Height of the network input in pixels. Images are stretched to the size of RoMa's input.
     [reference: coarse resolution]"""
     width: int = Field(672, ge=14, multiple_of=14)
     """Width of the network input in pixels."""

@@ -27,7 +27,8 @@ class SkyNetwork:
     """Network with one image as input and the sky probability as first output.
 
     The reference implementation stretches the output range of each image to 0..1, which finds sky
-    in images without sky. This provider uses the probability without stretching.
+    in images without sky. This provider uses the predicted sky probability without stretching its
+    range.
     """
 
     def __init__(self, options: SkyOptions, context: ProviderContext) -> None:

@@ -20,7 +20,7 @@ class SuperPointFeatures:
     """SuperPoint features. The library transformers places pixel centers at integer coordinates."""
 
     def __init__(self, options: SuperPointOptions, context: ProviderContext) -> None:
-        config: dict[str, float] = {"max_keypoints": -1}  # no limit before the mask is applied
+        config: dict[str, float] = {"max_keypoints": -1}  # keep all keypoints until masking
         if options.detection_threshold is not None:
             config |= {"keypoint_threshold": options.detection_threshold}
         self._model = LoadedModel(SuperPointForKeypointDetection, options, context, **config)

@@ -23,7 +23,8 @@ class _Paired(EfficientLoFTRForKeypointMatching):  # transformers is untyped
     """Efficient LoFTR with a corrected pairing of its matches.
 
     transformers 5.23 lists the matched cells of both images in different orders, but pairs them as
-    if the orders were equal. This class sorts both lists by the cells of the first image.
+    if the orders were equal. This class sorts the matched cells of both images by the cells of the
+    first image.
     """
 
     def _get_matches_from_scores(self, scores: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -62,7 +62,8 @@ KNOWN = (
     KnownModel("facebook/dinov2-*", "Apache-2.0"),
     KnownModel("facebook/dinov3-*", "DINOv3 License"),
 )
-"""Table of known models. The first entry whose pattern matches the model name applies."""
+"""Table of known models. A model has the properties of the first entry whose pattern matches its
+name."""
 
 
 def look_up_model(model: str) -> KnownModel:
@@ -127,8 +128,8 @@ class PromptOptions(HubOptions):
 
     model: str = "depth-anything/prompt-depth-anything-vits-hf"
     directory: Path
-    """Folder with sensor depth maps, as for the provider ``files``. Holes are filled before
-    inference.
+    """Folder with sensor depth maps, as for the provider ``files``. Holes in the depth maps are
+    filled before inference.
     """
     suffix: str | None = None
     """Suffix of the depth file names, as for the provider ``files``."""

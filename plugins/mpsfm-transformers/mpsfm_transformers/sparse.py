@@ -1,7 +1,7 @@
 """LightGlue and SuperGlue as sparse matchers of given keypoints.
 
-The models of transformers detect, describe and match keypoints in one pass. A module that returns
-given keypoints therefore replaces the detector in these models.
+The models of transformers detect, describe and match keypoints in one pass. To match given
+keypoints, a module that returns these keypoints replaces the detector in the models.
 """
 
 from __future__ import annotations

@@ -268,7 +268,7 @@ def _save(
     """Save random weights of an architecture in the published file format.
 
     ``noise`` is the shape of a random input that initializes the batch normalization statistics.
-    Without this initialization, deep random layers have a constant output.
+    Without initialized statistics, deep random layers have a constant output.
     """
     folder.mkdir(parents=True, exist_ok=True)
     with torch.random.fork_rng(), quiet():

@@ -1,4 +1,4 @@
-"""Comparison of features and matchers with the models of transformers on the same weights."""
+"""Comparison of features and matchers with transformers' own models of equal weights."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Browser viewer of the current scene, served by this process."""
+"""Browser viewer of the current reconstruction, with a server in the running process."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class ViserViewer:
 
     @property
     def address(self) -> str:
-        """Return the address of the page on this machine."""
+        """Return the local address of the viewer's web page."""
         return f"http://localhost:{self.server.get_port()}"
 
     @hookimpl

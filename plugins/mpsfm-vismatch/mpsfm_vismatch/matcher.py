@@ -26,7 +26,7 @@ _STD_DETECTED_PX, _STD_DENSE_PX = 1.0, 0.5
 _OF_CORNERS = ("roma", "redimatch", "gim-dkm", "loftr", "xoftr", "aspanformer", "matchformer")
 _OF_CORNERS += ("topicfm", "edm", "matchanything", "dedode", "steerers", "loma")
 """Substrings of the names of networks with COLMAP's pixel convention, the center of the first pixel
-at (0.5, 0.5). All other networks have the center of the first pixel at (0, 0).
+at (0.5, 0.5). The other vismatch networks have the center of the first pixel at (0, 0).
 """
 _OF_OPENCV = ("sift", "doghardnet-lightglue")
 """Substrings of the names of matchers with OpenCV's SIFT. OpenCV doubles the image for SIFT, so

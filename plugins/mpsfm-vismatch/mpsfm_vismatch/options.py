@@ -20,7 +20,7 @@ class CollectionOptions(Options):
     """Maximum number of keypoints of a detector, or of matches that are sampled from a warp."""
     resize: int | None = Field(1024, ge=32)
     """Longer side of the resized images in pixels. Images are never enlarged, and null keeps their
-    size. Dense matching networks resize these images again.
+    size. Dense matching networks resize the resized images again.
     """
 
 

@@ -21,8 +21,8 @@ _OVERSAMPLE = 1.25
 """Ratio of the rendered to the stored image size, for antialiasing of colors."""
 _NEAREST, _FARTHEST = 0.15, 120.0
 _DIFFERENT = 0.25
-"""Minimum log ratio of the 95th to the 5th percentile of depth in an image. This minimum excludes
-images of bare walls."""
+"""Minimum log ratio of the 95th to the 5th percentile of depth in an image. The minimum depth range
+excludes images of bare walls."""
 
 
 def draw_samples(seed: Sequence[int], photos: Sequence[Path] = ()) -> Iterator[Sample]:

@@ -1,9 +1,9 @@
 """Compiled ray casting of boxes, ellipsoids and cylinders.
 
 Every solid is a unit solid (cube [-1, 1]^3, unit ball, or cylinder of radius 1 along z in [-1, 1])
-under an affine map. Each kind of solid (cube, ball or cylinder) therefore needs one intersection
-routine. In world coordinates, x and y are horizontal and z is up, in meters. In camera coordinates,
-x is right, y down and z forward.
+under an affine map. One intersection routine per kind of solid (cube, ball or cylinder) suffices.
+In world coordinates, x and y are horizontal and z is up, in meters. In camera coordinates, x is
+right, y down and z forward.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ GROUP = 8
 _NEAR = 1e-4
 _TILE = 16
 _compiled = njit(cache=True, fastmath={"contract", "reassoc", "nsz", "arcp"}, error_model="numpy")
-"""Options of the numba compiler. These options keep comparisons with infinity exact."""
+"""Options of the numba compiler. The fast-math options keep comparisons with infinity exact."""
 
 
 @_compiled
