@@ -42,7 +42,8 @@ class MapperProgress(NamedTuple):
     runs: list[MapperRun]
     """Completed runs."""
     mapper: object | None
-    """The mapper of the interrupted run. The attribute is None if all mapper runs are complete."""
+    """The mapper of the interrupted run. The interrupted run is None if all mapper runs are
+    complete."""
 
 
 class Checkpointer:

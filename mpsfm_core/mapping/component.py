@@ -1,4 +1,4 @@
-"""One connected component: initialization, incremental registration and final refinement."""
+"""Initialization, incremental registration and final refinement of one connected component."""
 
 from __future__ import annotations
 
@@ -34,9 +34,8 @@ MAX_INITIAL_VIOLATIONS = 0.03
 """Share of pixels with contradicting depth above which an initial pair is rejected, 0.6 times the
 option ``max_violations``. [reference]"""
 MAX_FINAL_VIOLATIONS = 0.08
-"""Share of pixels with contradicting depth above which the final check deregisters an image. The
-share exceeds that of registration because other images depend on the image. [tuned:
-benchmarks.symmetry]"""
+"""Share of pixels with contradicting depth above which the final check deregisters an image, larger
+than in registration because other images depend on the image. [tuned: benchmarks.symmetry]"""
 
 _WITHOUT_POINTS = {
     True: "the scale of their depth is unknown; check that the poses and the images match",
@@ -45,7 +44,7 @@ _WITHOUT_POINTS = {
 
 
 def do_nothing() -> None:
-    """Ignore a call, as the default of optional callbacks."""
+    """Return without effect, as the default of optional callback arguments."""
 
 
 class Component:
@@ -92,7 +91,7 @@ class Component:
         return check.reweight_pairs(self.maintenance.problem, unregistered)
 
     def initialize_from_known_poses(self, unregistered: Bool) -> bool:
-        """Register all unregistered images that came with a pose.
+        """Register all unregistered images with a known input pose.
 
         Returns:
             False if fewer than two images with known poses observe enough points.
@@ -121,8 +120,9 @@ class Component:
     def initialize_globally(self, unregistered: Bool) -> bool:
         """Register all well connected images together (motion averaging).
 
-        Images whose depth contradicts others are deregistered. The global poses are kept if both
-        keypoints of enough matches then observe the same 3D point (option ``enough_explained``).
+        Images whose depth contradicts other images are deregistered. The global poses are kept if
+        both keypoints of enough matches then observe the same 3D point (option
+        ``enough_explained``).
 
         Returns:
             False if the initialization is rejected; the scene is then empty.
@@ -247,13 +247,13 @@ class Component:
             save_checkpoint()
 
     def reregister_images(self, candidates: Bool) -> None:
-        """Deregister misregistered images and register them with other references.
+        """Deregister misregistered images and register them with other reference images.
 
         The new poses are kept if no image is lost, more matches observe common 3D points, and the
-        images are no longer misregistered. Each set of misregistered images is tried once. If its
-        new poses are not kept, images that one pair connects to the model and several pairs
-        contradict are deregistered. Images with a known pose stay registered, unless the known
-        poses are only initial guesses.
+        images are no longer misregistered. New poses are tried once for each set of misregistered
+        images. If the new poses are not kept, images that one pair connects to the model and
+        several pairs contradict are deregistered. Images with a known pose stay registered, unless
+        the known poses are only initial guesses.
 
         Args:
             candidates: (n,) bool mask of the images that may be registered.
@@ -284,7 +284,7 @@ class Component:
     def _split_off(self, detection: Misregistration) -> None:
         """Deregister images that one pair connects to the model and several pairs contradict.
 
-        They may form another component.
+        The deregistered images may form another component.
         """
         reason = ImageReason.SPLIT_OFF.because(num_matches=int(detection.margin))
         self.maintenance.deregister(list(detection.images), reason)
@@ -297,7 +297,7 @@ class Component:
         return [int(i) for i in np.flatnonzero(before.scene.registered & ~self.scene.registered)]
 
     def _deregister_misregistered(self, detection: Misregistration) -> None:
-        """Deregister images and exclude the references that supported their wrong poses."""
+        """Deregister images and exclude the reference images that supported their wrong poses."""
         maintenance = self.maintenance
         reason = ImageReason.MISREGISTERED.because(num_matches=int(detection.margin))
         maintenance.deregister(list(detection.images), reason)

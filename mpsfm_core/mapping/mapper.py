@@ -17,11 +17,11 @@ The steps of :func:`reconstruct`, compared with COLMAP's ``IncrementalMapper``::
             while an image registers:                   # component.register_images()
                 select the next image, estimate its pose, verify it by depth, triangulate
                 refine locally; refine globally if the model has grown
-            component.reregister_images()               # misregistered images, elsewhere
+            component.reregister_images()               # misregistered images in other poses
             component.finalize()                        # global refinement, depth check of all
         stop if enough matches are explained and no guessed focal length was far off
     select the run that explains the most matches
-    register the remaining images tentatively           # if the options ask for it
+    register the remaining images tentatively           # if this option is set
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstructio
 from mpsfm_core.mapping.serialization import canonicalize
 
 MIN_ABSORBING_RATIO = 0.25
-"""Smallest ratio of the image counts of a component and of the largest component for which the
-former may take images of the latter. [ours]"""
+"""Minimum size of a component, relative to the largest component, to absorb images of completed
+components. [ours]"""
 
 
 def reconstruct(
@@ -64,10 +64,10 @@ def reconstruct(
 ) -> MappingResult:
     """Reconstruct poses, points and refined depth of all images that can be verified.
 
-    If many matches remain unexplained, the mapper runs again with other seeds. If guessed focal
-    lengths were far off, the mapper runs again with the refined focal lengths. The run that
-    explains most matches is kept. The same problem, options and machine give the same bits, also if
-    an interrupted run continues from a checkpoint.
+    If many matches observe no common 3D point, the mapper runs again with other random seeds. If
+    guessed focal lengths were far off, the mapper runs again with the refined focal lengths. The
+    run with the most matches that observe common 3D points is kept. The same problem, options and
+    machine give the same bits, also if an interrupted run continues from a checkpoint.
 
     Args:
         problem: Images with depth and normal priors, and geometrically verified matches.
@@ -128,8 +128,8 @@ def _apply_refined_focals(
 class Mapper:
     """One run of the mapper with one seed.
 
-    A checkpoint of the attributes between two image registrations suffices to continue the run with
-    identical results.
+    A run continues with identical results from a checkpoint of the attributes between two image
+    registrations.
 
     Attributes:
         component: The current component.
@@ -193,7 +193,7 @@ class Mapper:
         """Reconstruct the next component, or continue an interrupted one.
 
         Returns:
-            False if no further component is possible.
+            False if no further component can be reconstructed.
         """
         if not self._is_growing:
             if np.count_nonzero(self.unregistered) < 2:

@@ -41,7 +41,7 @@ class ModelMaintenance:
 
     Attributes:
         scene: Camera poses, 3D points and depth maps of the model.
-        scores: (n, n) float64, score of the matches of each two images.
+        scores: (n, n) float64 summed match scores of each two images.
         refiner: Object that runs bundle adjustment and depth integration.
         history: Record of failed and successful image registration attempts.
         thresholds: Acceptance thresholds of image registration, which relax if no image can be
@@ -68,7 +68,7 @@ class ModelMaintenance:
 
     @property
     def is_checked(self) -> bool:
-        """True if the depth of all registered images was compared with each other."""
+        """True if the depth of all pairs of registered images was compared."""
         return bool(self._checked[self.scene.registered].all())
 
     def state(self) -> ModelState:
@@ -101,7 +101,7 @@ class ModelMaintenance:
         """Refine all images and points, then deregister images with few or unconnected points.
 
         Args:
-            final: Sharpen the depth loss (paper, robust reconstruction).
+            final: Sharpen the depth loss as in the paper's final robust reconstruction.
         """
         before = self.scene.snapshot()
         with self.event_log.timed("global refinement"):
@@ -154,7 +154,7 @@ class ModelMaintenance:
                 relax.
 
         Returns:
-            None if the depth is consistent, else the reason.
+            None if the depth of the image is consistent, else the rejection reason.
         """
         if not self.options.consistency.enabled:
             return None

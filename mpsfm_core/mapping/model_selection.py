@@ -1,8 +1,8 @@
 """Selection of one result among mapper runs with different seeds.
 
-The selected run has the component that explains the largest share of the match scores. A match is
-explained if both of its keypoints observe the same 3D point. Among runs that explain equal shares
-of the match scores, the agreement of depth maps decides.
+The selected run has the component that explains the largest share of the match scores. A component
+explains a match if both keypoints of the match observe the same 3D point. Among runs that explain
+equal shares of the match scores, the agreement of depth maps decides.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class MapperRun(NamedTuple):
 
 
 def is_settled(runs: Sequence[MapperRun], min_explained_ratio: float) -> bool:
-    """Return True if the last mapper run explains enough matches or equals an earlier run."""
+    """Return True if no further mapper run is needed after the last run."""
     *earlier, last = runs
     is_explained = sum(last.explained_ratios) >= min_explained_ratio
     return is_explained or any(_are_equal(run, last) for run in earlier)
@@ -109,5 +109,5 @@ def compute_explained_score(model: Reconstruction, problem: MappingProblem) -> f
 
 
 def compute_total_score(problem: MappingProblem) -> float:
-    """Sum the scores of all matches of the problem."""
+    """Sum the scores of all matches of the mapping problem."""
     return sum(float(pair.scores.sum(dtype=float)) for pair in problem.pairs)

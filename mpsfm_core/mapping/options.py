@@ -68,7 +68,8 @@ class RegistrationOptions(Options):
     """Number of distinct pose hypotheses whose support is maximized; 0 keeps the poses of RANSAC.
     [tuned: benchmarks.ablation]"""
     num_bundle_adjusted: int = expert(3, ge=1)
-    """Number of distinct poses that bundle adjustment refines before one is chosen. [ours]"""
+    """Number of distinct pose hypotheses that bundle adjustment refines before one is selected.
+    [ours]"""
     max_bundle_iterations: int = expert(10, ge=1)
     """Maximum number of iterations of the bundle adjustment of a pose hypothesis. [ours]"""
     min_inlier_ratio: float = expert(0.25, gt=0, le=1)
@@ -88,7 +89,7 @@ class RegistrationOptions(Options):
     [reference: bundle of 5]"""
     max_relaxations: int = expert(6, ge=0)
     """Number of times that ``min_inliers`` and ``min_pose_inlier_ratio`` are divided by 1.2 if no
-    image registers; raising it registers more and less certain images. [reference]"""
+    image registers; raising it registers more, but less reliable images. [reference]"""
 
 
 class TriangulationOptions(Options):
@@ -98,7 +99,7 @@ class TriangulationOptions(Options):
     """Triangulation angle below which a point is lifted from depth; raising it relies more on
     depth. [COLMAP tri_min_angle] [reference hard_angle]"""
     max_angle_error_deg: float = expert(2.0, gt=0)
-    """Largest angular error of an observation of a new image, before refinement.
+    """Largest angular error of an observation in a new image, before refinement.
     [COLMAP tri_create_max_angle_error, tri_continue_max_angle_error]"""
     max_error_px: float = Field(4.0, gt=0)
     """Largest reprojection error of an observation, times the standard deviation of its keypoint;
@@ -171,10 +172,11 @@ class ConsistencyOptions(Options):
     """Share of pixels with contradicting depth above which the relative pose of an image pair is
     inconsistent, before any image is registered. [tuned: benchmarks.accuracy]"""
     max_deviation: float = expert(2.7, gt=0)
-    """Smallest depth error that counts as a violation, in standard deviations of both depth priors.
-    [paper gamma] [reference: 0.6 * 15 / 3.33]"""
+    """Smallest depth error of a pixel that counts as a violation of depth consistency, in standard
+    deviations of both depth priors. [paper gamma] [reference: 0.6 * 15 / 3.33]"""
     min_gap: float = expert(0.05, ge=0)
-    """Smallest relative depth error that counts as a violation. [tuned: benchmarks.symmetry]"""
+    """Smallest relative depth error of a pixel that counts as a violation of depth consistency.
+    [tuned: benchmarks.symmetry]"""
     num_views: int = expert(16, ge=1)
     """Number of most overlapping images whose depth is compared with that of a new image. [ours]"""
     map_width: int = expert(160, ge=16)

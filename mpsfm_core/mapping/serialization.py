@@ -1,6 +1,6 @@
 """Serialization of the state of the mapper to plain arrays, bit for bit.
 
-Objects and array memory that are shared stay shared, because a resumed mapper run must give
+Objects and array memory with several references stay shared, because a resumed mapper run must give
 bit-identical results. Unsupported objects, such as locks and open files, raise an error that names
 the attribute. Reading a checkpoint executes no stored code and only creates objects of data classes
 of ``mpsfm_core``.
@@ -88,7 +88,7 @@ class _Writer:
         for number, found in enumerate(_parts(shared)):
             self._shared.setdefault(id(found), number)
         self._met: dict[int, int] = {}
-        self._alive: list[object] = [shared]  # live objects have unique ids
+        self._alive: list[object] = [shared]  # only live Python objects have unique ids
 
     def node(self, value: Any, place: str) -> Any:
         """Return the JSON node that represents a Python value."""
@@ -181,7 +181,7 @@ class _Reader:
         self._read_only: list[NDArray[Any]] = []
 
     def __call__(self, tree: Any) -> Any:
-        """Return the root of the restored object graph."""
+        """Return the root object of the restored object graph."""
         made = self.value(tree)
         # set the flag last, because views of a read-only array may be writable
         for array in self._read_only:

@@ -1,4 +1,4 @@
-"""Triangulation of tracks (continue, create, complete, merge), and lifting from depth.
+"""Triangulation of tracks, and lifting of 3D points from depth maps.
 
 The operations are those of COLMAP's ``IncrementalTriangulator`` (``Continue``, ``Create``,
 ``Complete``, ``Merge``), vectorized over the edges of the correspondence graph. If the
@@ -63,7 +63,7 @@ def extend_tracks(
         scene: The scene.
         image: The image.
         edges: Source and target keypoints (e,) of the matches of the image to registered images.
-        max_error_px: Largest reprojection error in pixels in the image.
+        max_error_px: Largest reprojection error of an added observation, in pixels.
     """
     tracks = scene.tracks
     source, target = edges
@@ -135,7 +135,7 @@ def triangulate_or_lift(
         scene: The scene.
         source: (m,) keypoints.
         target: (m,) target keypoints that match the source keypoints.
-        max_error_px: Largest reprojection error in pixels in both images.
+        max_error_px: Largest reprojection error of a point in both images, in pixels.
         options: The option ``min_angle_deg`` is the triangulation angle below which points are
             lifted from depth.
 
@@ -169,7 +169,7 @@ def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int])
     Args:
         scene: The scene.
         options: ``max_error_px`` limits the reprojection errors in pixels.
-        images: Images whose matches are considered for merging.
+        images: Images whose matched points are merged.
     """
     tracks, graph = scene.tracks, scene.graph
     edges = [graph.edges_of(image) for image in images]
@@ -283,7 +283,7 @@ def _first_occurrences(values: Int64) -> Int64:
 
 
 def _pairs_within_groups(groups: Int64) -> tuple[Int64, Int64]:
-    """Return all ordered pairs of array positions with equal values, and each with itself.
+    """Return all ordered pairs of array positions with equal values, including equal positions.
 
     Args:
         groups: (m,) sorted values.

@@ -1,4 +1,4 @@
-"""Depth agreement of a model, for the selection among models of the same images."""
+"""Agreement among the depth maps of a model, for the selection of the best model."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def measure_depth_agreement(model: Reconstruction, options: ConsistencyOptions) 
     """Measure the share of pixels whose depth agrees with the depth of other images.
 
     The depth of a misregistered image may contradict no other image, because both may see different
-    surfaces. Little of the depth then agrees with other images.
+    surfaces. The depth of such a misregistered image then agrees little with other images.
 
     Args:
         model: The reconstructed model, with refined depth maps.

@@ -7,11 +7,12 @@ occluded. A contradiction of depth maps has one of two causes.
 
 * The depth is wrong. The errors of log depth in both images have normal distributions with standard
   deviations ``s`` and ``s'``. The likelihood of the contradiction is ``L = E_e[exp(-(e' / s')^2 /
-  2)]`` over the errors ``e`` along the pixel's ray, where ``e'`` is the log depth from the other
-  surface to the shifted pixel, and 0 if the shifted pixel is occluded or outside the other image.
-  At wide angles, an error of depth also shifts the pixel laterally in the other image. The
-  likelihood is the expectation over ``e`` instead of the maximum, because some error nearly always
-  shifts the pixel past a depth edge.
+  2)]`` over the errors ``e`` along the pixel's ray, where ``e'`` is the log-depth difference
+  between the other surface and the shifted pixel, or 0 if the shifted pixel is occluded or outside
+  the other image. At wide angles, an error of depth also shifts the pixel laterally in the other
+  image. The likelihood is the expectation over ``e`` instead of the maximum, because some error
+  nearly always shifts the pixel past a depth edge.
+
 * The pose is wrong. The surface in the other image is then independent of the pixel.
 
 A pixel is a violation if ``L`` is below the likelihood of a deviation of ``max_deviation`` standard
@@ -21,9 +22,10 @@ both directions.
 The depth check needs the standard deviation of depth at each pixel, because a good prior can be
 wrong in one spot. Triangulated points that do not depend on the prior measure this standard
 deviation (:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_local_depth_noise`). If nearby
-points contradict the prior, the standard deviation grows and the pixel is no violation. Otherwise
-the standard deviation of the whole scene applies. An image registered to a look-alike place
-observes points only on look-alike structure, so structure that differs still causes violations.
+points contradict the prior, the standard deviation grows and the pixel is no violation. If no
+nearby points contradict the prior, the standard deviation of the whole scene applies. An image
+registered to a look-alike place observes points only on look-alike structure, so structure that
+differs still causes violations.
 
 The depth of an image is compared with all overlapping images, not only with those that share
 points. Images that share points with a misregistered image look alike, so their depth may agree
@@ -55,7 +57,7 @@ NUM_ERROR_STEPS = 4
 """Number of samples of the depth error on either side of 0, evenly spaced up to the option
 ``max_deviation``. [ours]"""
 PIXEL_STRIDE = 2
-"""Distance in pixels between the compared pixels of the subsampled maps. [ours]"""
+"""Distance in pixels between the compared pixels of the subsampled depth maps. [ours]"""
 MIN_SIGNIFICANCE = 3.0
 """Number of standard deviations from the limit, beyond which the violation ratio of a quarter of
 the pixels decides and all other pixels are skipped. [ours]"""
@@ -81,8 +83,8 @@ class DepthConsistencyCheck:
     Args:
         scene: The scene.
         options: Thresholds of the depth consistency check.
-        fill_holes: The check fills holes of one or two pixels in sensor depth maps. Otherwise, with
-            a slightly wrong pose, an image sees other surfaces through these holes.
+        fill_holes: Fill holes of one or two pixels in sensor depth maps. If such holes are not
+            filled, an image with a slightly wrong pose sees other surfaces through them.
     """
 
     def __init__(
@@ -158,11 +160,11 @@ class DepthConsistencyCheck:
             b: Another registered image.
             std_factor: See :meth:`check_image`.
             limit: Limit to which the violation ratio is compared. A quarter of the pixels is
-                measured if it shows significantly that the ratio is below or above the limit. NaN
-                measures all pixels.
-            by_target_area: Weight a violating pixel by its area in the other image, at most 1. A
-                near surface may project to few pixels, which refined maps resolve worst. The
-                weights demand clearer evidence against images that are registered already.
+                measured if it shows significantly that the ratio is below or above the limit. A
+                limit of NaN measures all pixels.
+            by_target_area: Weight a violating pixel by its area in the other image, at most 1. The
+                weights reduce the influence of near surfaces, which project to few pixels of the
+                other image, and so demand clearer evidence against registered images.
         """
         scene, options = self._scene, self._options
         rotation = scene.rotations[b] @ scene.rotations[a].T
@@ -269,7 +271,7 @@ class _DepthGrid(NamedTuple):
     log_std: Float32
     """(h, w) standard deviation of the log depth."""
     valid: Bool
-    """(h, w) True where depth is known."""
+    """(h, w) bool mask of the pixels with known depth."""
     nearest: Float32
     """(h, w) smallest depth in the 3 x 3 neighborhood, in world units."""
     intrinsics: Float64

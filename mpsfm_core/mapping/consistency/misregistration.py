@@ -1,4 +1,4 @@
-"""Detection of misregistered images: more matches contradict their pose than support it.
+"""Detection of misregistered images, whose matches mostly contradict their pose.
 
 A match is explained if both of its keypoints observe the same 3D point. If hardly any match of a
 pair of registered images is explained, the matches are wrong or one image is misregistered.
@@ -7,7 +7,8 @@ Misregistered images are detected in three ways.
 1. An image pair has more unexplained matches than the maximum flow of explained matches between its
    images. The images on the smaller side of the minimum cut may be misregistered.
 2. Two images match a third image which cannot be registered, so at most one of the two has a
-   correct pose. Their matches with the third image count as unexplained matches between them.
+   correct pose. The matches of both images with the third image count as unexplained matches
+   between both images.
 3. The unexplained matches of one image clearly outnumber its explained matches, summed over all
    pairs.
 """
@@ -127,13 +128,13 @@ def count_pair_matches(scene: Scene) -> tuple[Int64, Int64]:
 
 
 def compute_widest_paths(capacities: Int64) -> Int64:
-    """Compute the capacity of the widest path between each two nodes (Kruskal's algorithm).
+    """Compute the capacity of the widest path between each two graph nodes (Kruskal).
 
     The capacity of a path is the smallest capacity of its edges, and a lower bound of the maximum
     flow.
 
     Args:
-        capacities: (n, n) symmetric capacities of the edges, 0 without an edge.
+        capacities: (n, n) symmetric capacities of the graph edges, 0 without an edge.
 
     Returns:
         (n, n) symmetric path capacities, 0 for nodes that are not connected.
@@ -216,8 +217,9 @@ def find_contradicted_cuts(
 def _count_separating_matches(registered: Bool, contradicting: Int64) -> Int64:
     """Count the matches (n, n) of each two registered images that contradict their poses.
 
-    The contradicting matches of a pair are its unexplained matches. If both images match an
-    unregistered image, the smaller number of matches with the unregistered image also counts.
+    The contradicting matches of a pair are its unexplained matches. If both images of a pair match
+    an unregistered image, the smaller of both numbers of matches with the unregistered image also
+    counts.
     """
     both_registered = registered[:, None] & registered
     separating = np.where(both_registered, contradicting, 0)

@@ -8,9 +8,9 @@ space.
    inconsistent, other pose hypotheses are checked in the order of their support.
 2. The matches of a pair are weighted by the support of the best depth-consistent pose, relative to
    the best supported pose.
-3. A pair without a consistent pose may still be correct, if few or bad matches make its pose
-   inaccurate. The pair is removed if consistent pairs connect its images by more matches (maximum
-   flow) and imply another relative rotation.
+3. A pair without a depth-consistent pose may still be correct, if few or bad matches make its
+   relative pose inaccurate. The pair is removed if consistent pairs connect its images by more
+   matches (maximum flow) and imply another relative rotation.
 
 Image pairs with fewer matches than a registration needs are not checked.
 """
@@ -104,7 +104,7 @@ class PairConsistencyCheck:
         return replace(problem, pairs=tuple(pairs))
 
     def check_pair(self, pair: VerifiedPair) -> PairConsistency:
-        """Check the depth consistency of an image pair, which passes without a pose hypothesis."""
+        """Check the depth consistency of the relative pose of an image pair."""
         verified = scale_verified_pair(self._scene, pair, self._options.initialization)
         if verified is not None and self._is_consistent(verified):
             return PairConsistency(pair.rotation, 1.0)
@@ -169,8 +169,8 @@ def _average_consistent_pairs(
         num_images: Number of images.
 
     Returns:
-        A sparse matrix (n, n) of the number of matches of every two images, and the rotations (n,
-        3, 3) of the images in one frame per connected component.
+        Sparse matrix (n, n) with the number of matches of each two images, and rotations (n, 3, 3)
+        of the images, in one world frame for each connected component.
     """
     a = np.array([pair.image_a for pair in rotation_of], dtype=np.int64)
     b = np.array([pair.image_b for pair in rotation_of], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Global initialization: poses of all well-connected images from relative poses and depth.
+"""Global initialization of well-connected images from relative poses and depth.
 
 1. Measure the baseline length of each verified pair from depth. Pairs whose triangulated points do
    not fit the depth prior get a low weight, because planar scenes have a second, wrong relative
@@ -82,7 +82,7 @@ class _RelativePoses(NamedTuple):
     translation: Float64
     """(m, 3) relative translations ``b_from_a``, of length 1."""
     log_length: Float64
-    """(m, 2) logarithm of the baseline in the unit of the depth prior of ``a`` and of ``b``."""
+    """(m, 2) log length of the baseline in the units of the depth priors of ``a`` and ``b``."""
     weight: Float64
     """(m,) number of matches of each pair, reduced if depth priors do not fit the triangulated
     points.
@@ -176,7 +176,7 @@ def average_differences(
         num_nodes: Number of nodes.
 
     Returns:
-        (num_nodes, ...) node values with mean 0. Nodes without edges share one value.
+        (num_nodes, ...) node values with mean 0. All graph nodes without edges share one value.
     """
     measured = differences.reshape(len(differences), -1)
     robust_weights = np.ones(len(a))
@@ -216,7 +216,7 @@ def _cauchy_weights(errors: Float64) -> Float64:
 def _chain_rotations(
     a: Int64, b: Int64, b_from_a: Float64, weights: Float64, num_images: int
 ) -> Float64:
-    """Chain relative rotations along the maximum spanning tree."""
+    """Chain relative rotations along the maximum spanning tree of the view graph."""
     graph = coo_matrix((1 / weights, (a, b)), shape=(num_images, num_images)).tocsr()
     tree = minimum_spanning_tree(graph)
     order, parents = breadth_first_order(tree, int(a[0]), directed=False)
@@ -296,11 +296,11 @@ def find_cycle_edges(a: Int64, b: Int64, num_nodes: int) -> Bool:
 
     Args:
         a: (m,) index of the first node of each edge.
-        b: (m,) index of the second node of each edge. No pair of nodes occurs twice.
+        b: (m,) index of the second node of each edge. No pair of graph nodes may occur twice.
         num_nodes: Number of nodes.
 
     Returns:
-        (m,) bool, True for edges on a cycle.
+        (m,) bool mask of the graph edges on a cycle.
     """
     root = num_nodes  # an extra root node joins the spanning trees of all components
     component_nodes = np.unique(label_components(a, b, num_nodes), return_index=True)[1]

@@ -1,1 +1,1 @@
-"""Bundle adjustment, depth refinement, filtering, and measurement of their noise."""
+"""Bundle adjustment, depth refinement, point filtering, and measurement of noise."""

@@ -45,7 +45,8 @@ MAX_NEIGHBOR_DISTANCE = 1 / 8
 """Maximum distance between a pixel and a well-constrained point, relative to the width of the depth
 map. Errors of depth priors do not correlate at larger distances. [ours]"""
 GRID_SIZE = 16
-"""Columns and rows of the grid of nodes on which the local noise is measured. [ours]"""
+"""Columns and rows of the grid of image positions at which the local depth noise is measured.
+[ours]"""
 
 
 class DepthNoise(NamedTuple):
@@ -90,7 +91,7 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
     variance counts as one additional residual (a unit information prior).
 
     Returns:
-        The measured noise, or the declared noise if too few residuals exist.
+        Measured depth noise, or the declared noise if too few residuals exist.
     """
     residuals, groups = _cross_view_residuals(scene)
     if len(residuals) < MIN_RESIDUALS:
@@ -198,9 +199,10 @@ def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
 
 
 def _clustering(values: Float64, groups: Int64) -> tuple[float, float]:
-    """Return the intraclass correlation r and the design effect ``1 + (mean size - 1) * r``.
+    """Return the intraclass correlation r of residual groups, and their design effect.
 
-    The correlation is estimated by one-way analysis of variance.
+    The intraclass correlation is estimated by one-way analysis of variance, and the design effect
+    is ``1 + (mean group size - 1) * r``.
     """
     _, group, sizes = np.unique(groups, return_inverse=True, return_counts=True)
     count, total = len(sizes), len(values)

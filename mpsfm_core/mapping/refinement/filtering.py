@@ -24,7 +24,7 @@ def filter_points(
 
     Args:
         scene: The scene.
-        options: The options ``max_error_px`` and ``min_angle_deg`` are used.
+        options: Triangulation options with the limits ``max_error_px`` and ``min_angle_deg``.
         images: Images whose observed points are filtered, or None to filter all points.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Self-calibration: decide which guessed focal lengths bundle adjustment may change.
+"""Self-calibration decisions about the guessed focal lengths that bundle adjustment estimates.
 
 Bundle adjustment estimates log focal lengths with a normal prior, whose standard deviation depends
 on the source of the guess (EXIF, a network, or a default). A camera takes the estimated focal
@@ -24,8 +24,9 @@ def decide_focal_outcome(
 
     Args:
         equivalent_mm: The estimated focal length as 35 mm equivalent.
-        posterior_std: Standard deviation of the log focal length given observations and prior.
-        prior_std: Standard deviation of the log focal length given the prior.
+        posterior_std: Posterior standard deviation of the log focal length, given observations and
+            prior.
+        prior_std: Prior standard deviation of the log focal length.
     """
     if not is_plausible_equivalent(equivalent_mm):
         return FocalOutcome.OUT_OF_RANGE

@@ -173,7 +173,7 @@ class Refiner:
                         scene.maps[image].set_scale(float(np.exp(np.median(log_scales))))
 
     def integrate(self, images: list[int]) -> None:
-        """Refine the depth maps of images with the current points.
+        """Refine the depth maps of images by depth integration with the current points.
 
         Images whose depth scale is unknown are skipped.
         """
@@ -285,10 +285,10 @@ class Refiner:
                 break
 
     def refine_globally(self, *, final: bool = False) -> None:
-        """Adjust all images and update all tracks until few tracks change, then refine depth maps.
+        """Adjust all images and update tracks until few tracks change, then refine depth maps.
 
         Args:
-            final: Sharpen the depth loss by ``FINAL_DEPTH_SCALE``.
+            final: Sharpen the depth loss by the factor ``FINAL_DEPTH_SCALE``.
         """
         images = [int(i) for i in self.scene.registered_images()]
         complete_and_merge_tracks(self.scene, self.triangulation, create=True)
@@ -510,7 +510,7 @@ class Refiner:
             observed_by: Images whose observed points get valid covariances and angles.
 
         Returns:
-            Covariances (p, 3, 3) and angles in degrees (p,).
+            Point covariances (p, 3, 3), and triangulation angles (p,) in degrees.
         """
         scene, tracks = self.scene, self.scene.tracks
         observations = tracks.observations()

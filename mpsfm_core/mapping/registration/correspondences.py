@@ -69,8 +69,8 @@ def find_correspondences(
     """Collect the 2D-3D correspondences of an image with the given registered images.
 
     A match uses the triangulated point of its keypoint if the triangulation angle suffices.
-    Otherwise the 3D point lies on the part of the matched keypoint's ray that the depth prior
-    allows.
+    If the angle is too small, the 3D point lies on the part of the matched keypoint's ray that the
+    depth prior allows.
 
     Args:
         scene: The scene with the registered images.
@@ -119,7 +119,7 @@ def _depth_weights(depth_known: Bool) -> Float64:
 def _depth_ranges(
     scene: Scene, keypoints: Int64, options: RegistrationOptions
 ) -> tuple[Float64, Float64, Bool]:
-    """Return the depth (m,) of keypoints, half its log range (m,), and a mask (m,) of known depth.
+    """Return the depth (m,), half its log range (m,) and known-depth mask (m,) of keypoints.
 
     A keypoint of unknown depth gets the range of the known depths in its image, or depth 0 if no
     depth of the image is known.

@@ -37,7 +37,7 @@ def rank_next_images(
         scene: The scene with the registered images.
         scores: (n, n) matching scores from :func:`compute_pair_scores`.
         candidates: (n,) bool mask of the images that may be registered.
-        options: The option ``next_view`` selects the ranking criterion.
+        options: Registration options, where ``next_view`` selects the ranking criterion.
 
     Returns:
         Candidate images, each with the registered image that it matches best.

@@ -160,7 +160,7 @@ class IncrementalRegistration:
     def _register_image(
         self, image: int, references: list[int], *, refine_globally: bool = False
     ) -> Reason | None:
-        """Register an image with its first pose that passes verification.
+        """Register an image with the first of its estimated poses that passes verification.
 
         Args:
             image: The image to register.

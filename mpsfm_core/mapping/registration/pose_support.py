@@ -1,4 +1,4 @@
-"""Support of a pose by 2D-3D correspondences, and its local maximization.
+"""Support of a pose by 2D-3D correspondences, and local pose refinement.
 
 The ray of a matched keypoint, between the nearest and farthest depth that the depth prior allows,
 projects to a segment in the new image. A correspondence is an inlier if its keypoint is close to

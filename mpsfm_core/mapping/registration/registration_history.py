@@ -50,7 +50,7 @@ class RegistrationHistory:
         return self._last_attempts[image].pose if image in self._last_attempts else None
 
     def is_exhausted(self, image: int, references: list[int]) -> bool:
-        """Return True if pose estimation with these reference images would repeat the last one.
+        """Return True if pose estimation from these reference images would repeat the last attempt.
 
         The first pose estimations of an image differ, because each draws other random halves of the
         matches.
@@ -71,11 +71,11 @@ class RegistrationHistory:
         self._contradicting[registered_image].add(new_image)
 
     def pop_contradicted_image(self, registered: Bool) -> tuple[int, int] | None:
-        """Return the registered image that most rejected images contradict, and their number.
+        """Return the registered image that the most rejected images contradict, and their number.
 
         If the depth of a new and a registered image contradict each other, the pose of the
-        registered image may be wrong. Each registered image is returned at most once. Returning an
-        image clears its record of contradictions.
+        registered image may be wrong. Each registered image is returned at most once. The
+        contradictions of the returned image are removed from the record.
 
         Args:
             registered: (n,) bool mask of the images that are registered at present.

@@ -48,7 +48,7 @@ def convert_scene(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
     """Convert the scene to a reconstruction, in meters if the metric scale is reliable.
 
     Args:
-        scene: The scene, whose tracks lose the rows of deleted points.
+        scene: The scene, from whose tracks the rows of deleted points are removed.
         keep_units: Keep the unit of the world instead of scaling to meters.
     """
     scene.tracks.compact()

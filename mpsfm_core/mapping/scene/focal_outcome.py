@@ -1,4 +1,4 @@
-"""Outcome of self-calibration: the decision about the guessed focal length of a camera."""
+"""Outcome of self-calibration for the guessed focal length of a camera."""
 
 from __future__ import annotations
 

@@ -20,14 +20,14 @@ class CorrespondenceGraph:
         offsets: (n + 1,) int64 global number of the first keypoint of each image, and the total.
         num_images: Number of images.
         image_of: (k,) int64 image index of each global keypoint.
-        source: (e,) int64 global keypoint at the start of each edge.
-        target: (e,) int64 global keypoint at the end of each edge.
-        score: (e,) float64 score of the match of each edge, in [0.05, 1].
+        source: (e,) int64 global number of the first keypoint of each match.
+        target: (e,) int64 global number of the second keypoint of each match.
+        score: (e,) float64 score of each match, in [0.05, 1].
         pair_scores: (p,) float64 summed match scores of each image pair.
-        pairs_of: For each image, the indices of the pairs that contain it.
-        keypoint_weight: (k,) float64 weight of the squared reprojection error of a keypoint: the
-            score of its best match relative to the mean score, divided by the reduction of its
-            variance by keypoint adjustment.
+        pairs_of: Verified pairs that contain each image.
+        keypoint_weight: (k,) float64 weight of the squared reprojection error of each keypoint. The
+            weight is the score of the best match relative to the mean score, divided by the ratio
+            of the keypoint variances after and before keypoint adjustment.
     """
 
     def __init__(self, problem: MappingProblem, *, weigh_by_score: bool = True) -> None:

@@ -1,4 +1,4 @@
-"""Compiled kernels for tracks: sorting of observations and triangulation angles."""
+"""Compiled kernels that sort the observations of tracks and compute triangulation angles."""
 
 from __future__ import annotations
 

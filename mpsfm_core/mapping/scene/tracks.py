@@ -37,7 +37,7 @@ class Tracks:
         return np.bincount(observed, minlength=len(self.xyz)).astype(np.int64)
 
     def observations(self) -> Int64:
-        """Return the global keypoints that observe a point, sorted by point, then by keypoint."""
+        """Return the global numbers of keypoints that observe a point, sorted by point."""
         keypoints: Int64 = sort_keypoints_by_point(self.point_of, len(self.xyz))
         return keypoints
 
@@ -50,7 +50,7 @@ class Tracks:
         """
         row_of = np.full(len(self.xyz) + 1, NO_POINT, dtype=np.int64)
         row_of[points] = np.arange(len(points))
-        row_of_keypoint = row_of[self.point_of]  # keypoints without a point read the last entry
+        row_of_keypoint = row_of[self.point_of]  # a keypoint without a point reads the last row
         keypoints = sort_keypoints_by_point(row_of_keypoint, len(points))
         return keypoints, row_of_keypoint[keypoints]
 
