@@ -123,7 +123,7 @@ class CompactNetwork(nn.Module):
         strangers = [key for key in strangers if not key.endswith("num_batches_tracked")]
         if strangers or unexpected:
             raise ValueError(
-                f"the weights are not those of EfficientNet-lite0: {strangers + unexpected}"
+                f"the checkpoint is not of EfficientNet-lite0: {strangers + unexpected}"
             )
 
     def freeze_depthwise(self) -> None:

@@ -42,11 +42,11 @@ class DepthAnything3:
         try:
             load_model(as_published(self._network), path)
         except (SafetensorError, OSError) as error:
-            raise WeightsError(f"{path} is not a safetensors file: {error}") from error
+            raise WeightsError(f"the file {path} is not a safetensors file: {error}") from error
         except RuntimeError as error:
             reason = str(error).splitlines()[1].strip()
             raise WeightsError(
-                f"{path} does not fit the network {options.network}: {reason}"
+                f"the weights file {path} does not fit the network {options.network}: {reason}"
             ) from error
         self._network.to(self._device)
 

@@ -44,7 +44,7 @@ class AdalamMatcher:
         features_a, features_b = require_features("adalam matches features", features_a, features_b)
         if features_a.descriptors.shape[1] != features_b.descriptors.shape[1]:
             raise ProviderError(
-                f"descriptors of {view_a.name!r} and {view_b.name!r} differ in dimension"
+                f"the descriptors of {view_a.name!r} and {view_b.name!r} differ in dimension"
             )
         if min(len(features_a), len(features_b)) < _FEWEST:
             return _matches(np.empty((0, 2)), np.empty(0))

@@ -33,12 +33,12 @@ def load_state(module: torch.nn.Module, state: dict[str, Any], uri: str) -> None
     try:
         mismatch = module.load_state_dict(state, strict=False)
     except RuntimeError as error:  # shapes
-        raise WeightsError(f"{uri} is a weights file for another network: {error}") from error
+        raise WeightsError(f"the weights file {uri} is for another network: {error}") from error
     learned = {name for name, _ in module.named_parameters()}
     learned |= {name for name, _ in module.named_buffers() if "running_" in name}
     if missing := sorted(learned & set(mismatch.missing_keys)):
         raise WeightsError(
-            f"{uri} is a weights file for another network: it has no {', '.join(missing[:3])}"
+            f"the weights file {uri} is for another network: {', '.join(missing[:3])} are missing"
         )
     module.eval()
 

@@ -100,7 +100,7 @@ def arguments(constructor_call: str) -> dict[str, Any]:
     """Parse the constructor call that a MASt3R checkpoint stores, without executing it."""
     call = ast.parse(constructor_call.replace("inf", _INFINITE), mode="eval").body
     if not (isinstance(call, ast.Call) and ast.unparse(call.func) == AsymmetricMASt3R.__name__):
-        raise SystemExit(f"the checkpoint is not of MASt3R but of {constructor_call}")
+        raise SystemExit(f"the checkpoint stores another network than MASt3R: {constructor_call}")
     given = {str(word.arg): ast.literal_eval(word.value) for word in call.keywords}
     return {**given, "patch_embed_cls": "PatchEmbedDust3R", "landscape_only": False}
 

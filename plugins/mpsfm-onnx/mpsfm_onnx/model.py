@@ -90,7 +90,9 @@ def _open(path: Path, context: ProviderContext) -> onnxruntime.InferenceSession:
         session = onnxruntime.InferenceSession(str(path), settings, providers=providers)
     except Exception as error:  # the exceptions of onnxruntime share no base class
         reason = str(error).strip().splitlines()[0]
-        raise WeightsError(f"{path} cannot be opened as an ONNX model: {reason}") from error
+        raise WeightsError(
+            f"the file {path} cannot be opened as an ONNX model: {reason}"
+        ) from error
     if not set(wanted) <= set(
         session.get_providers()
     ):  # onnxruntime may list CUDA as available although the CUDA libraries are missing

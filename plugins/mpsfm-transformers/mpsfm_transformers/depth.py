@@ -38,7 +38,7 @@ class HubDepth:
         config = self._model.network.config
         if config.model_type == _PROMPTED:
             raise ConfigError(
-                f"{options.model} needs depth maps of a sensor: use the provider "
+                f"the model {options.model} needs depth maps of a sensor: use the provider "
                 f"prompt-depth-anything"
             )
         self._output, self._metric = resolve_output(config, options)
@@ -81,7 +81,9 @@ class PromptDepth:
         self._model = LoadedModel(AutoModelForDepthEstimation, options, context)
         family = self._model.network.config.model_type
         if family != _PROMPTED:
-            raise ConfigError(f"{options.model} is of the family {family!r}, not {_PROMPTED!r}")
+            raise ConfigError(
+                f"the model {options.model} is of the family {family!r}, not {_PROMPTED!r}"
+            )
         files = DepthFileOptions(
             directory=options.directory,
             suffix=options.suffix,
@@ -116,7 +118,7 @@ def resolve_output(config: Any, options: DepthOptions) -> tuple[Output, bool]:
     """
     family = config.model_type
     if family == "chmv2":
-        raise ConfigError(f"{options.model} predicts the height of trees, not depth")
+        raise ConfigError(f"the model {options.model} predicts the height of trees, not depth")
     metric = family in _METRIC or family == "depth_pro"
     if family == "depth_anything":
         metric = config.depth_estimation_type == "metric"

@@ -88,7 +88,8 @@ def _explained(model: str) -> Iterator[None]:
     except Exception as error:  # the errors of transformers share no base class
         reason = str(error).strip().splitlines() or [""]
         raise WeightsError(
-            f"{model} cannot be loaded by transformers: {type(error).__name__}: {reason[0]}"
+            f"the model {model} cannot be loaded by transformers: "
+            f"{type(error).__name__}: {reason[0]}"
         ) from error
 
 
