@@ -106,7 +106,8 @@ class Config(Options):
     """Detector-free matcher, instead of or in addition to the sparse matcher."""
     retrieval: ProviderConfig | None = None
     multiview: ProviderConfig | None = None
-    """Network that predicts depth for groups of images; needed by ``depth: {use: multiview}``."""
+    """Multi-view network that predicts depth for groups of images, needed by ``depth: {use:
+    multiview}``."""
     depth: ProviderConfig
     normals: ProviderConfig
     """Provider of normals; ``use: same-network`` uses the normals of the depth network."""
@@ -133,7 +134,7 @@ class Config(Options):
         return config
 
     def provider_configs(self) -> Iterator[tuple[SettingPath, Kind, ProviderConfig]]:
-        """Yield path, kind and block of every provider, in the order of resolution."""
+        """Yield YAML path, provider kind and block of every named provider."""
         if self.fast_pass is not None:
             yield ("fast_pass", "features"), "features", self.fast_pass.features
             yield ("fast_pass", "matcher"), "matcher", self.fast_pass.matcher
@@ -198,7 +199,7 @@ PROVIDER_BLOCKS: dict[str, Kind] = {
     "depth": "depth",
     "normals": "normals",
 }
-"""Configuration blocks with one provider, and the kind of the provider."""
+"""Configuration blocks that name one provider, with the kind of this provider."""
 
 BLOCKS = ("fast_pass", *PROVIDER_BLOCKS, "masks")
 """Configuration blocks that name providers, in the order of provider resolution."""

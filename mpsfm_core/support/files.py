@@ -32,7 +32,7 @@ _log = logging.getLogger(__name__)
 _SCRATCH = ".mpsfm-"
 _TEMPORARY = ".tmp"
 _GRACE_S = 60.0
-"""Age in seconds below which a temporary file may not be locked yet by its writer."""
+"""Age in seconds below which the writer of a temporary file may not have locked the file yet."""
 _READY = "ready.json"
 """File in a scratch folder that lists the output files and folders to replace. The replacement is
 committed as soon as ``ready.json`` exists."""

@@ -25,7 +25,7 @@ def check_version(
     Args:
         content: Content of the file by key.
         known: Newest format version that the caller can read.
-        path: Path of the file, for messages.
+        path: Path of the file, for error messages.
         error: Exception class to raise if the format version cannot be read.
 
     Raises:

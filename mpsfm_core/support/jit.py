@@ -35,7 +35,7 @@ def kernel(**options: Any) -> Callable[[F], F]:
     nan, as in numpy.
 
     Args:
-        options: Keyword arguments of :func:`numba.njit`.
+        options: Keyword arguments that are passed on to :func:`numba.njit`.
     """
 
     def decorate(function: F) -> F:

@@ -45,11 +45,14 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
             with zipfile.ZipFile(file) as archive:
                 size = sum(entry.file_size for entry in archive.infolist())
             if size > max(MAX_BYTES, path.stat().st_size):
-                raise ValueError(f"unpacks to {size / 1e6:.0f} MB, {MAX_BYTES / 1e6:.0f} at most")
+                raise ValueError(
+                    f"the file unpacks to {size / 1e6:.0f} megabytes, but only "
+                    f"{MAX_BYTES / 1e6:.0f} are allowed"
+                )
             file.seek(0)
             with np.load(file, allow_pickle=False) as arrays:
                 return {name: arrays[name] for name in arrays.files}
         except (OSError, ValueError):
             raise
         except Exception as error:  # zipfile and numpy raise unrelated exception classes
-            raise ValueError(f"is damaged: {type(error).__name__}: {error}") from error
+            raise ValueError(f"the NPZ file is damaged: {type(error).__name__}: {error}") from error

@@ -33,7 +33,7 @@ def count_cores(groups: ControlGroups | None = None) -> int:
     cores.
 
     Args:
-        groups: Control groups with a CPU quota; default: the control groups of this process.
+        groups: Linux control groups with a CPU quota, by default those of this process.
     """
     if hasattr(os, "sched_getaffinity"):
         available = len(os.sched_getaffinity(0))

@@ -28,7 +28,7 @@ _SCALARS = (
 class _Loader(yaml.SafeLoader):
     """Loader of YAML 1.2 scalars that rejects repeated keys."""
 
-    yaml_implicit_resolvers = {}  # noqa: RUF012  (PyYAML's class attribute, filled below)
+    yaml_implicit_resolvers = {}  # noqa: RUF012  (class attribute of PyYAML)
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Hashable, Any]:
         keys = [self.construct_object(key, deep=True) for key, _ in node.value]

@@ -71,7 +71,7 @@ class CheckResult:
     """Outcome of the check, where ``xfail`` is a failure that the ContractSetup declares as
     expected."""
     message: str
-    """Reason of a failure or skip, or the remark of a check that passed."""
+    """Reason why the check failed or was skipped, or the remark of a check that passed."""
     seconds: float
     """Run time of the check in seconds."""
 
@@ -81,7 +81,7 @@ class CheckTask:
     """One contract check to run on one provider."""
 
     id: str
-    """Id of the check."""
+    """Id of the contract check."""
     around: str
     """Provider kind that a wrapper under test wraps, else empty."""
 
@@ -105,13 +105,13 @@ class Contract:
         """Prepare the contract of a provider without constructing the provider.
 
         Args:
-            registry: Registry that contains the provider.
+            registry: Registry of the installed providers.
             kind: Kind of the provider, such as ``depth``.
-            name: Name of the provider.
+            name: Name of the provider under test.
             folder: Folder for the weights files of test networks.
-            setup: ContractSetup, or function that returns one; by default the function of the
+            setup: ContractSetup, or a function that returns one; by default that of the
                 specification.
-            device: ``"cpu"`` or ``"cuda"``.
+            device: Device of the provider, ``"cpu"`` or ``"cuda"``.
 
         Raises:
             ProviderError: the provider does not exist or is unavailable.
@@ -209,13 +209,13 @@ def run_checks(
     """Run the contract checks of a provider.
 
     Args:
-        registry: Registry that contains the provider.
+        registry: Registry of the installed providers.
         kind: Kind of the provider, such as ``depth``.
-        name: Name of the provider.
-        setup: ContractSetup, or function that returns one; by default the function of the
-            specification.
-        only: Ids of the checks to run; None runs all.
-        device: ``"cpu"`` or ``"cuda"``.
+        name: Name of the provider under test.
+        setup: ContractSetup, or a function that returns one, by default the function that the
+            specification names.
+        only: Ids of the contract checks to run, or None to run all.
+        device: Device of the provider, ``"cpu"`` or ``"cuda"``.
         on_result: Function that is called with the result of each check.
 
     Returns:

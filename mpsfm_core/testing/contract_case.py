@@ -44,7 +44,7 @@ AUXILIARY_RELATIVE_STD = 0.02
 class ContractSetup:
     """Declaration of how to test a provider: its options and the source of the ground truth.
 
-    A plugin returns a ContractSetup from the function ``contract(folder: Path)`` that
+    A plugin returns a ContractSetup from the function ``contract(folder)`` that
     ``ProviderSpec.contract`` names. The argument ``folder`` is an empty temporary folder for test
     weights.
 
@@ -101,9 +101,9 @@ class ContractCase:
         """Create the contract case without constructing the provider.
 
         Args:
-            registry: Registry that contains the provider.
+            registry: Registry of the installed providers.
             spec: Specification of the provider.
-            setup: ContractSetup of the provider.
+            setup: ContractSetup of the provider under test.
             folder: Folder for the files of helper providers, such as a detector for a matcher.
             behaves_as: Kind of the provider inside a wrapper, or None if the provider under test is
                 not a wrapper.
@@ -131,7 +131,7 @@ class ContractCase:
         return self.setup.truth_source or ("image" if from_image else "none")
 
     def declares(self, capability: Capability) -> bool:
-        """Return whether the provider's specification declares a capability."""
+        """Return whether the specification of the provider lists a capability."""
         return capability in self.spec.capabilities
 
     def require_truth(self, *sources: TruthSource) -> None:
@@ -146,7 +146,7 @@ class ContractCase:
                 "(docs/contract.md)"
             )
         if self.truth_source not in sources:
-            raise CheckSkipped(f"does not apply to truth_source={self.truth_source!r}")
+            raise CheckSkipped(f"the check does not apply to truth_source={self.truth_source!r}")
 
     @property
     def example(self) -> Example:
@@ -198,7 +198,7 @@ class ContractCase:
         """Run the provider on a modified copy of a synthetic view and validate the output.
 
         Args:
-            view: Modified view that replaces ``example.view``.
+            view: Modified image that replaces the image ``example.view``.
             example: Synthetic view that supplies all other inputs.
             provider: Provider instance to use instead of the one that all checks share.
             auxiliary: Depth or features for the provider, by default from
@@ -235,7 +235,7 @@ class ContractCase:
         return validation.run_matcher(self._validated_spec, self.provider, views, features)
 
     def run_on_group(self, *examples: Example) -> MultiViewPrior:
-        """Run a multi-view provider on several synthetic views and validate the group prior."""
+        """Run a multi-view provider on several synthetic views and validate the output."""
         self.prepare(*examples)
         views = [example.view for example in examples]
         return validation.run_multiview(self._validated_spec, self.provider, views)

@@ -20,7 +20,7 @@ class GroundTruthOptions(Options):
     variance: bool = True
     """True if the returned depth and normals have a variance."""
     metric: bool = True
-    """True if the returned depth is declared metric."""
+    """True if the returned depth has the flag ``metric``."""
     scale: float = 1.0
     """Factor by which the true depth is multiplied."""
 

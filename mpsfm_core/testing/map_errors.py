@@ -1,4 +1,4 @@
-"""Errors of depth and normal maps, such as angles, ray length instead of z, and pixel shifts."""
+"""Errors of depth and normal maps, such as angles, pixel shifts, ray length instead of z."""
 
 from __future__ import annotations
 

@@ -27,12 +27,12 @@ def contract_tests(
     Args:
         kind: Kind of the provider, such as ``depth``.
         name: Name of the provider.
-        setup: ContractSetup, or function that returns one; by default the function of the
+        setup: ContractSetup, or a function that returns one; by default that of the
             specification.
-        registry: Registry that contains the provider; by default all installed plugins.
+        registry: Registry of providers, by default all installed plugins.
 
     Returns:
-        Parametrized function for a test module.
+        Parametrized pytest function to assign in a test module.
 
     Raises:
         ProviderError: the provider does not exist or is unavailable.

@@ -265,9 +265,9 @@ def test_compressed_file_size_is_limited(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(npz, "MAX_BYTES", 1_000_000)
     path = tmp_path / "depth.npz"
     np.savez_compressed(path, depth=np.zeros((1000, 1000), np.float32))
-    with pytest.raises(InputError, match="unpacks to 4 MB, 1 at most"):
+    with pytest.raises(InputError, match="unpacks to 4 megabytes, but only 1 "):
         read_arrays(path, "depth")
-    with pytest.raises(InputError, match="unpacks to 4 MB, 1 at most"):
+    with pytest.raises(InputError, match="unpacks to 4 megabytes, but only 1 "):
         read_depth_map(path)
     # The array has the size that its header declares.
     np.savez(path, depth=np.zeros((1000, 1000), np.float32))

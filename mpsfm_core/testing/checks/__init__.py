@@ -1,1 +1,1 @@
-"""Contract checks, one module for each provider kind."""
+"""Contract checks of providers, in one module for each provider kind."""

@@ -93,9 +93,9 @@ def check_light_import(case: ContractCase) -> str:
     # The last output line is the result; native code of a plugin may print other lines before.
     seconds, heavy = json.loads(process.stdout.splitlines()[-1])
     if heavy:
-        raise CheckFailed(f"importing {modules[0]!r} imports {' '.join(heavy)}")
+        raise CheckFailed(f"the plugin module {modules[0]!r} imports {' '.join(heavy)}")
     if seconds > MAX_IMPORT_S:
-        raise CheckFailed(f"importing {modules[0]!r} takes {seconds:.1f} s")
+        raise CheckFailed(f"importing the plugin module {modules[0]!r} takes {seconds:.1f} s")
     return f"{seconds:.3f} s to import"
 
 
@@ -117,8 +117,8 @@ print(json.dumps([seconds, sorted(set(heavy) & (set(sys.modules) - before))]))
 def check_output_rules(case: ContractCase) -> None:
     """Require that the provider's output passes the validator.
 
-    The validator checks type, dtype, shape and values, and the fields of the declared capabilities.
-    If ``output-rules`` fails, all checks that call the provider are skipped.
+    The output validator checks type, dtype, shape and values, and the fields that the provider's
+    capabilities require. If ``output-rules`` fails, all checks that call the provider are skipped.
     """
     case.run(case.example)
 
@@ -161,14 +161,14 @@ def check_inputs_unchanged(case: ContractCase) -> None:
     for name, old, new in zip(("image", "mask", "depth or features"), before, after, strict=True):
         difference = describe_difference(old, new)
         if difference:
-            raise CheckFailed(f"modifies its input {name}: {difference}")
+            raise CheckFailed(f"the provider modifies its input {name}: {difference}")
 
 
 def check_name_does_not_matter(case: ContractCase) -> None:
     """Require that the output does not depend on the name of the view.
 
-    The cache of a run identifies an image by its pixels, not by its name. Providers that read files
-    declare the capability ``uncached``.
+    The cache of a run identifies an image by its pixels, not by its name. Providers that read a
+    file per image declare the capability ``uncached``.
     """
     if case.declares("uncached"):
         raise CheckSkipped("declares 'uncached'")
@@ -193,13 +193,14 @@ def check_intrinsics_declared(case: ContractCase) -> None:
     camera = case.example.camera
     longer = replace(camera, fx=1.3 * camera.fx, fy=1.3 * camera.fy)
     answer = case.run_on_view(replace(case.example.view, camera=longer), case.example)
-    # Only the subset of normals that face the camera may change with the focal length.
+    # With the focal length only the subset of normals that face the camera may change.
     if isinstance(expected, NormalPrior):
         expected, answer = _select_valid_in_both(expected, answer)
     difference = describe_difference(expected, answer)
     if difference:
         raise CheckFailed(
-            f"depends on the focal length without declaring 'intrinsics-aware': {difference}"
+            f"the output depends on the focal length, but the provider does not declare "
+            f"'intrinsics-aware': {difference}"
         )
 
 
@@ -232,7 +233,7 @@ def check_threads(case: ContractCase) -> None:
         thread.join()
     for expected, answer in zip(alone, parallel, strict=True):
         if isinstance(answer, Exception):
-            raise CheckFailed(f"in two parallel threads: {answer}") from answer
+            raise CheckFailed(f"the provider fails in two parallel threads: {answer}") from answer
         _require_same(expected, answer, "in two parallel threads")
 
 
@@ -264,9 +265,9 @@ def check_offline(case: ContractCase) -> None:
         except Exception as error:
             if not attempts:
                 raise
-            raise CheckFailed(f"fails without network access: {error}") from error
+            raise CheckFailed(f"the provider fails without network access: {error}") from error
     if attempts:
-        raise CheckFailed(f"opens a network connection: {attempts[0]}")
+        raise CheckFailed(f"the provider opens a network connection: {attempts[0]}")
 
 
 def check_memory_released(case: ContractCase) -> str:
@@ -293,7 +294,7 @@ def check_memory_released(case: ContractCase) -> str:
     finally:
         tracemalloc.stop()
     if retained > _MAX_RETAINED_BYTES:
-        raise CheckFailed(f"retains {retained / 1000:.0f} kB per view")
+        raise CheckFailed(f"the provider retains {retained / 1000:.0f} kB per view")
     return f"retains {max(retained, 0) / 1000:.1f} kB per view"
 
 

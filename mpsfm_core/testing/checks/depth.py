@@ -111,7 +111,7 @@ def check_depth_orientation(case: ContractCase) -> None:
     for what, turn in _ORIENTATIONS.items():
         turned = DepthPrior.from_arrays(turn(prior.depth), valid=turn(prior.valid))
         if _median_deviation_from_truth(turned, case.example) < 0.5 * right:
-            raise CheckFailed(f"the map is {what}")
+            raise CheckFailed(f"the depth map is {what}")
 
 
 def check_depth_validity(case: ContractCase) -> str:
@@ -189,7 +189,7 @@ def check_depth_intrinsics(case: ContractCase) -> str:
 
 
 def check_depth_variance(case: ContractCase) -> str:
-    """Require a variance in m^2: the square of the std that the test network reports."""
+    """Require a depth variance in m^2, the square of the std that the test network reports."""
     case.require_truth("painted", "prepared")
     if case.spec.kind == "wrapper":
         raise CheckSkipped("a wrapper may change the variance")

@@ -1,4 +1,4 @@
-"""Contract checks of features providers."""
+"""Contract checks of providers that detect and describe features."""
 
 from __future__ import annotations
 
@@ -136,7 +136,7 @@ def check_features_descriptors(case: ContractCase) -> str:
     distance = np.linalg.norm(b.keypoints[columns] - true.xy_b, axis=1)
     right = (distance < 3 * max(1.0, a.std_px, b.std_px))[true.visible]
     if len(right) < _MIN_COUNT:
-        raise CheckSkipped(f"only {len(right)} mutual nearest neighbors")
+        raise CheckSkipped(f"the descriptors have only {len(right)} mutual nearest neighbors")
     if right.mean() < _MIN_CORRECT_RATIO:
         raise CheckFailed(f"only {right.mean():.0%} of the nearest descriptors are the same point")
     return f"{right.mean():.0%} of the nearest descriptors are the same point"

@@ -71,7 +71,7 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
 
 
 def check_matcher_no_features(case: ContractCase) -> None:
-    """Require empty output if a view has no features."""
+    """Require that a matcher returns no matches if a view has no features."""
     if not case.declares("sparse"):
         raise CheckSkipped("the matcher needs no features")
     a, b = case.example, case.example.partner

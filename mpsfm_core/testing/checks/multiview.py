@@ -22,9 +22,9 @@ from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 ROTATION_TOLERANCE_DEG = 1.0
-"""Largest accepted error of a predicted relative rotation in degrees. The synthetic views are
-rotated by 4 and 8 degrees relative to the first one, so an inverted or mirrored pose has an error
-of at least 8 degrees."""
+"""Largest accepted error of a predicted relative rotation in degrees. The views of the test are
+rotated by 4 and 8 degrees relative to the first, so an inverted or mirrored pose has an error of at
+least 8 degrees."""
 BASELINE_TOLERANCE = 0.1
 """Largest accepted relative error of the baseline between two views, twice the depth tolerance."""
 FOCAL_TOLERANCE = 0.1
@@ -65,7 +65,7 @@ def check_multiview_own_axis(case: ContractCase) -> str:
 
 
 def check_multiview_one_unit(case: ContractCase) -> str:
-    """Require one common unit for all depth maps of a group.
+    """Require one common unit for all depth maps that are predicted for a group of views.
 
     The mapper estimates only one metric scale for all depth maps of a group of views.
     """
@@ -79,7 +79,7 @@ def check_multiview_one_unit(case: ContractCase) -> str:
 
 
 def check_multiview_poses(case: ContractCase) -> str:
-    """Require ``cam_from_group`` poses of cameras that look along z with y down."""
+    """Require predicted ``cam_from_group`` poses of cameras that look along z with y down."""
     poses, examples = _predict_poses(case)
     worst = 0.0
     for index in range(1, len(examples)):
@@ -100,7 +100,7 @@ def check_multiview_poses(case: ContractCase) -> str:
 
 
 def check_multiview_pose_unit(case: ContractCase) -> str:
-    """Require translations of ``cam_from_group`` in the unit of depth."""
+    """Require that predicted translations have the unit of the predicted depth."""
     poses, examples = _predict_poses(case)
     unit = float(np.exp(np.median(_log_factors(case.run_on_group(*examples), examples))))
     true = _relative(_true_poses(examples), len(examples) - 1)[1]
@@ -133,7 +133,7 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
     off = np.abs(np.log(np.maximum(found, 1e-12) / true)).max(axis=0)
     for name, error in zip(("fx", "fy", "cx", "cy"), off.tolist(), strict=True):
         if error > FOCAL_TOLERANCE:
-            raise CheckFailed(f"{name} is {np.expm1(error):.0%} off")
+            raise CheckFailed(f"the predicted {name} is {np.expm1(error):.0%} off")
     return f"off by {np.expm1(off.max()):.1%}"
 
 
@@ -223,7 +223,7 @@ def _log_factors(group: MultiViewPrior, examples: tuple[Example, ...]) -> list[f
 
 
 def _predict_poses(case: ContractCase) -> tuple[Float64, tuple[Example, ...]]:
-    """Return the predicted poses (n, 3, 4) of a group and its synthetic views."""
+    """Return predicted poses (n, 3, 4) of a group of synthetic views, and the views."""
     if not case.declares("proposes-poses"):
         raise CheckSkipped("the provider does not declare 'proposes-poses'")
     case.require_truth("prepared", "image")

@@ -120,7 +120,7 @@ def check_normals_same_in_larger_view(case: ContractCase) -> str:
 
 
 def check_normals_variance(case: ContractCase) -> str:
-    """Require a variance in rad^2: the square of the angular std that the test network reports."""
+    """Require a variance in rad^2, the square of the angular std that the test network reports."""
     case.require_truth("painted", "prepared")
     if case.spec.kind == "wrapper":
         raise CheckSkipped("a wrapper may change the variance")

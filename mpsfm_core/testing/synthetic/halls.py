@@ -107,7 +107,7 @@ def make_hall_problem(
         map_width: Width of the depth and normal prior maps in pixels.
         keypoint_noise_px: Std of the errors of keypoint positions in pixels.
         wrong_matches: Ratio of wrong matches of each image pair, which connect random keypoints.
-        seed: Seed of scene, points and errors.
+        seed: Seed of the random scene, surface points and errors.
 
     Returns:
         The mapping problem with its true solution.

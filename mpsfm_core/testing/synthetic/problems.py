@@ -61,7 +61,7 @@ def make_mapping_problem(
         links: Image pairs to match, by default all. Image pairs with fewer than 15 common points
             are dropped.
         two_view_tracks: If true, match each surface point in at most one image pair.
-        seed: Seed of points and noise.
+        seed: Seed of the random surface points and noise.
 
     Returns:
         The mapping problem.

@@ -150,7 +150,7 @@ def make_twin_room_problem(
     whichever are more frequent.
 
     Args:
-        seed: Seed of poses, points and errors.
+        seed: Seed of the random poses, surface points and errors.
         errors: Model of the errors of the depth priors, which report the std of these errors. If
             None, the depth priors are exact and report a relative std of 1 %.
         per_room: Number of views per room.
