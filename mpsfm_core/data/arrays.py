@@ -33,16 +33,16 @@ def require_array(owner: object, name: str, dtype: Any, shape: tuple[int | None,
     """
     value = getattr(owner, name)
     if not isinstance(value, np.ndarray):
-        raise DataError(name, f"must be a numpy array, got {type(value).__name__}")
+        raise DataError(name, f"value must be a numpy array, got {type(value).__name__}")
     if value.dtype != np.dtype(dtype):
-        raise DataError(name, f"must have dtype {np.dtype(dtype)}, got {value.dtype}")
+        raise DataError(name, f"array must have dtype {np.dtype(dtype)}, got {value.dtype}")
     matches = value.ndim == len(shape) and all(
         required is None or required == size
         for required, size in zip(shape, value.shape, strict=False)
     )
     if not matches:
         required_shape = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
-        raise DataError(name, f"must have shape {required_shape}, got {value.shape}")
+        raise DataError(name, f"array must have shape {required_shape}, got {value.shape}")
     view = value.view()
     view.flags.writeable = False
     object.__setattr__(owner, name, view)
@@ -57,10 +57,10 @@ def require_finite(owner: object, name: str) -> None:
 def require_positive_where_valid(values: Float32, valid: Bool, name: str) -> None:
     """Raise :class:`DataError` if a value is not positive where the mask is True."""
     if ((values <= 0) & valid).any():
-        raise DataError(name, "must be positive where valid")
+        raise DataError(name, "values must be positive at valid pixels")
 
 
 def require_unit_interval(values: Float32, name: str) -> None:
     """Raise :class:`DataError` if a value is outside [0, 1]."""
     if values.size and not (values.min() >= 0 and values.max() <= 1):
-        raise DataError(name, "must lie in [0, 1]")
+        raise DataError(name, "values must lie in [0, 1]")

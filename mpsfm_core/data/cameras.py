@@ -31,7 +31,9 @@ class PinholeCamera:
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
-            raise DataError("camera", f"size must be positive, got {self.width}x{self.height}")
+            raise DataError(
+                "camera", f"width and height must be positive, got {self.width}x{self.height}"
+            )
         if not (np.isfinite([self.fx, self.fy, self.cx, self.cy]).all() and self.fx > 0):
             raise DataError("camera", "intrinsics must be finite and focal lengths positive")
         if self.fy <= 0:

@@ -44,7 +44,7 @@ class ImageReason(ReasonCode):
     TOO_FEW_POINTS = ("too-few-points", "num_matches", "min_matches")
     """Too few keypoints of the image match a keypoint with a 3D point to estimate a pose."""
     NO_POSE = ("no-pose",)
-    """Pose estimation fails for the image."""
+    """Pose estimation from 2D-3D matches fails for the image."""
     TOO_FEW_INLIERS = ("too-few-inliers", "num_inliers", "min_inliers")
     LOW_INLIER_RATIO = ("low-inlier-ratio", "inlier_ratio", "min_inlier_ratio")
     TOO_FEW_POINTS_AFTER_REFINEMENT = ("too-few-points-after-refinement",)
@@ -53,12 +53,12 @@ class ImageReason(ReasonCode):
     ``re-registration`` or ``component-split`` of the mapper."""
     CONTRADICTS_IMAGE = ("contradicts-image", "violation_ratio", "other_image")
     """The depth map of another image contradicts the pose of the image. The ratio
-    ``violation_ratio`` of the compared pixels is inconsistent."""
+    ``violation_ratio`` of the pixels has inconsistent depth."""
     CONTRADICTS_DEPTH = ("contradicts-depth", "violation_ratio", "step")
     """The depth maps of other images contradict the pose of the image in a check of all images.
 
-    The ratio ``violation_ratio`` of the compared pixels is inconsistent. The check belongs to the
-    step ``global-initialization`` or ``final-check`` of the mapper.
+    The ratio ``violation_ratio`` of the pixels has inconsistent depth. The mapper checks all
+    images in ``step``, which is ``global-initialization`` or ``final-check``.
     """
     CONTRADICTED_BY_IMAGES = ("contradicted-by-images", "num_images")
     MISREGISTERED = ("misregistered", "num_matches")
@@ -75,7 +75,7 @@ class ImageReason(ReasonCode):
     OTHER_COMPONENT = ("other-component", "component")
     """The image is registered in another component (model), in folder components/<component>."""
     NO_KNOWN_POSE = ("no-known-pose",)
-    """The user gives fixed camera poses, and this image has none."""
+    """The user gives fixed camera poses, but no pose for this image."""
     NOT_RECORDED = ("not-recorded",)
 
 
@@ -87,7 +87,7 @@ class PairReason(ReasonCode):
     DEGENERATE = ("degenerate", "num_inliers", "num_matches", "geometry")
     """COLMAP classifies the two-view geometry as degenerate, watermark or undefined."""
     EXPLAINED_BY_CHANCE = ("explained-by-chance", "num_inliers", "num_matches")
-    """Random matches would have as many inliers (a-contrario test)."""
+    """Random matches between the images would have as many inliers (a-contrario test)."""
     NO_RELATIVE_POSE = ("no-relative-pose",)
 
 
@@ -167,7 +167,7 @@ class Reason:
         """Check that the reason has a value for each field of its code, and no other values."""
         if set(self.values) != set(self.code.fields):
             wanted = ", ".join(self.code.fields) or "no field"
-            raise DataError(self.code.value, f"needs {wanted}, got {', '.join(self.values)}")
+            raise DataError(self.code.value, f"reason needs {wanted}, got {', '.join(self.values)}")
 
     def to_json(self) -> dict[str, Value]:
         """Convert the reason to the dictionary in ``summary.json``."""
@@ -178,7 +178,7 @@ def reason_from_json(codes: type[Code], stored: Mapping[str, Any]) -> Reason:
     """Restore a reason from the output of :meth:`Reason.to_json`.
 
     Args:
-        codes: Enumeration of reason codes that contains the code, such as :class:`ImageReason`.
+        codes: Enumeration in which the reason code is looked up, such as :class:`ImageReason`.
         stored: Dictionary with the reason code and the values of its fields.
 
     Raises:
@@ -188,5 +188,5 @@ def reason_from_json(codes: type[Code], stored: Mapping[str, Any]) -> Reason:
     try:
         code = codes(stored["code"])
     except (KeyError, ValueError) as error:
-        raise DataError("reason", f"has no known code: {stored}") from error
+        raise DataError("reason", f"reason has no known code: {stored}") from error
     return Reason(code, values)

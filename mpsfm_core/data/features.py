@@ -67,10 +67,10 @@ class SparseMatches:
         require_array(self, "scores", np.float32, (len(self.indices),))
         require_unit_interval(self.scores, "scores")
         if (self.indices < 0).any():
-            raise DataError("indices", "must not be negative")
+            raise DataError("indices", "feature indices must not be negative")
         for column in self.indices.T:
             if len(np.unique(column)) != len(column):
-                raise DataError("indices", "must use each feature at most once")
+                raise DataError("indices", "matches must use each feature at most once")
 
     @classmethod
     def from_arrays(cls, indices: NDArray[Any], scores: NDArray[Any]) -> SparseMatches:

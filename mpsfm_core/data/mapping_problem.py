@@ -65,11 +65,11 @@ class MappingImage:
         if not self.focal_log_std > 0:
             raise DataError("focal_log_std", "must be positive")
         if self.depth.variance is None:
-            raise DataError("depth", "the mapper needs a variance (calibrate the prior)")
+            raise DataError("depth", "depth prior has no variance; calibrate the prior")
         if self.normals.variance is None:
-            raise DataError("normals", "the mapper needs a variance (calibrate the prior)")
+            raise DataError("normals", "normal prior has no variance; calibrate the prior")
         if self.depth.shape != self.normals.shape:
-            raise DataError("normals", "must be on the grid of the depth map")
+            raise DataError("normals", "normal map must have the size of the depth map")
 
     @property
     def focal_prior_px(self) -> float:
@@ -124,7 +124,7 @@ class VerifiedPair:
 
     def __post_init__(self) -> None:
         if not 0 <= self.image_a < self.image_b:
-            raise DataError("image_a", "must be smaller than image_b")
+            raise DataError("image_a", "image index must be smaller than image_b")
         require_array(self, "matches", np.int64, (None, 2))
         require_array(self, "scores", np.float32, (len(self.matches),))
         require_unit_interval(self.scores, "scores")

@@ -27,7 +27,7 @@ UNIT_NORMAL_TOLERANCE = 1e-3
 class DepthPrior:
     """Depth map with variance, at any resolution of the whole undistorted image.
 
-    Depth and variance at invalid pixels are finite and undefined.
+    Depth and variance at invalid pixels are finite but meaningless.
     """
 
     depth: Float32
@@ -112,7 +112,7 @@ class NormalPrior:
         require_finite(self, "normals")
         length = np.linalg.norm(self.normals[self.valid], axis=-1)
         if length.size and np.abs(length - 1).max() > UNIT_NORMAL_TOLERANCE:
-            raise DataError("normals", "must have unit length where valid")
+            raise DataError("normals", "normals must have unit length at valid pixels")
         if self.variance is not None:
             require_array(self, "variance", np.float32, shape)
             require_finite(self, "variance")
@@ -134,7 +134,7 @@ class NormalPrior:
 
         Args:
             normals: (h, w, 3) normals in the camera frame, any number type and length.
-            variance: (h, w) angular variance in rad^2, or None.
+            variance: (h, w) angular variance of the normals in rad^2, or None.
             valid: (h, w) mask of valid pixels, or None for all True.
             camera: Intrinsics of the view, for the test whether normals face the camera (None omits
                 the test).
@@ -188,17 +188,19 @@ class MultiViewPrior:
     def __post_init__(self) -> None:
         count = len(self.depth)
         if len({prior.metric for prior in self.depth}) > 1:
-            raise DataError("depth", "must be metric in all views of a group or in none")
+            raise DataError(
+                "depth", "depth priors must be metric in all views of a group or in none"
+            )
         if self.poses is not None:
             require_array(self, "poses", np.float64, (count, 3, 4))
             require_finite(self, "poses")
             rotations = self.poses[:, :, :3]
             if not np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-3):
-                raise DataError("poses", "must be rotations and translations (n, 3, 4)")
+                raise DataError("poses", "poses must be rotations and translations (n, 3, 4)")
             if (np.linalg.det(rotations) < 0).any():
                 raise DataError("poses", "must not mirror")
         if self.intrinsics is not None:
             require_array(self, "intrinsics", np.float64, (count, 4))
             require_finite(self, "intrinsics")
             if (self.intrinsics[:, :2] <= 0).any():
-                raise DataError("intrinsics", "must have positive focal lengths")
+                raise DataError("intrinsics", "cameras must have positive focal lengths")

@@ -1,7 +1,7 @@
 """Names of the files and folders that a run writes into its output folder.
 
 Folders that contain a ``summary.json`` are results, so the search for input images skips them. The
-package ``results`` writes the files, and the package ``report`` reads the files.
+package ``mpsfm_core.results`` writes these files, and ``mpsfm_core.report`` reads these files.
 """
 
 SUMMARY = "summary.json"

@@ -53,14 +53,14 @@ from mpsfm_core.support.threads import thread_limit
 
 _T = TypeVar("_T", bound=np.generic)
 _NUM_SOURCES = 5
-"""Maximum number of source views per reference view. Raising it adds depth and takes longer
-[ours]."""
+"""Maximum number of source views per reference view. Raising this number gives more complete depth
+and takes longer [ours]."""
 _MATCH_STD_PX = 0.5
 """Assumed std of a stereo match in pixels, for the tolerance of the consistency check [ours]."""
 _MAX_COST = 0.9
 """Maximum matching cost of a pixel with valid stereo depth [ours]."""
 _MAX_SPLAT_STDS = 1.5
-"""Maximum log depth difference of depth projected from neighbors, in stds of input depth [ours].
+"""Maximum log depth difference between projected neighbor depth and input depth, in stds [ours].
 
 With a larger difference, the projected depth may belong to another surface behind an edge."""
 _MAX_SPLAT_VIEWS = 16
@@ -107,7 +107,8 @@ class StereoCheckpoints(Protocol):
     def load(self, name: str) -> StereoDepth | None:
         """Return the stored stereo depth of an image, or None if there is none.
 
-        Implementations must check that reconstruction, images and options have not changed.
+        Implementations of `load` must check that reconstruction, images and options have not
+        changed.
         """
 
     def save(self, name: str, depth: StereoDepth) -> None:

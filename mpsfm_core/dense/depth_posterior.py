@@ -30,7 +30,7 @@ _MIN_MEASURED_RATIO = 0.3
 _MIN_KNOWN_ERROR_RATIO = 0.5
 """Minimum ratio of the input depth's estimated std to its distance from stereo depth [ours].
 
-The std of stereo depth is itself only known to about 1/8."""
+The std of stereo depth is known with a relative accuracy of about 1/8."""
 MIN_STD = 1e-4
 """Minimum std of log depth, below that of any depth sensor."""
 UNKNOWN_LOG_STD = 1.0

@@ -84,7 +84,8 @@ class _WeightedDepth(NamedTuple):
         """Find the mesh vertices on the surface of the depth map.
 
         Behind object edges the TSDF contains false surfaces, because only some images have depth
-        there. No depth map contains these false surfaces, so this test rejects their vertices.
+        behind the edge. No depth map contains these false surfaces, so the comparison with depth
+        maps rejects the vertices on them.
 
         Args:
             vertices: (n, 3) positions of the vertices, world frame.

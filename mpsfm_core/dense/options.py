@@ -16,7 +16,7 @@ class DenseOptions(Options):
     enabled: bool = True
     """Run multi-view stereo; if False, the results contain the refined depth maps of the mapper."""
     max_size: int = Field(640, ge=64)
-    """Maximum length of a depth map's longer side in pixels; raising it is finer and slower."""
+    """Maximum length of a depth map's longer side in pixels; larger maps are finer and slower."""
     correlation_px: float = expert(40.0, gt=0)
     """Correlation length of the error of the refined depth, in pixels of the depth map."""
 

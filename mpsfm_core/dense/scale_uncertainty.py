@@ -45,7 +45,7 @@ class ScaleConstraints(NamedTuple):
     known: Float64
     """(k,) precision of the log scale difference between the input depth and each stereo pair."""
     known_std: float
-    """Declared std of the input depth map's log scale."""
+    """Prior std of the input depth map's log scale."""
 
 
 def measure_scale_constraints(
@@ -65,7 +65,7 @@ def measure_scale_constraints(
         differences: Source image -> (h, w) log depth differences from
             :func:`~mpsfm_core.dense.geometric_consistency.compare_depths`.
         change: (h, w) log of stereo depth minus log of input depth.
-        known_std: Declared std of the input log depth.
+        known_std: Prior std of the log of input depth.
         correlation_px: Correlation length of depth errors in pixels; a square of this side counts
             as one observation.
     """
@@ -143,7 +143,7 @@ def _world_precision(precision: csr_array, maps: list[int], stds: list[float]) -
     Args:
         precision: (n, n) precision of the constraints between unknown log scales.
         maps: Indices of the unknown log scales that belong to input depth maps.
-        stds: Declared std of each input depth map's log scale.
+        stds: Prior std of each input depth map's log scale.
 
     Returns:
         (n,) precision of each log scale relative to the world, 0 for stereo pairs.

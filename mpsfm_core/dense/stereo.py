@@ -1,7 +1,7 @@
 """Multi-view stereo by plane-sweep along the surface of the input depth, coarse to fine.
 
 Each depth hypothesis (label) is an offset of log depth from the surface of the input depth map. The
-sweep warps all pixels of a label into a source view with their own depth, so that NCC windows
+plane sweep warps all pixels of a label into a source view with their own depth, so that NCC windows
 follow the slant of the surface. Semi-global matching (Hirschmueller, PAMI 2008) aggregates the
 matching costs. The next finer pyramid level searches a few labels around the coarse depth.
 """
@@ -32,7 +32,8 @@ _MAX_LABELS = 96
 _WINDOW_RADIUS = 3
 """Radius of the NCC window in pixels of the pyramid level [ours]."""
 _GRAY_NOISE = 2.0
-"""Std of image noise in gray levels of 255. Raising it treats more texture as noise [ours]."""
+"""Std of image noise in gray levels of 255. Raising this std treats more texture as noise
+[ours]."""
 _MERGED_VIEW_RATIO = 0.5
 """Ratio of source views whose matching costs are averaged, the lowest costs first [ours].
 
@@ -43,7 +44,7 @@ _PRIOR_WEIGHT = 0.02
 _SMALL_STEP_PENALTY = 0.04
 """Penalty P1 of semi-global matching for neighboring pixels one label apart [ours]."""
 _LARGE_STEP_PENALTY = 1.6
-"""Penalty P2 of semi-global matching for larger steps; image edges reduce the penalty [ours]."""
+"""Penalty P2 of semi-global matching for larger label steps, reduced at image edges [ours]."""
 _LEVELS = (2, 1)
 """Downsampling factors of the pyramid levels, coarse to fine."""
 _FINE_LABELS = 5

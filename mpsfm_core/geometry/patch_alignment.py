@@ -92,7 +92,8 @@ def align_patches(
 def _sample_patch(radius: int) -> tuple[Float64, Float64]:
     """Return pixel offsets (q, 2) and Gaussian weights (q,) of the samples of a round patch.
 
-    The samples are every second pixel in a checkerboard pattern, because images are smooth.
+    The samples are every second pixel of the patch in a checkerboard pattern, which suffices for
+    smooth images.
     """
     line = np.arange(-radius, radius + 1, dtype=np.float64)
     x, y = (grid.ravel() for grid in np.meshgrid(line, line))
@@ -194,8 +195,8 @@ def _derive(
 
     The 8 columns of the basis are the window weights, the weighted normalized template, and the
     weighted derivatives by 2 translation and 4 affine parameters. Pixel offsets in the affine
-    derivatives are divided by the radius of the patch. The derivatives are orthogonal to changes of
-    brightness and contrast.
+    derivatives are divided by the radius of the patch. The weighted derivatives are orthogonal to
+    changes of brightness and contrast of the patch.
 
     Args:
         image: (h, w) gray values of the template image.

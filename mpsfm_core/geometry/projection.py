@@ -99,14 +99,14 @@ def resize_map(values: NDArray[Any], width: int, height: int, *, linear: bool = 
     """Resize a map to another number of rows and columns.
 
     Args:
-        values: (h, w) or (h, w, c) map.
+        values: (h, w) or (h, w, c) map, for example of depth or normals.
         width: Number of columns of the resized map.
         height: Number of rows of the resized map.
         linear: If True, average areas to shrink and interpolate bilinearly to enlarge; if False,
             use the nearest pixel.
 
     Returns:
-        (height, width) or (height, width, c) float32.
+        Resized map, (height, width) or (height, width, c) float32.
     """
     import cv2  # The import is local, because OpenCV slows down the start of the command line.
 

@@ -64,8 +64,8 @@ class BundleResult:
     points: Float64
     std_log_focals: Float64
     """(k,) posterior standard deviation of each variable log focal length, from the inverse of the
-    reduced camera system at the solution. The value is NaN for a constant focal length and infinite
-    for an undetermined one."""
+    reduced camera system at the solution. The standard deviation is NaN for a constant focal length
+    and infinite for an undetermined focal length."""
     initial_cost: float
     final_cost: float
     iterations: int
@@ -268,8 +268,8 @@ class SchurComplementSolver:
 
         Returns:
             Cost of the visible observations, actual decrease of the cost, and predicted decrease of
-            the cost. The actual decrease counts observations that become invisible as unchanged. If
-            the system has no finite solution, the cost is infinite.
+            the cost. The actual decrease of the cost treats observations that become invisible as
+            unchanged. If the reduced camera system has no finite solution, the cost is infinite.
         """
         diagonal = self.total.diagonal
         boost = np.where(diagonal > 0, damping * diagonal, 1.0)

@@ -419,13 +419,13 @@ def _add_coupling(
 def _invert_factor(block: Float64, p: int, damping: float) -> bool:
     """Invert the Cholesky factor ``L`` of a point's damped block ``V + damping m I = L L^T``.
 
-    The damping is relative to ``m``, the mean of the diagonal of V. The inverse replaces V in
-    ``block[p, :6]``, and ``m`` is written to ``block[p, 9]``. A point in a single view has no
-    constraint along its ray. Isotropic damping prevents motion along the ray, unlike damping by the
-    diagonal of V.
+    The damping of a point is relative to ``m``, the mean of the diagonal of V. The inverse factor
+    replaces V in ``block[p, :6]``, and ``m`` is written to ``block[p, 9]``. A point in a single
+    view has no constraint along its ray. Isotropic damping prevents motion along the ray, unlike
+    damping by the diagonal of V.
 
     Returns:
-        False if the damped block is not positive definite; V is then unchanged.
+        False if the damped block is not positive definite, in which case V is unchanged.
     """
     block[p, 9] = (block[p, 0] + block[p, 2] + block[p, 5]) / 3.0
     boost = damping * block[p, 9]
@@ -566,7 +566,7 @@ def eliminate_points(
         scratch: Buffers of this range of points.
 
     Returns:
-        Cost of the observations of these points.
+        Cost of the observations of the points ``first:last``.
     """
     obs, layout = bundle.obs, bundle.layout
     slots, focals, columns = scratch.slots, scratch.focals, scratch.columns
@@ -641,8 +641,8 @@ def _joint_step(
 ) -> float:
     """Compute the step ``-V^-1 (g + W^T delta)`` of a point by back-substitution.
 
-    The step is written to ``scratch.vector``. The array ``scratch.before`` receives the cost (-1 if
-    invisible) and depth of each observation.
+    The step of the point is written to ``scratch.vector``. The array ``scratch.before`` receives
+    the cost (-1 if invisible) and depth of each observation.
 
     Returns:
         Predicted decrease of the cost.

@@ -71,15 +71,15 @@ class BundleProblem:
     prior_log_focals: Float64 | None = None
     """(k,) mean of the prior on ``log fx`` of each camera (None uses ``intrinsics``)."""
     prior_std_log_focals: Float64 | float = np.inf
-    """(k,) standard deviation of the prior on ``log fx``, or one number for all. Infinity means no
-    prior."""
+    """(k,) standard deviation of the prior on ``log fx``, or one number for all (infinite without
+    prior)."""
     log_scales: Float64 | None = None
     """(n,) log of the scale factor on the depth map of each image (None uses 0)."""
     expected_log_scales: Float64 | None = None
     """(n,) mean of the prior on the log scale of each depth map (None uses 0)."""
     std_log_scales: Float64 | float = np.inf
-    """(n,) standard deviation of the prior on the log scales, or one number for all. Infinity means
-    no prior."""
+    """(n,) standard deviation of the prior on the log scales, or one number for all (infinite
+    without prior)."""
     variable_scale: Bool | None = None
     """(n,) bool, True for images whose depth map has a variable log scale (None keeps all
     constant)."""
@@ -99,7 +99,7 @@ class ScalePrior(NamedTuple):
     log_scale: Float64
     """(s,) mean."""
     weight: Float64
-    """(s,) inverse variance of each prior."""
+    """(s,) inverse variance of the prior on each parameter."""
 
     def cost(self, state: kernels.BundleParameters) -> float:
         """Return the cost of the prior, half the weighted sum of squared residuals."""
@@ -117,7 +117,7 @@ class FocalPrior(NamedTuple):
     log_focal: Float64
     """(s,) mean."""
     weight: Float64
-    """(s,) inverse variance of each prior."""
+    """(s,) inverse variance of the prior on each parameter."""
 
     def residuals(self, state: kernels.BundleParameters) -> Float64:
         """Return the residuals (s,), log focal lengths minus their prior means."""
@@ -297,7 +297,7 @@ def _focal_prior(
 def _numbers(values: ArrayLike, name: str, shape: tuple[int, ...]) -> Float64:
     array = np.ascontiguousarray(values, dtype=np.float64)
     if array.shape != shape:
-        raise DataError(name, f"must have shape {shape}, got {array.shape}")
+        raise DataError(name, f"array must have shape {shape}, got {array.shape}")
     if not np.isfinite(array).all():
         raise DataError(name, "must be finite")
     return array
@@ -313,9 +313,9 @@ def _inverse_std(std: Float64 | float, name: str, count: int) -> Float64:
 def _indices(values: NDArray[Any], name: str, count: int, limit: int) -> NDArray[np.int32]:
     array = np.asarray(values)
     if array.shape != (count,) or array.dtype.kind not in "iu":
-        raise DataError(name, f"must be integers of shape ({count},)")
+        raise DataError(name, f"indices must be integers of shape ({count},)")
     if count and not 0 <= array.min() <= array.max() < limit:
-        raise DataError(name, f"must lie in [0, {limit})")
+        raise DataError(name, f"indices must lie in [0, {limit})")
     return np.array(array, dtype=np.int32)
 
 
@@ -324,7 +324,7 @@ def _mask(values: Bool | None, name: str, count: int, default: bool) -> Bool:
         return np.full(count, default)
     array = np.array(values)
     if array.shape != (count,) or array.dtype != np.bool_:
-        raise DataError(name, f"must be bool of shape ({count},)")
+        raise DataError(name, f"mask must be bool of shape ({count},)")
     return array
 
 
@@ -336,7 +336,8 @@ def _scale_gauge(anchor: int, variable: Bool, state: kernels.BundleParameters) -
     """Return the image and pose parameter to keep constant, which fixes the scale gauge."""
     if not (0 <= anchor < len(variable) and variable[anchor]) or variable.all():
         raise DataError(
-            "scale_anchor", "must be a variable pose, and another pose must be constant"
+            "scale_anchor",
+            "scale anchor must be an image with variable pose, and another pose must be constant",
         )
     first = int(np.argmin(variable))
     center = -state.rotations[first].T @ state.translations[first]

@@ -41,8 +41,8 @@ _FILLED_LOG_VARIANCE = 1.0
 """Variance of the log depth of pixels with a normal but no depth prior, which makes the linear
 system non-singular."""
 _COARSE_COLUMNS = 300
-"""Width in pixels of half-resolution depth maps from which depth integration starts at half
-resolution. A coarse start is faster and reaches a lower energy. [tuned:
+"""Minimum width in pixels of half-resolution depth maps for a coarse start. Depth integration with
+a coarse start at half resolution is faster and reaches a lower energy. [tuned:
 benchmarks.depth_integration]"""
 _FINE_ITERATIONS = 3
 """Maximum number of IRLS re-weightings at full resolution after the coarse refinement. [ours]"""
@@ -83,7 +83,7 @@ class RefinedDepth:
     """(h, w) float64 natural logarithm of depth in the unit of the scaled prior."""
     valid: Bool
     """(h, w) bool, False for pixels with neither a depth prior nor normals that connect them to
-    depth. The log depth of these pixels is the median."""
+    depth. The log depth of invalid pixels is set to the median."""
     scale: float
     """Scale of the depth prior during the refinement."""
     initial_energy: float
@@ -135,7 +135,7 @@ class DepthIntegrator:
         depth: Depth prior with variance, at the resolution of ``camera``.
         normals: Normal prior with variance, at the resolution of ``camera``.
         camera: Intrinsics in pixels of the depth and normal priors.
-        options: Options of the integration.
+        options: Options of depth integration.
 
     Raises:
         DataError: The depth prior, normal prior and camera differ in size, or a prior has no
@@ -150,9 +150,13 @@ class DepthIntegrator:
         options: IntegrationOptions | None = None,
     ) -> None:
         if depth.variance is None or normals.variance is None:
-            raise DataError("variance", "depth integration needs one for depth and for normals")
+            raise DataError(
+                "variance", "depth prior or normal prior has no variance; calibrate the prior"
+            )
         if not depth.shape == normals.shape == (camera.height, camera.width):
-            raise DataError("camera", "depth, normals and camera must have one grid")
+            raise DataError(
+                "camera", "depth prior, normal prior and camera must have one grid size"
+            )
         self.options = options = options or IntegrationOptions()
         self._normals = normals
         self.camera = camera
@@ -188,7 +192,7 @@ class DepthIntegrator:
 
         Args:
             anchors: Triangulated points.
-            scale: Scale of the depth prior.
+            scale: Scale factor on the depth prior.
             start: Earlier refined depth of this instance, which is rescaled and used as initial
                 depth map. The earlier depth map is returned unrefined if the anchors fit about as
                 well as before. With None, the refinement starts from the scaled prior.
@@ -209,7 +213,7 @@ class DepthIntegrator:
         """Compute the marginal variance of the refined log depth.
 
         The variance is the exact diagonal of the inverse Gauss-Newton Hessian with the present IRLS
-        weights. The variance of depth is this variance times depth^2.
+        weights. The variance of depth is the variance of log depth times depth^2.
 
         Returns:
             (h, w) float32 variance of log depth, infinite at pixels without valid depth.

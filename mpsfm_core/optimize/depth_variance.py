@@ -4,7 +4,7 @@ The algorithm is selected inversion by nested dissection (George, 1973). The ope
 matrix with a five-point stencil on the pixel grid. Separator lines halve the grid until small
 blocks remain. Block elimination proceeds bottom-up, from the small blocks to the separators. Each
 elimination leaves a dense Schur complement on the boundary of the eliminated part. A top-down pass
-then computes the entries of the inverse on these boundaries. Parts of equal size are processed
+then computes the entries of the inverse on these boundaries. Grid parts of equal size are processed
 together as stacked dense matrices. Selected inversion for n pixels takes O(n^1.5) operations and
 O(n log n) memory.
 """
@@ -84,7 +84,7 @@ def compute_inverse_diagonal(east: Float32, south: Float32, mass: Float32) -> Fl
     planes = np.zeros((2, mass.shape[0] + 1, mass.shape[1] + 1))
     planes[0, :-1, :-2] = east[:, :-1]
     planes[1, :-2, :-1] = south[:-1]
-    # Index -1 wraps to the last row or column, which is zero.
+    # Index -1 of `plane` wraps to the last row or column, whose couplings are zero.
     diagonal = sum(plane + np.roll(plane, 1, 1 - axis) for axis, plane in enumerate(planes))
     diagonal = diagonal[:-1, :-1] + mass
     detached = diagonal == 0

@@ -106,7 +106,7 @@ class QuadraticMajorizer(NamedTuple):
     point_energy: float
     """Mean energy per sparse point."""
     gradient: Float64
-    """(h, w) half of the gradient of the energy."""
+    """(h, w) half of the gradient of the depth integration energy by log depth."""
     east: Float32
     south: Float32
     mass: Float32

@@ -1,9 +1,10 @@
 """Robust losses in the convention of Ceres, ``(rho(s), rho'(s))`` of squared residuals s.
 
 A loss function maps the squared residual ``s`` and the loss scale ``a`` to ``(rho(s), rho'(s))``.
-The scale has the unit of the residual. The minimized cost is ``sum(rho(s)) / 2``, and ``rho'`` is
-the weight in iteratively re-weighted least squares (IRLS). All loss functions accept numpy arrays
-and, in compiled kernels, scalars. :func:`evaluate_loss` selects a function by its :class:`Loss`.
+The loss scale has the unit of the residual. The minimized cost is ``sum(rho(s)) / 2``, and ``rho'``
+is the weight in iteratively re-weighted least squares (IRLS). All loss functions accept numpy
+arrays and, in compiled kernels, scalars. :func:`evaluate_loss` selects a function by its
+:class:`Loss`.
 """
 # mypy: allow-untyped-decorators
 

@@ -1,8 +1,8 @@
 """Conjugate gradients with a black-box multigrid preconditioner on image grids.
 
-The linear system has a symmetric positive definite matrix A on the pixels. Its coefficients are
-non-negative couplings between horizontal and vertical neighbors, and a non-negative mass per pixel
-that is added to the diagonal::
+The linear system has a symmetric positive definite matrix A on the pixels. The coefficients of A
+are non-negative couplings between horizontal and vertical neighbors, and a non-negative mass per
+pixel that is added to the diagonal::
 
     x' A x = sum east (x[i, j] - x[i, j+1])^2 + sum south (x[i, j] - x[i+1, j])^2 + sum mass x^2
 
@@ -169,9 +169,9 @@ def _conjugate_gradients(
 ) -> tuple[int, float]:
     """Solve the linear system on the finest multigrid level by conjugate gradients.
 
-    The residual replaces the right-hand side. The rows of ``vectors`` are x, the search direction
-    p, and the product A p. The function returns the fields ``iterations`` and ``relative_error`` of
-    :class:`LinearSolution`.
+    The residual of the linear system replaces the right-hand side in memory. The rows of
+    ``vectors`` are x, the search direction p, and the product A p. The function returns the fields
+    ``iterations`` and ``relative_error`` of :class:`LinearSolution`.
     """
     finest = _level(grids, 0)
     x, direction, image, residual = vectors[0], vectors[1], vectors[2], finest.rhs
@@ -270,7 +270,7 @@ def _smooth(level: _Level, nine_point: bool, backward: bool) -> None:
 
 @_helper
 def _start_points(level: _Level) -> None:
-    """Relax the pixels that the coarser grid contains, starting from x = 0."""
+    """Apply Jacobi relaxation from x = 0 to the pixels that the coarser grid contains."""
     x = level.x
     x[:] = 0
     for i in range(1, x.shape[0] - 1, 2):
@@ -280,7 +280,7 @@ def _start_points(level: _Level) -> None:
 
 @_helper
 def _relax_points(level: _Level, nine_point: bool) -> None:
-    """Relax the pixels that the coarser grid contains, each pixel alone."""
+    """Apply Gauss-Seidel relaxation to the pixels that the coarser grid contains."""
     x, row = level.x, level.work[0]
     for i in range(1, x.shape[0] - 1, 2):
         _residual_row(level, i, nine_point, row)
@@ -452,8 +452,9 @@ def _derive_interpolation(fine: _Level, coarse: _Level) -> None:
 def _shares(first: float, second: float, mass: float) -> tuple[float, float]:
     """Return the interpolation weights of the two coarse neighbors of a fine pixel.
 
-    Coarse couplings and masses can be negative. Strong couplings across a line can make a mass
-    negative. Negative masses reduce the interpolation weights as positive masses of equal size do.
+    On coarse multigrid levels, couplings and masses can be negative. Strong couplings across a line
+    can make a mass negative. Negative masses reduce the interpolation weights as positive masses of
+    equal size do.
     """
     first, second = max(first, 0.0), max(second, 0.0)
     inverse = _inverse(first + second + abs(mass))

@@ -67,8 +67,9 @@ class IntegrationOptions(Options):
     number makes the refined depth follow the normals more closely. [tuned:
     benchmarks.depth_integration]"""
     sharpness: float = expert(2.0, gt=0)
-    """Sharpness k of the soft minimum of both one-sided residuals. Raising k approaches a hard
-    choice of the smaller residual. [bilateral normal integration: 2; reference: 1]"""
+    """Sharpness k of the soft minimum of a pixel's two one-sided normal residuals. Raising k
+    approaches a hard choice of the smaller residual. [bilateral normal integration: 2; reference:
+    1]"""
     normal_limit: float = expert(6.0, gt=0)
     """Squared normal residual above which depth may be discontinuous between two pixels. Raising
     this value smooths depth discontinuities. [tuned: benchmarks.depth_integration]"""
@@ -91,4 +92,5 @@ class IntegrationOptions(Options):
     depth integration earlier. [reference]"""
     max_point_growth: float = expert(1.2, ge=0)
     """Maximum increase of the sparse points' mean energy for which a depth map is not refined
-    again. Raising this value skips more refinements. [tuned: benchmarks.depth_integration]"""
+    again. Raising this value skips more refinements of depth maps. [tuned:
+    benchmarks.depth_integration]"""

@@ -77,8 +77,8 @@ def measure_segments(
         segments: Keypoints and segments.
 
     Returns:
-        Distances (m,) in pixels and depths (m,) of the nearest points on the segments. Both are NaN
-        if an end of the segment is behind the camera.
+        Distances (m,) in pixels and depths (m,) of the nearest points on the segments. Distance and
+        depth are NaN if an end of the segment is behind the camera.
     """
     distances, depths = np.empty((2, len(segments.xy)))
     rotation, translation = map(np.ascontiguousarray, pose)

@@ -56,7 +56,7 @@ def test_multiview_prior_of_group_is_cached(tmp_path: Path) -> None:
 
 def test_multiview_prior_of_wrong_shape_raises() -> None:
     depth = (DepthPrior.from_arrays(np.ones((2, 2))),)
-    with pytest.raises(DataError, match=r"poses: must have shape \(1, 3, 4\)"):
+    with pytest.raises(DataError, match=r"poses: array must have shape \(1, 3, 4\)"):
         MultiViewPrior(depth, np.zeros((2, 3, 4)))
     with pytest.raises(DataError, match="positive focal lengths"):
         MultiViewPrior(depth, intrinsics=np.zeros((1, 4)))

@@ -192,7 +192,7 @@ class TripsOverMasks(Changed):
     ("factory", "check", "message"),
     [
         (NotANumber, "output-rules", "depth: must be finite"),
-        (Double, "output-rules", "depth: must have dtype float32"),
+        (Double, "output-rules", "depth: array must have dtype float32"),
         (BareArray, "output-rules", "must be a DepthPrior, got ndarray"),
         (Random, "deterministic", "the output in a second call differs"),
         (RandomWeights, "deterministic", "of a second instance"),

@@ -83,7 +83,7 @@ class NotFinite(Detector):
     [
         (RowsFirst, "features-axes", "x and y are swapped"),
         (IntegerCentres, "features-pixel-convention", r"shifted by .-0.49, -0.49. px"),
-        (Outside, "output-rules", "keypoints: must lie inside of the 192x144 view"),
+        (Outside, "output-rules", "keypoints: points must lie inside of the 192x144 image"),
         (SortedAgain, "features-descriptors", "of the nearest descriptors are the same point"),
         (EmptyIsFlat, "features-dimension", "1 and 128 values"),
         (NotFinite, "output-rules", "descriptors: must be finite"),
@@ -178,7 +178,7 @@ class WantsTwoNeighbours(MutualNearest):
         (SortsViews, "matcher-order", "indices: must be below|matches are correct"),
         (OutOfRange, "output-rules", "indices: must be below"),
         (Duplicates, "output-rules", "must use each feature at most once"),
-        (Percent, "output-rules", r"scores: must lie in \[0, 1\]"),
+        (Percent, "output-rules", r"scores: values must lie in \[0, 1\]"),
         (Distances, "matcher-scores", "correct matches score 0.1.*, wrong matches 0.[89]"),
         (WantsFeatures, "matcher-no-features", "out of bounds"),
         (WantsTwoNeighbours, "matcher-few-features", "kth"),
@@ -309,7 +309,7 @@ class LeftHalf(PaintedMask):
     ("factory", "check", "message"),
     [
         (Inverted, "mask-polarity", "is inverted"),
-        (Reduced, "output-rules", "must have the view's shape"),
+        (Reduced, "output-rules", "must have the image's shape"),
         (Grey, "output-rules", "2-dimensional bool"),
         (Displaced, "mask-place", "of the pixels have the wrong value"),
         (Backwards, "mask-channel-order", "follows the blue channel"),
