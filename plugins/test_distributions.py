@@ -24,7 +24,7 @@ WITH_THE_CORE = {"mpsfm_core", "pydantic"}
 """Packages that plugins may import without declaring them, because the core requires them."""
 WITHOUT_THEIR_DEPENDENCIES = {"depth_anything_3", "vismatch"}
 """Packages with conflicting dependencies, which plugins do not declare.
-``ProviderSpec.install_hint`` gives their installation command.
+The ``install_hint`` of a provider specification has the command that installs these packages.
 """
 FOR_TESTS_ONLY = ("contract.py", "stand_in.py")
 BESIDE_THE_AUTHORS_CODE = ("export.py", "export_moge.py", "export_unidepth.py")

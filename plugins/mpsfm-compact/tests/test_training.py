@@ -109,7 +109,7 @@ def test_training_runs_from_rendering_to_onnx(tmp_path: Path) -> None:
         if value.is_floating_point():
             torch.testing.assert_close(value, (stages[0][name] + stages[1][name]) / 2)
     differences = export(tmp_path / "mean.pt", tmp_path / "network.onnx")
-    assert max(differences.values()) < 0.03  # float16 rounding of a hardly trained network
+    assert max(differences.values()) < 0.03  # weights are rounded to float16
 
 
 def test_views_of_a_panorama_have_the_scale_of_its_tripod() -> None:

@@ -26,7 +26,8 @@ _SIZES = ((256, 192), (256, 192), (256, 192), (192, 256), (224, 224))
 """Possible widths and heights of the network input, one drawn per batch. All input sizes have 0.05
 megapixels."""
 _ZOOM = 1.6
-"""Maximum zoom of the augmentation. Small zooms are more frequent, because inference does not zoom.
+"""Maximum zoom factor of the image augmentation. Small zooms are more frequent, because inference
+does not zoom.
 """
 _ROLL_DEG = 6.0
 
@@ -170,7 +171,7 @@ def augmented(
 def rays(width: int, height: int, focal: np.ndarray, center: np.ndarray) -> Tensor:
     """Compute ray slopes x / z and y / z, (n, 2, h / 32, w / 32), at centers of pixel blocks.
 
-    Blocks have 32 x 32 pixels. ``focal`` (n, 2) and ``center`` (n, 2) are in pixels.
+    The pixel blocks have 32 x 32 pixels. ``focal`` (n, 2) and ``center`` (n, 2) are in pixels.
     """
     x, y = np.meshgrid(np.arange(width // 32) * 32 + 16.0, np.arange(height // 32) * 32 + 16.0)
     slopes = (np.stack([x, y]) - center[:, :, None, None]) / focal[:, :, None, None]

@@ -63,7 +63,8 @@ def make_real(output: Path, source: Path) -> None:
 def make_triangulated(output: Path, images: Path, model: Path, name: str) -> None:
     """Convert images and their triangulated COLMAP points to the shard ``name``.
 
-    ``model`` is the COLMAP reconstruction of ``images``. Depth has the unit of ``model``.
+    ``model`` is the COLMAP reconstruction of ``images``. Depth has the length unit of this
+    reconstruction.
     """
     import pycolmap
 

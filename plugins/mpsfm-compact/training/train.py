@@ -31,7 +31,7 @@ class Schedule:
     batch: int = 16
     rate: float = 1e-3
     encoder_rate: float = 0.4
-    """Learning rate of the encoder relative to ``rate``."""
+    """Learning rate of the encoder relative to the learning rate ``rate`` of the other layers."""
     warmup: int = 200
     decay: float = 1e-2
     average: float = 0.998

@@ -19,7 +19,7 @@ def unpack(shards: Sequence[Path], output: Path, most: int) -> int:
     ``intrinsics.yaml``.
 
     Returns:
-        The number of written samples.
+        The number of written training samples.
     """
     cameras = {}
     for folder in shards:

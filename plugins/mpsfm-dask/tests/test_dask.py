@@ -11,7 +11,7 @@ from mpsfm_dask.executor import DaskExecutor
 from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.testing import executor_contract
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # cluster threads warn at exit
+pytestmark = pytest.mark.filterwarnings("ignore")  # Dask's threads warn when Python exits
 
 
 @pytest.fixture(scope="module")

@@ -16,5 +16,5 @@ class DsineOptions(Options):
     """Expected SHA-256 hash of the file ``model``."""
     size: int = Field(1200, ge=32, le=2000)
     """Longer side of the network input in pixels. Smaller images are not enlarged. DSINE supports
-    up to 2000 pixels. [reference]
+    input sides of up to 2000 pixels. [reference]
     """

@@ -41,7 +41,7 @@ class LightGlueMatcher:
         use_threads(context)
         self._device = context.device
         self._network = LightGlue(
-            None,  # type: ignore[arg-type]  # kornia: None loads no weights
+            None,  # type: ignore[arg-type]  # None loads no published weights
             **self.architecture,
             **_FIXED,
             depth_confidence=options.depth_confidence,

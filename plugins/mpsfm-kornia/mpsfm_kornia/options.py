@@ -225,8 +225,8 @@ class LoftrOptions(Options):
     """Options of LoFTR (CVPR 2021), a detector-free matcher."""
 
     resize: int = Field(840, ge=32)
-    """Longer side of the resized images in pixels. Images are never enlarged. Memory grows with the
-    fourth power of ``resize``.
+    """Longer side of the resized images in pixels. Images are never enlarged. LoFTR's memory use
+    grows with the fourth power of ``resize``.
     """
     match_threshold: float = Field(0.2, ge=0, lt=1)
     """Minimum coarse score of a LoFTR match. [published default]"""

@@ -71,11 +71,12 @@ def test_keypoints_become_pixels_of_the_view(detector, context):
     """Check keypoints in an image shrunk to 32 x 24 pixels, without those outside of the image."""
     options = SuperPointOptions(model=detector(1), resize=32)
     found = SuperPoint(options, context).extract(view_of(128, 96))
-    order = [1, 3, 0, 2]  # by score, without the keypoint at (40, 5)
+    order = [1, 3, 0, 2]  # by score, without the keypoint (40, 5) outside of the view
     np.testing.assert_allclose(found.keypoints, (PLACES[0][order] + 0.5) * 4)
     np.testing.assert_allclose(found.scores, STRENGTHS[0][order])
     assert found.std_px == 4.0
-    np.testing.assert_allclose(found.descriptors, 0.299, rtol=1e-5)  # luma of pure red
+    # The descriptor is the luma of pure red.
+    np.testing.assert_allclose(found.descriptors, 0.299, rtol=1e-5)
 
 
 def test_disk_sees_colours_on_multiples_of_16(detector, context):

@@ -15,7 +15,7 @@ import torch
 
 from mpsfm_core.providers.model_export.author_script import ExportJob, run_network
 
-sys.modules["models.curope"] = None  # torch code replaces the CUDA embeddings
+sys.modules["models.curope"] = None  # torch code replaces the CUDA rotary embeddings
 
 from mast3r.model import AsymmetricMASt3R  # noqa: E402
 from models.pos_embed import RoPE2D  # noqa: E402

@@ -109,7 +109,7 @@ class PairNetwork(ABC):
 
 
 class OnnxPairNetwork(PairNetwork):
-    """MASt3R in an ONNX file.
+    """MASt3R network in an ONNX file.
 
     The inputs are ``img1`` and ``img2``. The outputs are ``pts3d_1`` (1, h, w, 3), ``conf_1`` (1,
     h, w), ``desc_1`` (1, h, w, d), ``desc_conf_1`` (1, h, w), and ``pts3d_2`` to ``desc_conf_2``
@@ -123,7 +123,7 @@ class OnnxPairNetwork(PairNetwork):
         self._model.require(("img1", "img2"), self._outputs, "MASt3R")
 
     def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
-        """Run the ONNX model, see :class:`PairNetwork`."""
+        """Run MASt3R's ONNX model, see :class:`PairNetwork`."""
         feed = {"img1": first, "img2": second}
         tensors = [tensor[0] for tensor in self._model.run(feed, self._outputs)]
         return tensors[:4], tensors[4:]

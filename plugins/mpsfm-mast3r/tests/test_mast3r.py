@@ -17,7 +17,8 @@ from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 SIZE = (80, 60)  # size of test views, resized to 64 x 48
 
 # The network returns the red channel as z and green as certainty for its first input. For the
-# second input, z and certainty are 90. Descriptors are the unit vectors of (red, green, blue).
+# second input, the network returns 90 for z and certainty. Descriptors are the unit vectors of
+# (red, green, blue).
 STAND_IN = """
 mast3r (float[b,3,h1,w1] img1, float[b,3,h2,w2] img2) => (
     float[b,h1,w1,3] pts3d_1, float[b,h1,w1] conf_1, float[b,h1,w1,3] desc_1,
@@ -155,7 +156,7 @@ def test_depth_of_each_view_comes_from_the_pass_where_it_is_first(model, context
     for prior, view in ((depth.depth_a, a), (depth.depth_b, b)):
         assert prior.shape == (39, 64) and prior.metric
         inside = np.zeros(39, dtype=bool)
-        inside[3:35] = True  # crop from 39 to 32 rows
+        inside[3:35] = True  # the network input crops 39 image rows to 32
         np.testing.assert_array_equal(prior.valid, np.broadcast_to(inside[:, None], (39, 64)))
         columns = (np.arange(64) + 0.5) * 100 / 64 - 0.5
         expected = np.interp(columns, np.arange(100), view.image[0, :, 0]) / 255

@@ -24,7 +24,7 @@ class Canvas:
 
     ``size`` is the ``(width, height)`` of the network input, and ``image`` that of the resized
     image. ``offset`` (x, y) is the upper left corner of the resized image on the network input.
-    ``offset`` is negative where the network input crops the image.
+    The offset is negative where the network input crops the resized image.
     """
 
     size: tuple[int, int]

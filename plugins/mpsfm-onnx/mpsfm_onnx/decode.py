@@ -96,7 +96,7 @@ def _network_depth(
 def estimate_z_shift(points: Float64, xy: Float64, valid: Bool | None = None) -> float:
     """Estimate the unknown shift t of z for points (h, w, 3) on known rays ``(x, y, 1)``.
 
-    ``xy`` (h, w, 2) are x and y of the rays. The shift minimizes the reprojection error ``sum
+    ``xy`` (h, w, 2) are x and y of the rays. The z-shift t minimizes the reprojection error ``sum
     |(x_i, y_i) / (z_i + t) - xy_i|^2`` on a grid of 64 x 64 pixels by Gauss-Newton, as in MoGe. The
     initial t minimizes the linear error ``sum |(x_i, y_i) - xy_i (z_i + t)|^2 / z_i^2``.
     """
@@ -148,8 +148,8 @@ def decode_normals(
 ) -> NormalPrior:
     """Decode normals, and their variance from an angular std (h, w) in rad.
 
-    The tensor ``value`` (h, w, 3 or more) starts with x, y, z. Normals that do not face the
-    ``camera`` are invalid, and so are pixels outside of the mask ``valid``.
+    The first channels of the tensor ``value`` (h, w, 3 or more) are x, y, z of the normals. Normals
+    that do not face the ``camera`` are invalid, and so are pixels outside of the mask ``valid``.
     """
     variance = None if std is None else std**2
     normals = value[..., :3] * np.array(rule.axes, dtype=np.float32)

@@ -46,9 +46,9 @@ class SideSize(Options):
     multiple_of: int = Field(1, gt=0)
     """Both sides of the network input are multiples of this number of pixels."""
     fit: Literal["stretch", "pad", "crop"] = "stretch"
-    """Adaptation of the sides to ``multiple_of``. ``stretch`` resizes to the nearest multiples,
-    ``pad`` pads to the next larger multiples, and ``crop`` crops to the next smaller multiples.
-    Cropped borders have no prediction.
+    """Adaptation of the image sides to ``multiple_of``. ``stretch`` resizes to the nearest
+    multiples, ``pad`` pads to the next larger multiples, and ``crop`` crops to the next smaller
+    multiples. Cropped image borders have no prediction.
     """
     enlarge: bool = True
     """Enlarge small images."""
@@ -90,7 +90,7 @@ class ImageInput(Options):
     rays: str | None = None
     """Name of the input tensor with unit rays (1, 3, h, w) through the pixel centers, if any."""
     constants: dict[str, float] = Field(default_factory=dict)
-    """Names and values of further inputs that are constant."""
+    """Names and values of further input tensors that are constant."""
 
 
 class DepthOutput(Options):
@@ -105,11 +105,12 @@ class DepthOutput(Options):
     intrinsics. Pixels whose value is not positive are invalid, except for ``log-depth``.
     """
     channel: int = Field(0, ge=0)
-    """Channel of the depth tensor. The channel is ignored if ``output`` is ``points``."""
+    """Channel index of depth in the depth tensor. The channel is ignored if ``output`` is
+    ``points``."""
     scale: float = 1.0
     shift: float = 0.0
-    """Scale and shift of the tensor values. Scale and shift convert the values to meters (or 1 /
-    meters), or make an affine disparity positive.
+    """Scale and shift of the values in the depth tensor. Scale and shift convert the values to
+    meters (or 1 / meters), or make an affine disparity positive.
     """
     metric: bool
     """True if depth is in meters after the correction by ``canonical_focal``."""
@@ -144,7 +145,7 @@ class MaskOutput(Options):
 
     name: str
     minimum: float = 0.5
-    """Probability above which a pixel is valid."""
+    """Probability above which depth and normals of a pixel are valid."""
 
 
 class NormalsOutput(Options):
@@ -161,7 +162,8 @@ class KappaOutput(Options):
     name: str
     output: Literal["kappa", "angle"] = "kappa"
     """Meaning of the values in the uncertainty tensor of normals. ``kappa`` is the concentration of
-    DSINE and Metric3D. ``angle`` is the std about each axis in rad.
+    the normal distribution on the sphere of DSINE and Metric3D. ``angle`` is the std about each
+    axis in rad.
     """
     channel: int = Field(0, ge=0)
     """Channel index of the uncertainty in its tensor, 3 if x, y, z of the normals precede it."""

@@ -25,7 +25,7 @@ class DescribedDepth:
     """Provider of depth, with the variance that the network predicts, if any.
 
     Args:
-        weights: Path or URI of the ONNX file. None selects the file of the description.
+        weights: Path or URI of the ONNX file. None selects the file that the description names.
         sha256: Expected SHA-256 hash of the file ``weights``.
     """
 
@@ -69,7 +69,7 @@ class DescribedNormals:
     """Provider of normals, with the variance that the network predicts, if any.
 
     Args:
-        weights: Path or URI of the ONNX file. None selects the file of the description.
+        weights: Path or URI of the ONNX file. None selects the file that the description names.
         sha256: Expected SHA-256 hash of the file ``weights``.
     """
 

@@ -78,7 +78,7 @@ def test_integer_models_get_rounded_integers(write_onnx, write_description, make
     description = write_description(input={**IDENTITY_INPUT, "scale": 0.5}, outputs=depth())
     options = OnnxOptions(description=description, model=str(write_onnx(text)))
     prior = OnnxDepth(options, context).predict(make_view(4, 4, colour=(13, 0, 0)))
-    np.testing.assert_array_equal(prior.depth, 6)  # 6.5 is rounded to even
+    np.testing.assert_array_equal(prior.depth, 6)  # the network input 6.5 is rounded to even
 
 
 def test_camera_and_constants_are_inputs(write_onnx, write_description, make_view, context):
@@ -125,7 +125,8 @@ def test_guessed_focal_length_and_unit(write_onnx, write_description, make_view,
     view = make_view(64, 16, colour=(8, 0, 0), focal=(120.0, 300.0))
     provider = OnnxDepth(options, context)
     np.testing.assert_allclose(provider.predict(view).depth, 8 * (120 * 32 / 64) / 50 * 0.25)
-    assert provider.estimate_focal(view) == pytest.approx(100)  # 50 px at half width
+    # The network input has half of the view's width and a focal length of 50 pixels.
+    assert provider.estimate_focal(view) == pytest.approx(100)
 
 
 def test_mask_applies_to_depth_and_normals(write_onnx, write_description, make_view, context):
@@ -333,6 +334,6 @@ def test_fastdepth_on_real_photos(shared_data, make_view, context):
         errors.append(np.abs(ratio - 1).mean())
         close.append((np.maximum(ratio, 1 / ratio) < 1.25).mean())
     assert len(errors) == 21
-    assert 0.75 < np.median(scales) < 1.1  # ratio of predicted to true depth, 0.89
+    assert 0.75 < np.median(scales) < 1.1  # median of predicted over true depth is 0.89
     assert np.mean(errors) < 0.21
     assert np.mean(close) > 0.66

@@ -12,7 +12,7 @@ from mpsfm_core.testing import executor_contract
 pytest.importorskip("ray", reason="Ray is not installed: pip install ray")
 from mpsfm_ray.executor import RayExecutor
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # cluster threads warn at exit
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's threads warn when Python exits
 
 
 class TestOneCluster:

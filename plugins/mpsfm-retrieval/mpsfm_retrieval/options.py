@@ -41,4 +41,4 @@ class AppearanceOptions(Options):
     """Parameter of the kernel ``exp(-sharpness |x - y|^2)`` of two unit SIFT descriptors x, y."""
     color_share: float = Field(0.3, ge=0, lt=1)
     """Weight of the color histogram in the similarity of two images. The SIFT features have the
-    remaining weight."""
+    remaining weight in the similarity."""

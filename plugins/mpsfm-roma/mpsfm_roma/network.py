@@ -38,7 +38,7 @@ class Warp:
         return scale_pixels(xy, (width, height), self.size)
 
     def at(self, xy: Float64) -> tuple[Float64, Float64]:
-        """Interpolate target (n, 2) and certainty (n,) at pixels (n, 2) of the first view."""
+        """Interpolate warp targets (n, 2) and certainty (n,) at pixels (n, 2) of the first view."""
         height, width = self.certainty.shape
         grid = scale_pixels(xy, self.size, (width, height))
         everywhere: Bool = np.ones((height, width), dtype=np.bool_)
@@ -72,7 +72,7 @@ class WarpNetwork(ABC):
 
 
 class OnnxWarpNetwork(WarpNetwork):
-    """RoMa in an ONNX file.
+    """RoMa network in an ONNX file.
 
     The inputs are two images (1, 3, height, width), normalized by the mean and std of ImageNet. The
     outputs are warp and
@@ -92,7 +92,7 @@ class OnnxWarpNetwork(WarpNetwork):
         )
 
     def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
-        """Run the ONNX model, see :class:`WarpNetwork`."""
+        """Run RoMa's ONNX model, see :class:`WarpNetwork`."""
         images = (
             Canvas.plan(self._rule.size, v.camera.size).paint(v.image, self._rule)
             for v in (view_a, view_b)

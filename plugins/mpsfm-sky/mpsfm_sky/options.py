@@ -18,14 +18,14 @@ class SkyOptions(Options):
     model: str = SKYSEG.uri
     """Path or URI of the ONNX file of the sky network."""
     network: Literal["skyseg", "skysegsmall"] = "skyseg"
-    """Preprocessing of the image. ``skyseg`` resizes to 320 x 320 pixels and normalizes by the mean
-    and std of ImageNet [reference]. ``skysegsmall`` resizes to 384 x 384 pixels with values in
-    0..1.
+    """Name of the image preprocessing that the network requires. ``skyseg`` resizes to 320 x 320
+    pixels and normalizes by the mean and std of ImageNet [reference]. ``skysegsmall`` resizes to
+    384 x 384 pixels with values in 0..1.
     """
     sha256: str | None = None
     """Expected SHA-256 hash of the file ``model``."""
     threshold: float = Field(0.5, gt=0, lt=1)
-    """Sky probability above which a pixel is masked. Higher values mask fewer pixels.
+    """Sky probability above which a pixel is masked. A higher threshold masks fewer pixels.
     [reference]"""
 
 

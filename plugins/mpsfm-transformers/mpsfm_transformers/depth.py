@@ -46,7 +46,7 @@ class HubDepth:
         self._by_focal = config.model_type == "depth_pro"
 
     def predict(self, view: View) -> DepthPrior:
-        """Predict the depth of a view. Depth Pro also uses the focal length of the camera."""
+        """Predict the depth of a view, for Depth Pro from the focal length of its camera."""
         value, _ = self._run(view)
         if self._by_focal:
             inverse = value.astype(np.float64) * (view.camera.width / view.camera.fx)
@@ -65,7 +65,7 @@ class HubDepth:
         return 0.5 * view.camera.width / float(np.tan(0.5 * np.radians(angle)))
 
     def _run(self, view: View) -> tuple[Float32, float | None]:
-        """Run the network, and return its depth map and its angle of view in degrees, if any."""
+        """Return the network's depth map, and its predicted angle of view in degrees, if any."""
         prepared = self._preparation(view)
         with inference():
             prediction = self._model.network(pixel_values=prepared.pixels.to(self._model.device))

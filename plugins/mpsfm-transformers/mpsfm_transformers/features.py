@@ -20,7 +20,8 @@ class SuperPointFeatures:
     """SuperPoint features. The library transformers places pixel centers at integer coordinates."""
 
     def __init__(self, options: SuperPointOptions, context: ProviderContext) -> None:
-        config: dict[str, float] = {"max_keypoints": -1}  # keep all keypoints until masking
+        # -1 keeps all keypoints, because the mask may remove some of them.
+        config: dict[str, float] = {"max_keypoints": -1}
         if options.detection_threshold is not None:
             config |= {"keypoint_threshold": options.detection_threshold}
         self._model = LoadedModel(SuperPointForKeypointDetection, options, context, **config)

@@ -1,8 +1,8 @@
 """Position of a view on the input of a depth network.
 
-The image processor of the model prepares the network input from a view. If the processor pads, or
-aligns corner pixels when resizing, the network output covers another area than the view. The method
-:meth:`Prepared.cut` returns the part of the output that covers the view exactly.
+The image processor of the model prepares the network input from a view. If the image processor pads
+the view, or aligns corner pixels when resizing, the network output covers another area than the
+view. The method :meth:`Prepared.cut` returns the part of the output that covers the view exactly.
 """
 
 from __future__ import annotations

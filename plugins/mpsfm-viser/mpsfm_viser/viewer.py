@@ -19,8 +19,8 @@ from mpsfm_core.geometry import camera_center
 from mpsfm_core.report.viewing import ColoredPoints, Pictures, unproject_depth_map
 
 PORT_VARIABLE = "MPSFM_VIEWER_PORT"
-"""Environment variable with the port of the page. If the port is taken, the viewer uses the next
-free port."""
+"""Environment variable with the port of the viewer's web page. If the port is taken, the viewer
+uses the next free port."""
 HOST_VARIABLE = "MPSFM_VIEWER_HOST"
 """Environment variable with the host address. 0.0.0.0 allows access from other machines."""
 _LEAST_SECONDS = 1.0

@@ -24,7 +24,7 @@ class TorchPairNetwork(PairNetwork):
         self._device = context.device
 
     def answer(self, first: Float32, second: Float32) -> tuple[Tensors, Tensors]:
-        """Run the network, see :class:`~mpsfm_mast3r.network.PairNetwork`."""
+        """Run MASt3R in torch, see :class:`~mpsfm_mast3r.network.PairNetwork`."""
         views = [
             {
                 "img": torch.from_numpy(image).to(self._device),
@@ -46,12 +46,12 @@ def _tensors(answer: dict[str, torch.Tensor], points: str) -> Tensors:
 
 
 class DenseMatcher(mast3r.DenseMatcher):
-    """Dense matcher in torch, see :class:`mpsfm_mast3r.matcher.DenseMatcher`."""
+    """Dense MASt3R matcher in torch, see :class:`mpsfm_mast3r.matcher.DenseMatcher`."""
 
     network = TorchPairNetwork
 
 
 class SparseMatcher(mast3r.SparseMatcher):
-    """Sparse matcher in torch, see :class:`mpsfm_mast3r.matcher.SparseMatcher`."""
+    """Sparse MASt3R matcher in torch, see :class:`mpsfm_mast3r.matcher.SparseMatcher`."""
 
     network = TorchPairNetwork

@@ -39,7 +39,7 @@ class DenseMatcher:
 
     def __init__(self, options: CollectionOptions, context: ProviderContext) -> None:
         self._matcher = load(options.network, context, options.max_keypoints)
-        self._matcher.skip_ransac = True  # vismatch's RANSAC fits a homography
+        self._matcher.skip_ransac = True  # RANSAC in vismatch fits a homography
         self._resize, self._seed = options.resize, context.seed
         self._first = _first_pixel(options.network)
 
@@ -55,7 +55,7 @@ class DenseMatcher:
 
     def _matched(self, *views: View) -> DenseMatches:
         images = [self._shown(view) for view in views]
-        np.random.seed(self._seed)  # some networks sample matches randomly
+        np.random.seed(self._seed)  # some matching networks sample matches randomly
         torch.manual_seed(self._seed)
         with inference():
             output = self._matcher(*images)

@@ -33,7 +33,7 @@ class TorchWarpNetwork(WarpNetwork):
         self._device = context.device
 
     def answer(self, view_a: View, view_b: View) -> tuple[NDArray[Any], NDArray[Any], bool]:
-        """Run the network, see :class:`~mpsfm_roma.network.WarpNetwork`."""
+        """Run RoMa in torch, see :class:`~mpsfm_roma.network.WarpNetwork`."""
         with tempfile.TemporaryDirectory(prefix="mpsfm-") as folder, inference():
             paths = []
             for side, view in zip("ab", (view_a, view_b), strict=True):
@@ -46,12 +46,12 @@ class TorchWarpNetwork(WarpNetwork):
 
 
 class DenseMatcher(roma.DenseMatcher):
-    """Dense matcher in torch, see :class:`mpsfm_roma.matcher.DenseMatcher`."""
+    """Dense RoMa matcher in torch, see :class:`mpsfm_roma.matcher.DenseMatcher`."""
 
     network = TorchWarpNetwork
 
 
 class SparseMatcher(roma.SparseMatcher):
-    """Sparse matcher in torch, see :class:`mpsfm_roma.matcher.SparseMatcher`."""
+    """Sparse RoMa matcher in torch, see :class:`mpsfm_roma.matcher.SparseMatcher`."""
 
     network = TorchWarpNetwork

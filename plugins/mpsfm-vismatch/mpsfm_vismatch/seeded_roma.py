@@ -13,8 +13,9 @@ import torch
 from mpsfm_vismatch.collection import provide_imports
 
 COARSE, FINE = 560, 280
-"""Image sides in pixels of RoMa's first and second pass. Published RoMa uses 560 and 864. If the
-first pass has another size than 560, RoMa versions differ in the radius of the warp refinement.
+"""Image sides in pixels of RoMa's first and second pass. The published RoMa uses image sides of 560
+and 864 pixels. If the first pass has another size than 560, RoMa versions differ in the radius of
+the warp refinement.
 """
 
 
@@ -22,7 +23,7 @@ def network(roma_outdoor: Callable[..., Any], device: str = "cpu") -> Any:
     """Create the RoMa network, with random weights that are seeded by the tensor names."""
     options = {"coarse_res": COARSE, "upsample_res": FINE, "use_custom_corr": False}
     known = inspect.signature(roma_outdoor).parameters
-    with patch.object(torch.nn.Module, "load_state_dict"):  # no weights files to load
+    with patch.object(torch.nn.Module, "load_state_dict"):  # there is no weights file to load
         made = roma_outdoor(
             device=device,
             weights={},

@@ -194,7 +194,7 @@ def _shade(scene, i, axis, point, direction, distance, pixel, normal, colour):
     kinds, inverses, _, _ = solids
     uv = np.empty(2)
     _surface(kinds, inverses, sizes, i, axis, point, direction, normal, uv)
-    look = looks[i]  # texture index, 1 / texture period, tint rgb, offset uv, shine, glow
+    look = looks[i]  # appearance: texture index, 1 / period, tint rgb, offset uv, shine, glow
     slant = max(
         0.15, -(normal[0] * direction[0] + normal[1] * direction[1] + normal[2] * direction[2])
     )
@@ -242,12 +242,12 @@ def _shade(scene, i, axis, point, direction, distance, pixel, normal, colour):
 def draw(scene, shows, sky, origin, rotation, focal, width, height, image, depth, normals, kind):
     """Render color, depth, normals and surface kind of a scene.
 
-    ``scene`` starts with the solids: kinds (n,), inverses (n, 3, 4), centers (n, 3) and radii (n,).
-    The next elements of ``scene`` are half sizes (n, 3), surface appearances (n, 9), and textures
-    (levels, t, s, s, 3). The shadow casters in ``scene`` are solid indices, and bounding spheres of
-    :data:`GROUP` solids each. The last elements of ``scene`` are lights (m, 7) and the ambient
-    light (2, 3) from above and below. ``shows`` (n,) is PLAIN, MIRROR or WINDOW for each solid, and
-    ``rotation`` is world_from_camera.
+    ``scene`` starts with the kinds (n,), inverse affine maps (n, 3, 4), centers (n, 3) and radii
+    (n,) of the solids. The next elements of ``scene`` are half sizes (n, 3), surface appearances
+    (n, 9), and textures (levels, t, s, s, 3). The shadow casters in ``scene`` are solid indices,
+    and bounding spheres of :data:`GROUP` solids each. The last elements of ``scene`` are lights (m,
+    7) and the ambient light (2, 3) from above and below. ``shows`` (n,) is PLAIN, MIRROR or WINDOW
+    for each solid, and ``rotation`` is world_from_camera.
 
     The function fills ``image`` (h, w, 3) in linear light, ``depth`` (h, w) along z, ``normals``
     (h, w, 3) in the camera frame, and ``kind`` (h, w) uint8. In ``kind``, 0 is sky, 1 is a surface,
