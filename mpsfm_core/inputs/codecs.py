@@ -44,31 +44,31 @@ def find_decoder(data: bytes, path: Path) -> Callable[[bytes, Path], UInt8] | No
 
 
 def is_heif(data: bytes) -> bool:
-    """Return whether the content is HEIF (AVIF is not included)."""
+    """Return whether the bytes of an image are HEIF, but not AVIF."""
     return data[4:8] == b"ftyp" and data[8:12] in (b"heic", b"heix", b"hevc", b"mif1", b"msf1")
 
 
 def is_avif(data: bytes) -> bool:
-    """Return whether the content is AVIF."""
+    """Return whether the bytes of an image are AVIF."""
     return data[4:12] in (b"ftypavif", b"ftypavis")
 
 
 def avif_exif(data: bytes) -> bytes | None:
-    """Return the EXIF block of an AVIF file, None if there is none or Pillow is missing."""
+    """Return the EXIF block of an AVIF file, None without EXIF data or without Pillow."""
     try:
         with importlib.import_module("PIL.Image").open(BytesIO(data)) as image:
             block = image.info.get("exif")
-    except Exception:  # decoding the pixels reports the reason
+    except Exception:  # decoding the image reports the reason later
         return None
     return bytes(block).removeprefix(b"Exif\x00\x00") if block else None
 
 
 def heif_exif(data: bytes) -> bytes | None:
-    """Return the EXIF block of a HEIF file, None if there is none or ``pillow_heif`` is missing."""
+    """Return the EXIF block of a HEIF file, None without EXIF data or ``pillow_heif``."""
     try:
         opened = importlib.import_module("pillow_heif").open_heif(data)
         block = opened.info.get("exif")
-    except Exception:  # decoding the pixels reports the reason
+    except Exception:  # decoding the image reports the reason later
         return None
     return None if block is None else bytes(block).removeprefix(b"Exif\x00\x00")
 
@@ -76,10 +76,10 @@ def heif_exif(data: bytes) -> bytes | None:
 def _decode_heif(data: bytes, path: Path) -> UInt8:
     library = _library("pillow_heif", "heic", path)
     try:
-        image = library.read_heif(data)  # applies the rotation in the file
+        image = library.read_heif(data)  # pillow_heif applies the rotation
         pixels = np.asarray(image.to_pillow().convert("RGB"))
-    except Exception as error:  # the library documents no exception types
-        raise InputError(f"image {path} cannot be decoded: {error}") from error
+    except Exception as error:  # the decoder documents no exception types
+        raise InputError(f"image file {path} cannot be decoded: {error}") from error
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
 
@@ -93,8 +93,8 @@ def _decode_avif(data: bytes, path: Path) -> UInt8:
         raise InputError(
             f"image {path}: this Pillow does not read AVIF: pip install 'mpsfm-core[avif]'"
         ) from error
-    except Exception as error:  # the library documents no exception types
-        raise InputError(f"image {path} cannot be decoded: {error}") from error
+    except Exception as error:  # the decoder documents no exception types
+        raise InputError(f"image file {path} cannot be decoded: {error}") from error
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
 
@@ -103,7 +103,7 @@ def _decode_raw(data: bytes, path: Path) -> UInt8:
     try:
         with library.imread(BytesIO(data)) as raw:
             pixels = raw.postprocess(use_camera_wb=True, output_bps=8)
-    except Exception as error:  # the library documents no exception types
+    except Exception as error:  # the decoder documents no exception types
         raise InputError(f"image {path} cannot be decoded: {error!r}") from error
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 

@@ -67,7 +67,9 @@ def _read(path: Path, database: sqlite3.Connection) -> ColmapDatabase:
     images, camera_of = {}, {}
     for number, name, camera_id in database.execute("SELECT image_id, name, camera_id FROM images"):
         if not isinstance(name, str) or camera_id not in cameras:
-            raise InputError(f"{path}, image {number} has no name or no camera")
+            raise InputError(
+                f"{path}: image {number} of the COLMAP database has no name or no camera"
+            )
         images[name.replace("\\", "/")] = number
         camera_of[number] = camera_id
     keypoints = {}
@@ -77,7 +79,7 @@ def _read(path: Path, database: sqlite3.Connection) -> ColmapDatabase:
         where = f"{path}, keypoints of image {number}"
         values = _array(where, count, columns, data, np.dtype("<f4"))
         if values.shape[1] < 2 or not np.isfinite(values[:, :2]).all():
-            raise InputError(f"{where}: x and y are missing or not finite")
+            raise InputError(f"{where}: keypoint coordinates x and y are missing or not finite")
         keypoints[number] = values[:, :2].astype(np.float64)
     matches = dict(_matches(path, database, "two_view_geometries"))
     matches |= {pair: rows for pair, rows in _matches(path, database, "matches") if len(rows)}
@@ -105,10 +107,12 @@ def _array(
     where: str, rows: object, columns: object, data: object, dtype: np.dtype[Any]
 ) -> NDArray[Any]:
     if not isinstance(rows, int) or not isinstance(columns, int) or min(rows, columns) < 0:
-        raise InputError(f"{where}: rows and columns are missing")
+        raise InputError(f"{where}: the array has no valid numbers of rows and columns")
     content = data if isinstance(data, bytes) else b""
     if rows * columns * dtype.itemsize != len(content):
-        raise InputError(f"{where} are cut off: {len(content)} bytes for {rows} x {columns} values")
+        raise InputError(
+            f"{where}: the array has {len(content)} bytes for {rows} x {columns} values"
+        )
     return np.frombuffer(content, dtype).reshape(rows, columns)
 
 
@@ -119,10 +123,12 @@ def _camera(
     sized = isinstance(width, int) and isinstance(height, int) and min(width, height) > 0
     if model not in known or model == -1 or not sized or not isinstance(params, bytes):
         raise InputError(
-            f"{where}: the model ({model}) is unknown, or size or parameters are missing"
+            f"{where}: the camera model ({model}) is unknown, or size or parameters are missing"
         )
     values = np.frombuffer(params, "<f8") if len(params) % 8 == 0 else np.zeros(0)
     camera = pycolmap.Camera(model=known[model], width=width, height=height, params=values)
     if not camera.verify_params() or not np.isfinite(values).all():
-        raise InputError(f"{where}: invalid parameters for {known[model]}: {values.tolist()}")
+        raise InputError(
+            f"{where}: invalid parameters of the camera model {known[model]}: {values.tolist()}"
+        )
     return camera

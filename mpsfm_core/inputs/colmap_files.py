@@ -45,7 +45,7 @@ def _check(data: bytes, record_end: Callable[[bytes, int], int]) -> None:
 
 
 def _camera_end(data: bytes, start: int) -> int:
-    return start + _CAMERA_START + 8  # at least one parameter; COLMAP checks the number
+    return start + _CAMERA_START + 8  # a camera has at least one parameter
 
 
 def _image_end(data: bytes, start: int) -> int:

@@ -41,10 +41,14 @@ class HlocFiles:
         values, attributes = self.features.read(f"{name}/keypoints")
         where = f"{self.features.path}, keypoints of {name!r}"
         if values.ndim != 2 or values.shape[1] != 2 or not _finite(values):
-            raise InputError(f"{where} must be finite x and y, their shape is {values.shape}")
+            raise InputError(
+                f"{where}: keypoints must be finite and of shape (n, 2), not {values.shape}"
+            )
         std = attributes.get("uncertainty", 1.0)
         if not isinstance(std, (int, float, np.number)) or not 0 < float(std) < np.inf:
-            raise InputError(f"{where}: the uncertainty {std!r} is not a number of pixels")
+            raise InputError(
+                f"{where}: the keypoint uncertainty {std!r} is not a positive number of pixels"
+            )
         return values.astype(np.float64) + _TO_COLMAP, float(std)
 
     def size(self, name: str) -> tuple[int, int] | None:
@@ -53,7 +57,9 @@ class HlocFiles:
             return None
         values = self.features.read(f"{name}/image_size")[0].ravel()
         if values.shape != (2,) or not _finite(values):
-            raise InputError(f"{self.features.path}, {name!r}: image_size is not width, height")
+            raise InputError(
+                f"{self.features.path}, {name!r}: the dataset image_size is not (width, height)"
+            )
         return int(values[0]), int(values[1])
 
     def pairs(self, names: list[str]) -> Iterator[tuple[str, str, Int64, Float32]]:
@@ -74,12 +80,12 @@ class HlocFiles:
         where = f"{self.matches.path}, pair {pair!r}"
         target = self.matches.read(f"{pair}/matches0")[0]
         if target.ndim != 1 or not np.issubdtype(target.dtype, np.integer):
-            raise InputError(f"{where}: matches0 must be a list of rows")
+            raise InputError(f"{where}: the dataset matches0 must be a vector of keypoint indices")
         scores = np.ones(len(target), np.float32)
         if self.matches.has(f"{pair}/matching_scores0"):
             scores = self.matches.read(f"{pair}/matching_scores0")[0]
         if scores.shape != target.shape or not _finite(scores):
-            raise InputError(f"{where}: matching_scores0 and matches0 differ in length")
+            raise InputError(f"{where}: matching_scores0 must be finite and as long as matches0")
         rows = np.flatnonzero(target >= 0)
         indices = np.stack([rows, target[rows]], axis=1).astype(np.int64)
         return indices, np.clip(scores[rows], 0, 1).astype(np.float32)
@@ -97,7 +103,7 @@ class _Hdf5:
                 f"{path}: reading HDF5 needs h5py: pip install 'mpsfm-core[hloc]'"
             ) from error
         if not path.is_file():
-            raise InputError(f"{path} does not exist; check the path")
+            raise InputError(f"HDF5 file {path} does not exist; check the path")
 
     def datasets(self) -> list[str]:
         """Return the full names of all datasets in the HDF5 file."""

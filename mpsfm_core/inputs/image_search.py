@@ -60,21 +60,21 @@ def find_images(folder: Path, without: Path | None = None) -> list[str]:
     masks = _find_mask_names(names)
     if undecodable:
         _log.warning(
-            "%s in %s: %s; rename them, for example with convmv",
+            "%s in %s: %s; rename these files, for example with convmv",
             _count(len(undecodable), "name is not UTF-8", "names are not UTF-8"),
             escape(str(folder)),
             escape(list_names(undecodable)),
         )
     if unread:
         _log.warning(
-            "%s in %s: %s; convert them to JPEG or PNG, with the extension in their names",
+            "%s in %s: %s; convert the pictures to JPEG or PNG, with the extension in their names",
             _count(len(unread), "picture is not read", "pictures are not read"),
             folder,
             list_names(sorted(unread, key=_natural_sort_key)),
         )
     if masks:
         _log.warning(
-            "%s in %s: %s; they are not reconstructed. To use them: --set inputs.masks=%s",
+            "%s in %s: %s; masks are not reconstructed. To use these masks: --set inputs.masks=%s",
             _count(len(masks), "file is a mask", "files are masks"),
             folder,
             list_names(masks),
@@ -109,7 +109,7 @@ def require_two_images(folder: Path, names: list[str], source: Path) -> None:
             f"{videos[0]!r}. Give one video instead of the folder: "
             f"mpsfm reconstruct '{folder / videos[0]}'"
         )
-    raise InputError(f"{source} has {content}: a reconstruction needs two or more")
+    raise InputError(f"{source} has {content}: a reconstruction needs two or more images")
 
 
 def check_output_folder(output: Path, folder: Path) -> None:
@@ -120,7 +120,7 @@ def check_output_folder(output: Path, folder: Path) -> None:
         )
     if output.resolve() == folder.resolve():
         raise InputError(
-            f"{output} is the folder of the photos, and results must not be mixed with them. "
+            f"{output} is the folder of the photos, and results must not be mixed with photos. "
             f"Choose another output folder, such as {output / 'reconstruction'}"
         )
     inside = _find_below(output, folder)

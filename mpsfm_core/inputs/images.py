@@ -78,7 +78,7 @@ class SourceImage:
     pinhole: PinholeCamera
     """Pinhole camera of the undistorted and possibly downscaled image."""
     focal_source: FocalSource
-    """Source of the focal length."""
+    """Source of the focal length, such as EXIF."""
     digest: str
     """SHA-256 hash of the image file."""
     orientation: int = 1
@@ -423,7 +423,7 @@ def _report_left_out(left_out: Mapping[str, str], total: int, options: InputOpti
     rest = len(faults) - MAX_LISTED
     text = "; ".join(faults[:MAX_LISTED]) + (f"; and {rest} more" if rest > 0 else "")
     if options.strict:
-        raise InputError(f"{text} (inputs.strict=false leaves such photos out)")
+        raise InputError(f"{text} (set inputs.strict=false to leave out such photos)")
     if len(faults) > total / 2 or total - len(faults) < 2:
         raise InputError(f"{len(faults)} of {total} photos cannot be used: {text}")
     _log.warning("%d of %d photos cannot be used and are left out: %s", len(faults), total, text)
@@ -433,8 +433,8 @@ def _warn_of_default_focal_lengths(images: Sequence[SourceImage], options: Input
     guessed = [image.name for image in images if image.focal_source == "default"]
     if guessed:
         _log.warning(
-            "%d of %d images (%s%s) have no known focal length. %g times the longer side "
-            "is assumed; give --intrinsics for a better result",
+            "%d of %d images (%s%s) have no known focal length. The assumed focal length is %g "
+            "times the longer image side; give --intrinsics for a better result",
             len(guessed),
             len(images),
             ", ".join(guessed[:MAX_LISTED]),

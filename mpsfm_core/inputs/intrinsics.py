@@ -204,7 +204,9 @@ def _from_yaml(path: Path) -> tuple[CameraEntry, ...]:
     except (yaml.YAMLError, RecursionError, ValueError) as error:
         raise InputError(f"{path} is not valid YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, Mapping) or not data:
-        raise InputError(f"{path}: expected cameras by number; the documentation shows the format")
+        raise InputError(
+            f"{path}: expected cameras by number; docs/inputs.md shows intrinsics.yaml"
+        )
     return tuple(_yaml_entry(path, key, value) for key, value in data.items())
 
 
@@ -213,21 +215,25 @@ def _yaml_entry(path: Path, key: object, value: object) -> CameraEntry:
     if not isinstance(key, int) or isinstance(key, bool):
         raise InputError(f"{where}: the key of a camera must be a number (1:, 2:, ...)")
     if not isinstance(value, Mapping):
-        raise InputError(f"{where}: expected a mapping with 'params' and 'images'")
+        raise InputError(f"{where}: expected a mapping of the camera with 'params' and 'images'")
     for name in value:
         if name not in _KEYS:
-            raise InputError(f"{where}: unknown key {name!r}{did_you_mean(str(name), _KEYS)}")
+            raise InputError(
+                f"{where}: unknown camera key {name!r}{did_you_mean(str(name), _KEYS)}"
+            )
     params: Any = value.get("params")
     if not _is_list_of(params, (int, float)):
-        raise InputError(f"{where}: 'params' must be a list of numbers")
+        raise InputError(f"{where}: camera 'params' must be a list of numbers")
     size: Any = (value.get("width"), value.get("height"))
     if size == (None, None):
         size = None
     elif not _is_list_of(size, int):
-        raise InputError(f"{where}: 'width' and 'height' must both be whole numbers, or absent")
+        raise InputError(
+            f"{where}: camera 'width' and 'height' must both be whole numbers, or absent"
+        )
     images: Any = value.get("images", "all")
     if images != "all" and not _is_list_of(images, str):
-        raise InputError(f"{where}: 'images' must be 'all' or a list of names")
+        raise InputError(f"{where}: camera 'images' must be 'all' or a list of image names")
     model = value.get("model") or _DEFAULT_MODELS.get(len(params))
     return _entry(where, key, model, params, size, None if images == "all" else images)
 
@@ -248,7 +254,9 @@ def _from_text(path: Path) -> tuple[CameraEntry, ...]:
             number, size = int(fields[0]), (int(fields[2]), int(fields[3]))
             params = [float(value) for value in fields[4:]]
         except (ValueError, IndexError) as error:
-            raise InputError(f"{where}: expected ID MODEL WIDTH HEIGHT PARAMS") from error
+            raise InputError(
+                f"{where}: expected the cameras.txt line ID MODEL WIDTH HEIGHT PARAMS"
+            ) from error
         images = names.get(number, []) if names or len(cameras) > 1 else None
         entry = _entry(where, number, fields[1], params, size, images)
         entries.append(replace(entry, is_stored=True))
@@ -298,9 +306,13 @@ def _entry(
 ) -> CameraEntry:
     known = [name for name in pycolmap.CameraModelId.__members__ if name != "INVALID"]
     if model is None:
-        raise InputError(f"{where}: {len(params)} params need a 'model', one of {', '.join(known)}")
+        raise InputError(
+            f"{where}: {len(params)} camera params need a 'model', one of {', '.join(known)}"
+        )
     if model not in known:
-        raise InputError(f"{where}: unknown model {model!r}{did_you_mean(str(model), known)}")
+        raise InputError(
+            f"{where}: unknown camera model {model!r}{did_you_mean(str(model), known)}"
+        )
     camera = pycolmap.Camera(model=model, width=1, height=1, params=list(params))
     if not camera.verify_params():
         raise InputError(

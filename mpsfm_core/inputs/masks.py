@@ -86,8 +86,9 @@ def find_masks(folder: Path, names: Sequence[str], images_folder: Path) -> dict[
         content = f"has {list_names(sorted(files))}" if files else "has no image files"
         expected = f"{names[0]}.png" if names else "NAME.png"
         raise InputError(
-            f"masks folder {folder}: no file is the mask of an image. It {content}; the mask of "
-            f"{names[0]!r} is called {expected!r} or {_strip(expected[:-4]) + '_mask.png'!r}"
+            f"masks folder {folder}: no file is the mask of an image. The masks folder "
+            f"{content}; the mask of {names[0]!r} is called {expected!r} or "
+            f"{_strip(expected[:-4]) + '_mask.png'!r}"
         )
     missing = [name for name in names if name not in masks]
     if missing:
@@ -148,7 +149,7 @@ def orient_masks(
         stored = upright[::-1] if orientation >= 5 else upright
         if mask.size not in (upright, stored):
             raise InputError(
-                f"mask {path} has {mask.size[0]}x{mask.size[1]} pixels, its image {name!r} has "
+                f"mask {path} has {mask.size[0]}x{mask.size[1]} pixels, but its image {name!r} has "
                 f"{upright[0]}x{upright[1]}; give the mask of the original image"
             )
         if not mask.allows_pixels:
@@ -166,8 +167,8 @@ def orient_masks(
         turned[name] = MaskFile(masks[name], orientations[name] if is_stored else 1)
     if ambiguous and convention == "auto" and num_stored == num_upright:
         _log.warning(
-            "masks of %d rotated photos are taken as stored, like COLMAP does: %s; if they are "
-            "upright: --set inputs.mask_orientation=upright",
+            "masks of %d rotated photos are rotated like the photos, as in COLMAP: %s; if the "
+            "masks are upright: --set inputs.mask_orientation=upright",
             len(ambiguous),
             list_names(ambiguous),
         )

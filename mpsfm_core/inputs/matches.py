@@ -111,7 +111,7 @@ class _Builder:
                 name = self._images[index].name
                 raise InputError(
                     f"{self._source}: a match refers to keypoint {rows.max()} of {name!r}, which "
-                    f"has {len(new_rows)}"
+                    f"has {len(new_rows)} keypoints"
                 )
             columns.append(new_rows[rows])
         matches = np.stack(columns, axis=1)
@@ -124,9 +124,13 @@ class _Builder:
         """Return the imported matches; raise :class:`InputError` if there are none."""
         if not self._rows:
             difference = describe_name_difference(self._images.names, self._source_names)
-            raise InputError(f"{self._source}: has keypoints of none of the images; {difference}")
+            raise InputError(
+                f"{self._source}: the file has keypoints of none of the images; {difference}"
+            )
         if not self._matches:
-            raise InputError(f"{self._source}: has no matches of these images")
+            raise InputError(
+                f"{self._source}: the file has no matches between the images of the run"
+            )
         return ImportedMatches(
             self._source, tuple(self._keypoints), tuple(self._std_px), self._matches
         )
@@ -143,5 +147,5 @@ def _upright(
     if size == (width, height):
         return keypoints
     raise InputError(
-        f"{source}: its {image.name!r} has {size[0]}x{size[1]} pixels, the photo {width}x{height}"
+        f"{source}: image {image.name!r} has {size[0]}x{size[1]} pixels, the photo {width}x{height}"
     )

@@ -98,7 +98,7 @@ def find_model_folder(folder: Path) -> Path:
     for candidate in (folder, folder / "sparse", folder / "sparse" / "0"):
         if any((candidate / f"images.{suffix}").is_file() for suffix in ("bin", "txt")):
             return candidate
-    raise InputError(f"{folder} has no COLMAP model (images.bin or images.txt)")
+    raise InputError(f"folder {folder} has no COLMAP model (images.bin or images.txt)")
 
 
 def read_image_lines(path: Path) -> dict[int, tuple[int, str]]:
@@ -176,7 +176,7 @@ def match_names(wanted: Iterable[str], available: Iterable[str]) -> dict[str, st
 
     Args:
         wanted: names of the images of the run.
-        available: names in the other source.
+        available: image names in the other source.
 
     Returns:
         Available names by image name, without image names that have no or several matches.

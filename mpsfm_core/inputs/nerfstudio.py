@@ -66,7 +66,7 @@ def read_transforms(path: Path, images_folder: Path | None = None) -> pycolmap.R
         raise InputError(f"{path} cannot be read: {error}") from error
     frames = data.get("frames") if isinstance(data, dict) else None
     if not isinstance(frames, list) or not frames:
-        raise InputError(f"{path}: it has no 'frames', so it is not a transforms.json")
+        raise InputError(f"{path}: the file has no 'frames', so it is not a transforms.json")
     shared = {key: value for key, value in data.items() if key != "frames"}
     model = pycolmap.Reconstruction()
     cameras: dict[str, int] = {}
@@ -74,11 +74,11 @@ def read_transforms(path: Path, images_folder: Path | None = None) -> pycolmap.R
     for number, frame in enumerate(frames, start=1):
         where = f"{path}, frame {number}"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
-            raise InputError(f"{where}: has no 'file_path'")
+            raise InputError(f"{where}: the frame has no 'file_path'")
         name = posixpath.normpath(frame["file_path"].replace("\\", "/"))
         where += f" ({name})"
         if name in names:
-            raise InputError(f"{where}: an earlier frame has the same file_path")
+            raise InputError(f"{where}: an earlier frame of transforms.json has the same file_path")
         names.add(name)
         camera = _camera(where, {**shared, **frame}, _find_image(path.parent / name, images_folder))
         key = camera_key(camera)
@@ -136,13 +136,17 @@ def _camera(where: str, values: Mapping[str, Any], picture: Path | None) -> pyco
     if "w" not in numbers or "h" not in numbers:
         numbers.update(_picture_size(where, picture))
     if not 1 <= min(numbers["w"], numbers["h"]) <= max(numbers["w"], numbers["h"]) < _LARGEST:
-        raise InputError(f"{where}: no image has 'w' {numbers['w']:g} and 'h' {numbers['h']:g}")
+        raise InputError(
+            f"{where}: image width 'w' {numbers['w']:g} or height 'h' {numbers['h']:g} is invalid"
+        )
     width, height = int(numbers["w"]), int(numbers["h"])
     focal = numbers.get("fl_x")
     if focal is None and 0 < numbers.get("camera_angle_x", 0) < math.pi:
         focal = 0.5 * width / math.tan(0.5 * numbers["camera_angle_x"])
     if focal is None or min(focal, width, height) <= 0:
-        raise InputError(f"{where}: no focal length ('fl_x', in pixels, or 'camera_angle_x')")
+        raise InputError(
+            f"{where}: the frame has no focal length ('fl_x' in pixels, or 'camera_angle_x')"
+        )
     center = numbers.get("cx", width / 2), numbers.get("cy", height / 2)
     params = [focal, numbers.get("fl_y", focal), *center]
     k1, k2, k3, k4, p1, p2 = (numbers.get(k, 0.0) for k in ("k1", "k2", "k3", "k4", "p1", "p2"))
@@ -190,7 +194,8 @@ def _picture_size(where: str, file: Path | None) -> dict[str, float]:
     """Return (width, height) of the image file of a frame."""
     if file is None:
         raise InputError(
-            f"{where}: 'w' and 'h' are missing, and so is the image file; add them to the file"
+            f"{where}: 'w' and 'h' are missing, and so is the image file; "
+            f"add 'w' and 'h' to transforms.json"
         )
     data = read_bytes(file)
     check_size(data, file, InputOptions().max_pixels)

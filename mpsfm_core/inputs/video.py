@@ -22,7 +22,7 @@ from mpsfm_core.support.files import replace_entries
 from mpsfm_core.support.format_versions import VERSION, check_version
 
 EXTENSIONS = frozenset((".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".wmv"))
-"""Extensions of video files."""
+"""File extensions of videos."""
 FRAMES = "frames"
 """Subfolder of the output folder with the selected video frames."""
 
@@ -102,7 +102,8 @@ def choose_frames(
 
     Points are tracked from each selected frame with Lucas-Kanade optical flow. The next frame is
     selected when the tracked points have moved by ``options.motion`` or only the share
-    ``options.overlap`` of the points is still tracked. A sharper frame shortly before is preferred.
+    ``options.overlap`` of the points is still tracked. If an earlier frame nearby is sharper, the
+    earlier frame is selected instead.
 
     Raises:
         InputError: as :func:`extract_frames`.
@@ -116,7 +117,7 @@ def choose_frames(
         if progress is not None:
             progress(decoded, max(announced, decoded))
     if decoded < _MIN_FRAME_RATIO * announced:
-        _log.warning("%s is cut off: it has %d of %d frames", video, decoded, announced)
+        _log.warning("video %s is cut off: the file has %d of %d frames", video, decoded, announced)
     chosen = chooser.finish()
     if len(chosen) < 2:
         raise InputError(

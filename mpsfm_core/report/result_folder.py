@@ -127,7 +127,7 @@ class ResultFolder:
             camera = PinholeCamera(width, height, *map(float, data["camera"]))
             return RefinedMap(depth, std, valid, camera, pose[:, :3], pose[:, 3])
         except _UNREADABLE as error:
-            raise InputError(f"{file} is damaged: {error}") from error
+            raise InputError(f"depth map file {file} is damaged: {error}") from error
 
     def prior(self, name: str) -> PriorMaps | None:
         """Read the priors of an image, None if the run wrote no priors."""
@@ -145,7 +145,7 @@ class ResultFolder:
                 PinholeCamera(int(width), int(height), *params),
             )
         except _UNREADABLE as error:
-            raise InputError(f"{file} is damaged: {error}") from error
+            raise InputError(f"prior file {file} is damaged: {error}") from error
 
     def picture(self, name: str) -> UInt8 | None:
         """Read the downscaled undistorted image, (h, w, 3) BGR, None if the run wrote no image."""
@@ -154,7 +154,7 @@ class ResultFolder:
             return None
         picture = cv2.imdecode(np.frombuffer(file.read_bytes(), np.uint8), cv2.IMREAD_COLOR)
         if picture is None:
-            raise InputError(f"{file} is damaged")
+            raise InputError(f"image {file} is damaged")
         return np.asarray(picture, np.uint8)
 
     def matches(self) -> list[MatchLines]:
@@ -175,11 +175,11 @@ class ResultFolder:
                 for row, (a, b) in enumerate(data["pairs"])
             ]
         except _UNREADABLE as error:
-            raise InputError(f"{file} is damaged: {error}") from error
+            raise InputError(f"match file {file} is damaged: {error}") from error
 
 
 def _load(file: Path) -> dict[str, Any]:
     try:
         return read_npz(file)
     except (OSError, ValueError) as error:
-        raise InputError(f"{file} is damaged: {error}") from error
+        raise InputError(f"result file {file} is damaged: {error}") from error

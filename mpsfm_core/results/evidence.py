@@ -25,8 +25,8 @@ def count_explained_matches(
     """Count the matches of each registered image pair whose keypoints share a 3D point.
 
     Args:
-        reconstruction: Reconstruction of some images of the problem.
-        problem: Images and verified pairs.
+        reconstruction: reconstruction of some images of the mapping problem.
+        problem: mapping problem with images and verified pairs.
 
     Returns:
         Number of explained matches by pair of image names.
@@ -46,8 +46,8 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
     """Describe the evidence for the poses of a reconstruction as plain data.
 
     Args:
-        reconstruction: Reconstruction of some images of the problem.
-        problem: Images and verified pairs.
+        reconstruction: reconstruction of some images of the mapping problem.
+        problem: mapping problem with images and verified pairs.
 
     Returns:
         Plain data with the following keys. ``parts``: image names of each connected part of the

@@ -35,7 +35,7 @@ def write_ply(
     """Write a point cloud or mesh as binary little-endian PLY.
 
     Args:
-        path: file to write.
+        path: PLY file to write.
         points: (n, 3) vertex positions, written as float32.
         colors: (n, 3) uint8 RGB colors of the vertices.
         normals: (n, 3), optional.
@@ -97,12 +97,12 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
     if encoding == "ascii":
         vertices = _read_text(path, body, vertex, count)
     elif len(body) < count * vertex.itemsize:
-        raise InputError(f"{path} is cut off: the header has {count} points")
+        raise InputError(f"PLY file {path} is cut off: the header has {count} points")
     else:
         vertices = np.frombuffer(body, vertex, count)
     points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
     if not np.isfinite(points).all():
-        raise InputError(f"{path} has points that are not finite")
+        raise InputError(f"PLY file {path} has points that are not finite")
     rgb = ("red", "green", "blue")
     if not set(rgb) <= set(vertex.names or ()):
         return points, np.full((count, 3), 128, np.uint8)
@@ -125,15 +125,15 @@ def _layout(path: Path, header: list[str], order: str) -> tuple[np.dtype[Any], i
                 raise InputError(f"{path}: a vertex property has an unknown type: {line}")
     names = [name for name, _ in layout]
     if count is None or not {"x", "y", "z"} <= set(names) or len(set(names)) < len(names):
-        raise InputError(f"{path}: the vertices need x, y and z once each")
+        raise InputError(f"{path}: the vertices need x, y and z once each in the PLY header")
     return np.dtype(layout), count
 
 
 def _read_text(path: Path, body: bytes, vertex: np.dtype[Any], count: int) -> NDArray[Any]:
     lines = body.decode("ascii", "replace").splitlines()[:count]
     if len(lines) < count:
-        raise InputError(f"{path} is cut off: the header has {count} points")
+        raise InputError(f"PLY file {path} is cut off: the header has {count} points")
     try:
         return np.array([tuple(map(float, line.split())) for line in lines], dtype=vertex)
     except (ValueError, OverflowError) as error:
-        raise InputError(f"{path} has a point that cannot be read: {error}") from error
+        raise InputError(f"PLY file {path} has a point that cannot be read: {error}") from error

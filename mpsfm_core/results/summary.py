@@ -41,7 +41,7 @@ def read_summary(path: Path) -> dict[str, Any]:
             f"{path}: {error.strerror}; give a folder that 'mpsfm reconstruct' wrote"
         ) from error
     except (ValueError, RecursionError) as error:
-        raise InputError(f"{path} is damaged: {error}") from error
+        raise InputError(f"summary {path} is damaged: {error}") from error
     if not isinstance(summary, dict) or summary.get("status") not in ("success", "failed"):
         raise InputError(f"{path} is not the summary of a run")
     check_version(summary, FORMAT, path)
@@ -55,7 +55,7 @@ def describe_images(
 
     Args:
         images: images of the run.
-        extraction: report of the extraction.
+        extraction: report of the extraction of features, priors and matches.
         mapping: result of the mapper.
     """
     component = {
@@ -117,7 +117,7 @@ def describe_pairs(
     first model. The entry ``cannot_start`` explains why a pair cannot initialize a component.
 
     Args:
-        extraction: report of the extraction.
+        extraction: report of the extraction of features, priors and matches.
         mapping: result of the mapper.
         problem: input of the mapper.
     """

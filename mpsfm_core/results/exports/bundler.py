@@ -26,7 +26,7 @@ def write(source: ExportSource, folder: Path) -> None:
     """Write a folder in Bundler's format; the focal length is the mean of fx and fy.
 
     Raises:
-        InputError: the image files are missing, or a name has a space.
+        InputError: the image files are missing, or an image name has a space.
     """
     model = source.undistorted()
     images = sort_images_by_name(model)

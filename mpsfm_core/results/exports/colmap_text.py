@@ -12,10 +12,10 @@ ENTRIES = ("cameras.txt", "images.txt", "points3D.txt", "rigs.txt", "frames.txt"
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the text model of the original images.
+    """Write the COLMAP text model of the original images.
 
     Raises:
-        InputError: a name has a space, which COLMAP's text format does not allow.
+        InputError: an image name has a space, which COLMAP's text format does not allow.
     """
     check_names_without_spaces(source.names, "COLMAP's text format")
     write_model(folder, source.model, text=True)

@@ -72,7 +72,7 @@ def known_formats(registry: Registry | None = None) -> dict[str, ExportFormat]:
     """Return all export formats of the core and of plugins by name.
 
     Args:
-        registry: plugins; by default all installed plugins.
+        registry: registry of plugins, by default of all installed plugins.
     """
     registry = registry or Registry.discover()
     plugin_formats = [f for formats in registry.call_hook("mpsfm_export_formats") for f in formats]
@@ -91,7 +91,7 @@ def export(
     turn: bool | None = None,
     registry: Registry | None = None,
 ) -> dict[str, Any]:
-    """Export a result folder or COLMAP model to another format.
+    """Export a result folder or COLMAP model to another file format.
 
     Args:
         folder: result folder or COLMAP model.
@@ -100,7 +100,7 @@ def export(
         photos: folder of the original images, if it has moved since the run.
         turn: true to rotate gravity to -z and move the origin to the median point, None for the
             default of the export format.
-        registry: plugins; by default all installed plugins.
+        registry: registry of plugins, by default of all installed plugins.
 
     Returns:
         The content of the file :data:`DESCRIPTION`, and the path of the export folder as
@@ -133,7 +133,7 @@ def _writer_of(chosen: ExportFormat) -> Callable[[ExportSource, Path], None]:
         return chosen.write
     try:
         writer: Callable[[ExportSource, Path], None] = resolve_name(chosen.write)
-    except Exception as error:  # plugin code may raise anything
+    except Exception as error:  # a plugin may raise any exception
         text = f"format {chosen.name!r} cannot be written: {type(error).__name__}: {error}"
         raise InputError(text) from error
     return writer

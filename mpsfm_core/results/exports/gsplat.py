@@ -71,7 +71,7 @@ def write_maps(source: ExportSource, folder: Path) -> None:
 
 
 def write_gaussians(path: Path, points: Float64, colors: UInt8) -> None:
-    """Write isotropic Gaussians in the PLY layout of Kerbl et al. (2023). (2023).
+    """Write isotropic Gaussians in the PLY layout of 3D Gaussian splatting. (2023).
 
     Args:
         path: PLY file to write.

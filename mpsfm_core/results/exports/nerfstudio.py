@@ -1,4 +1,4 @@
-"""Export for nerfstudio: ``transforms.json`` with images, depth and points.
+"""Export a ``transforms.json`` with images, depth and points for nerfstudio.
 
 ::
 

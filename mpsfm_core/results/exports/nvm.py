@@ -22,7 +22,7 @@ def write(source: ExportSource, folder: Path) -> None:
     """Write a folder with an NVM file; the focal length is the mean of fx and fy.
 
     Raises:
-        InputError: the image files are missing, or a name has a space, which NVM does not allow.
+        InputError: the image files are missing, or an image name has a space.
     """
     model = source.undistorted()
     images = sort_images_by_name(model)
