@@ -32,9 +32,9 @@ def losses(out: Mapping[str, Tensor], batch: Batch) -> dict[str, Tensor]:
     """Compute the weighted terms of the training loss.
 
     The depth terms are the absolute log-depth error after aligning the scale of each image, the
-    log-scale error of metric samples, and the error of log-depth differences at four pixel
-    distances. The term of the predicted std is the negative Laplace log-likelihood of residuals of
-    measured depth. The std term has no gradient with respect to the predicted depth.
+    log-scale error of metric samples, and the error of log-depth gradients. The term of the
+    predicted std is the negative Laplace log-likelihood of residuals of measured depth. The std
+    term has no gradient with respect to the predicted depth.
     """
     known = batch.known
     measured = known & (batch.kind == SURFACE)

@@ -14,8 +14,7 @@ three iterations."""
 
 
 def find_nearest(queries: Float32, base: Float32) -> Int64:
-    """Find the index (n,) of the descriptor in ``base`` (m, d) most similar to each query (n,
-    d)."""
+    """Find the index (n,) of the most similar descriptor in ``base`` for each query (n, d)."""
     step = max(1, _BLOCK // max(len(base), 1))
     blocks = [
         (queries[start : start + step] @ base.T).argmax(axis=1)

@@ -1,5 +1,4 @@
-"""Provider contract tests of one Metric3D size. All network sizes of Metric3D share the tested
-code."""
+"""Provider contract tests of one Metric3D size, because all sizes share the tested code."""
 
 import pytest
 

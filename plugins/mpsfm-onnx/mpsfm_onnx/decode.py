@@ -122,8 +122,7 @@ def estimate_z_shift(points: Float64, xy: Float64, valid: Bool | None = None) ->
 
 
 def _step(miss: Float64, slope: Float64) -> float:
-    """Compute the Gauss-Newton step of the z-shift from residual ``miss`` and Jacobian
-    ``slope``."""
+    """Compute the Gauss-Newton step of the z-shift from residuals and Jacobian (``slope``)."""
     return float((miss * slope).sum() / max((slope**2).sum(), 1e-12))
 
 

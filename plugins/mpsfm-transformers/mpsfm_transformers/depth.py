@@ -94,8 +94,7 @@ class PromptDepth:
         self._preparation: Preparation = preparation_for(self._model)
 
     def predict(self, view: View) -> DepthPrior:
-        """Predict metric depth. All pixels of the prior are invalid if the view has no sensor
-        depth."""
+        """Predict metric depth, with only invalid pixels if the view has no sensor depth."""
         sensor = self._sensor.predict(view)
         if not sensor.valid.any():
             return sensor

@@ -56,8 +56,7 @@ class Warping:
 
 
 class Pointing:
-    """Replacement of vismatch's MASt3R matcher. The predicted 3D points are pixel colors, shifted
-    in front of the camera."""
+    """Replacement of vismatch's MASt3R matcher, whose 3D points are shifted pixel colors."""
 
     def __init__(self, device: str = "cpu", max_num_keypoints: int = 2048) -> None:
         self.model = torch.nn.Module()

@@ -1,7 +1,7 @@
 """Functions ``(builder, x, y, yaw)`` that add a piece of furniture of random size.
 
 The back of the furniture is at ``(x, y)`` in meters, and the front faces the direction ``yaw``
-(rad). All furniture has sizes as in real rooms.
+(rad). All pieces have the size of real furniture.
 """
 
 from __future__ import annotations
