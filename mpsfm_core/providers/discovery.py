@@ -169,11 +169,11 @@ def inspect_plugin(module: object, name: str, distribution: str, version: str) -
     manager.register(module, name)
     callers = manager.get_hookcallers(module) or []
     if not callers:
-        raise TypeError(f"{name!r} is a {type(module).__name__} without any mpsfm hook")
+        raise TypeError(f"plugin {name!r} is a {type(module).__name__} without any mpsfm hook")
     answers = manager.hook.mpsfm_providers()
     answer = answers[0] if answers else ()
     if not isinstance(answer, (list, tuple)):
-        raise TypeError(f"mpsfm_providers returned {type(answer).__name__}, not a list")
+        raise TypeError(f"the hook mpsfm_providers returned {type(answer).__name__}, not a list")
     known = [caller for caller in callers if caller.has_spec()]
     unknown = [caller.name for caller in callers if not caller.has_spec()]
     fault = ""
@@ -214,7 +214,7 @@ def _distribution(entry: metadata.EntryPoint) -> tuple[str, str]:
         if entry.dist is not None:
             return str(entry.dist.name), str(entry.dist.version)
     except Exception as error:
-        _log.info("no metadata for the entry point %s: %s", entry.name, error)
+        _log.info("the package metadata of plugin %s cannot be read: %s", entry.name, error)
     return "unknown distribution", "unknown"
 
 
@@ -238,7 +238,7 @@ def _load(
         thread.join(timeout_s)
     if not outcome:
         fault = f"did not load within {timeout_s:g} s"
-        _log.warning("plugin %r of %s %s %s", entry.name, distribution, version, fault)
+        _log.warning("plugin %r of package %s %s %s", entry.name, distribution, version, fault)
         hint = f"pip uninstall {distribution}, or raise MPSFM_PLUGIN_TIMEOUT_S"
         return LoadedPlugin(entry.name, distribution, version, fault=fault, hint=hint)
     result = outcome[0]

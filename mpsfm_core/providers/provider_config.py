@@ -45,7 +45,7 @@ class ProviderConfig(Options):
     def _merge_environment(cls, values: Any) -> Any:
         if isinstance(values, Mapping) and values.get("environment") and "use" in values:
             if values["use"] == SAME_NETWORK or "@" in str(values["use"]):
-                raise ValueError(f"environment: 'use: {values['use']}' already selects one")
+                raise ValueError(f"environment: 'use: {values['use']}' already selects it")
             values = {**values, "use": f"{values['use']}@{values['environment']}"}
             del values["environment"]
         return values

@@ -542,7 +542,7 @@ def _require_methods(entry: _Entry, provider: object, names: Sequence[str]) -> N
     for name in names:
         if not callable(getattr(provider, name, None)):
             kind = type(provider).__name__
-            raise ProviderError(f"{entry.label} gives a {kind} without the method {name}()")
+            raise ProviderError(f"{entry.label} is a {kind} without the method {name}()")
 
 
 def _default_timeout() -> float:
@@ -550,7 +550,9 @@ def _default_timeout() -> float:
     try:
         return float(value) if value else DEFAULT_TIMEOUT_S
     except ValueError as error:
-        raise InputError(f"{TIMEOUT_VARIABLE}={value!r} is not a number of seconds") from error
+        raise InputError(
+            f"variable {TIMEOUT_VARIABLE}={value!r} is not a number of seconds"
+        ) from error
 
 
 def core_version() -> str:

@@ -71,7 +71,9 @@ def run_joint(
     with provider_errors(spec, view.name):
         answer = provider.predict_joint(view)
         if not (isinstance(answer, tuple) and len(answer) == 2):
-            raise DataError("output", f"must be (depth, normals), got {_type(answer)}")
+            raise DataError(
+                "output", f"the output must be a pair (depth, normals), got {_type(answer)}"
+            )
         return validate_depth(spec, view, answer[0]), validate_normals(spec, view, answer[1])
 
 
@@ -82,7 +84,9 @@ def run_focal(spec: ProviderSpec, provider: FocalEstimator, view: View) -> float
         if focal is None:
             return None
         if not (isinstance(focal, (int, float, np.number)) and 0 < focal < np.inf):
-            raise DataError("focal", f"must be a positive number of pixels, got {focal!r}")
+            raise DataError(
+                "focal", f"the focal length must be a positive number of pixels, got {focal!r}"
+            )
         return float(focal)
 
 
@@ -183,7 +187,9 @@ def validate_normals(spec: ProviderSpec, view: View, output: object) -> NormalPr
         elif prior.valid.any():
             median = float(np.median(prior.variance[prior.valid]))
             if median > MAX_MEDIAN_NORMAL_VARIANCE:
-                raise DataError("variance", f"must be in rad^2, the median is {median:.3g}")
+                raise DataError(
+                    "variance", f"the variance must be in rad^2, but its median is {median:.3g}"
+                )
         return prior
 
 
@@ -206,7 +212,9 @@ def validate_multiview(spec: ProviderSpec, views: Sequence[View], output: object
         group = _revalidate(output, MultiViewPrior, "output")
         if not isinstance(group.depth, tuple) or len(group.depth) != len(views):
             found = len(group.depth) if isinstance(group.depth, tuple) else _type(group.depth)
-            raise DataError("depth", f"must be a tuple of {len(views)} priors, got {found}")
+            raise DataError(
+                "depth", f"the depth must be a tuple of {len(views)} priors, got {found}"
+            )
         for prior in group.depth:
             _check_depth(spec, prior, "depth")
         if group.poses is None:
@@ -320,7 +328,9 @@ def validate_mask(spec: ProviderSpec, view: View, output: object) -> Bool:
         mask = _require_array(output, "mask", np.dtype(np.bool_), 2)
         expected = (view.camera.height, view.camera.width)
         if mask.shape != expected:
-            raise DataError("mask", f"must have the view's shape {expected}, got {mask.shape}")
+            raise DataError(
+                "mask", f"the mask must have the image's shape {expected}, got {mask.shape}"
+            )
         return mask
 
 
@@ -342,20 +352,20 @@ def validate_filtered_pairs(
         ValueError: The plugin selects image pairs, but none of them is a candidate.
     """
     if not isinstance(answer, Iterable):
-        raise TypeError(f"must return pairs of image names, got {_type(answer)}")
+        raise TypeError(f"the hook must return pairs of image names, got {_type(answer)}")
     filtered: list[tuple[str, str]] = []
     for pair in answer:
         if not (isinstance(pair, Sequence) and len(pair) == 2):
-            raise TypeError(f"must return pairs of image names, got {pair!r}")
+            raise TypeError(f"the hook must return pairs of image names, got {pair!r}")
         first, second = pair
         if not (isinstance(first, str) and isinstance(second, str)):
-            raise TypeError(f"must return pairs of image names, got {pair!r}")
+            raise TypeError(f"the hook must return pairs of image names, got {pair!r}")
         filtered.append((first, second))
     candidates = {frozenset(pair) for pair in pairs}
     if filtered and not any(frozenset(pair) in candidates for pair in filtered):
         raise ValueError(
-            f"returns no candidate pair, for example {filtered[0]!r}: image names have their "
-            f"folder and extension, such as {pairs[0] if pairs else ('a.jpg', 'b.jpg')!r}"
+            f"the hook returns no candidate pair, for example {filtered[0]!r}: image names have "
+            f"their folder and extension, such as {pairs[0] if pairs else ('a.jpg', 'b.jpg')!r}"
         )
     return filtered
 
@@ -381,8 +391,10 @@ def provider_errors(spec: ProviderSpec, image: str) -> Iterator[None]:
         except MpsfmError:
             raise
         except MemoryError as error:
-            text = f"provider {spec.name!r}, image {image!r}: out of memory"
-            raise ProviderRunError(f"{text}; reduce the size of images or workers") from error
+            raise ProviderRunError(
+                f"provider {spec.name!r}, image {image!r}: out of memory; reduce the image size or "
+                f"the number of workers"
+            ) from error
         except (Exception, SystemExit) as error:
             text = f"provider {spec.name!r}, image {image!r}: {type(error).__name__}: {error}"
             raise ProviderRunError(text) from error
@@ -413,7 +425,7 @@ Checked = TypeVar(
 def _revalidate(output: object, expected: type[Checked], field: str) -> Checked:
     """Require that a provider's output has the expected type, and validate its values again."""
     if not isinstance(output, expected):
-        raise DataError(field, f"must be a {expected.__name__}, got {_type(output)}")
+        raise DataError(field, f"the output must be a {expected.__name__}, got {_type(output)}")
     return replace(output)  # The constructor validates the field values again.
 
 
@@ -431,13 +443,15 @@ def _require_facing(prior: NormalPrior, camera: PinholeCamera) -> None:
     facing_away = (dot_with_rays(camera, prior.normals) > FACING_TOLERANCE)[prior.valid]
     if facing_away.any():
         ratio = f"{100 * facing_away.mean():.3g} % of the valid pixels"
-        raise DataError("normals", f"must face the camera (n . ray < 0), not so at {ratio}")
+        raise DataError("normals", f"normals must face the camera (n . ray < 0), not so at {ratio}")
 
 
 def _check_sparse(sparse: SparseMatches, features: tuple[Features, Features] | None) -> None:
     _revalidate(sparse, SparseMatches, "sparse")
     if features is None:
-        raise DataError("sparse", "must be absent, as there are no features")
+        raise DataError(
+            "sparse", "sparse matches must be absent, because the matcher received no features"
+        )
     for column, (name, available) in enumerate(zip("ab", features, strict=True)):
         largest = int(sparse.indices[:, column].max(initial=-1))
         if largest >= len(available):
@@ -448,7 +462,7 @@ def _check_sparse(sparse: SparseMatches, features: tuple[Features, Features] | N
 def _require_undeclared(spec: ProviderSpec, capability: str, field: str) -> None:
     """Raise DataError if the provider declares the capability of a field that is None."""
     if capability in spec.capabilities:
-        raise DataError(field, f"lacks what the specification declares: {capability!r}")
+        raise DataError(field, f"the output lacks the declared capability {capability!r}")
 
 
 def _require_inside(points: Float64, camera: PinholeCamera, field: str) -> None:
@@ -456,22 +470,26 @@ def _require_inside(points: Float64, camera: PinholeCamera, field: str) -> None:
     if outside.any():
         x, y = points[outside][0]
         size = f"{camera.width}x{camera.height}"
-        raise DataError(field, f"must lie inside of the {size} view, got ({x:.2f}, {y:.2f})")
+        raise DataError(
+            field, f"points must lie inside of the {size} image, got ({x:.2f}, {y:.2f})"
+        )
 
 
 def _require_not_empty(shape: tuple[int, ...], field: str) -> None:
     if 0 in shape:
-        raise DataError(field, f"must not be empty, has shape {shape}")
+        raise DataError(field, f"the array must not be empty, but has shape {shape}")
 
 
 def _require_array(
     output: object, field: str, dtype: np.dtype[Any], dimensions: int
 ) -> NDArray[Any]:
     if not isinstance(output, np.ndarray):
-        raise DataError(field, f"must be a numpy array, got {_type(output)}")
+        raise DataError(field, f"the output must be a numpy array, got {_type(output)}")
     if output.dtype != dtype or output.ndim != dimensions:
         expected = f"{dimensions}-dimensional {dtype}"
-        raise DataError(field, f"must be a {expected} array, got {output.dtype} {output.shape}")
+        raise DataError(
+            field, f"the output must be a {expected} array, got {output.dtype} {output.shape}"
+        )
     return output
 
 

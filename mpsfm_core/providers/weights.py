@@ -139,7 +139,9 @@ class WeightStore:
                 if not self._is_verified(uri, path, expected):
                     self._download_to_cache(uri, path, expected or self._recorded(uri))
         except OSError as error:
-            raise WeightsError(f"{uri}: cannot store in {self.cache_dir}: {error}") from error
+            raise WeightsError(
+                f"cannot store {uri} in the cache {self.cache_dir}: {error}"
+            ) from error
         return path
 
     def locate(self, uri: str) -> Path | None:
@@ -223,7 +225,7 @@ class WeightStore:
             raise WeightsError(
                 f"{uri} {state} the cache {self.cache_dir} and downloads are switched off "
                 f"(--offline, runtime.offline or ${' or $'.join(OFFLINE_VARIABLES)}). Run 'mpsfm "
-                f"models fetch {uri}' with network, or name a local file instead"
+                f"models fetch {uri}' with network, or name a local file with the weights"
             )
         part = path.with_name(path.name + ".part")
         _download(uri, part, expected, self._progress)
@@ -270,7 +272,7 @@ class WeightStore:
             check_version(entries, FORMAT, record, WeightsError)
             entries.pop(VERSION, None)
             if not all(isinstance(entry, dict) for entry in entries.values()):
-                raise ValueError("not a record for each file")
+                raise ValueError("an entry is not a mapping")
         except (ValueError, AttributeError, RecursionError) as error:
             raise WeightsError(
                 f"{record} is damaged ({error}): remove this file; weights files are then "
@@ -328,11 +330,13 @@ def load_torch_state(path: Path) -> dict[str, Any]:
     # The readers of pickle, zip and safetensors files have no common exception class.
     except Exception as error:
         raise WeightsError(
-            f"{path} cannot be loaded as plain tensors ({type(error).__name__}): the file is "
-            f"damaged or contains Python objects, which are never executed"
+            f"weights file {path} cannot be loaded as plain tensors ({type(error).__name__}): the "
+            f"file is damaged or contains Python objects, which are never executed"
         ) from error
     if not isinstance(loaded, dict):
-        raise WeightsError(f"{path} contains a {type(loaded).__name__}, not named tensors")
+        raise WeightsError(
+            f"weights file {path} contains a {type(loaded).__name__}, not named tensors"
+        )
     return loaded
 
 
@@ -404,7 +408,7 @@ def _find_package_resource(uri: str) -> Path:
     """Return the path of the package file ``package:NAME/PATH`` without importing the package."""
     package, _, resource = uri.removeprefix("package:").partition("/")
     if not package.isidentifier() or not resource or ".." in resource.split("/"):
-        raise WeightsError(f"{uri}: expected package:NAME/PATH inside of the package")
+        raise WeightsError(f"weights URI {uri}: expected package:NAME/PATH inside of the package")
     spec = importlib.util.find_spec(package)
     folders = list(spec.submodule_search_locations or ()) if spec else []
     if not folders:
@@ -423,7 +427,7 @@ def _make_request(uri: str, expected: str | None) -> urllib.request.Request:
     request = urllib.request.Request(uri, headers=_HEADERS)
     local = request.host.rsplit(":", 1)[0] in _LOOPBACK
     if request.type == "http" and expected is None and not local:
-        raise WeightsError(f"{uri}: plain http needs a sha256; use https")
+        raise WeightsError(f"{uri}: download by plain http needs a sha256; use https")
     return request
 
 
@@ -431,7 +435,9 @@ def _make_hub_request(uri: str) -> urllib.request.Request:
     """Create the HTTP request for an ``hf://`` URI, with the user's Hugging Face token."""
     parts = _HUB.match(uri)
     if parts is None:
-        raise WeightsError(f"{uri}: expected hf://ORG/REPO@REVISION/PATH with a fixed revision")
+        raise WeightsError(
+            f"weights URI {uri}: expected hf://ORG/REPO@REVISION/PATH with a fixed revision"
+        )
     hub = importlib.import_module("huggingface_hub")
     url = hub.hf_hub_url(parts["repo"], parts["path"], revision=parts["revision"])
     request = urllib.request.Request(url, headers=_HEADERS)
@@ -469,8 +475,9 @@ def _download(uri: str, part: Path, expected: str | None, progress: Progress | N
         num_failed = 0 if _size(part) > before else num_failed + 1
         if num_failed >= _MAX_ATTEMPTS_WITHOUT_PROGRESS or not reached:
             raise WeightsError(
-                f"{uri} cannot be downloaded: {_describe_failure(failure)}. Try again (it "
-                f"continues after {_size(part)} bytes), or name a local file"
+                f"{uri} cannot be downloaded: {_describe_failure(failure)}. Try again (the "
+                f"download continues after {_size(part)} bytes), or name a local "
+                f"file with the weights"
             ) from failure
         time.sleep(_RETRY_WAIT_S * 2**num_failed)
 
@@ -507,7 +514,7 @@ def _open_download(
                 raise
             if error.headers.get("Content-Range") != f"bytes */{have}":
                 _delete_partial(part)
-                raise ConnectionError("the file on the server has changed") from error
+                raise ConnectionError("the weights file on the server has changed") from error
             return None
 
 

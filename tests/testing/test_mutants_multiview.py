@@ -212,7 +212,7 @@ class Chains(Changed):
         (OneSize, "multiview-sizes", "must have the same shape"),
         (CropsToTheSmallest, "multiview-sizes", "relative error|shifted"),
         (Fewer, "output-rules", "must be a tuple of 2 priors, got 1"),
-        (NoPoses, "output-rules", "lacks what the specification declares: 'proposes-poses'"),
+        (NoPoses, "output-rules", "lacks the declared capability 'proposes-poses'"),
         (Sheared, "output-rules", "must be rotations and translations"),
         (Mirrored, "output-rules", "must not mirror"),
         (SomeInMetres, "output-rules", "metric in all views of a group or in none"),

@@ -29,7 +29,7 @@ class MatcherDepth:
             ProviderError: The error is raised for every image.
         """
         raise ProviderError(
-            f"the depth of {view.name!r} is predicted by {self.source}, not from a single view"
+            f"the depth of {view.name!r} is predicted by {self.source}, not from a single image"
         )
 
 

@@ -63,11 +63,13 @@ class DepthFiles:
             check_map(path, stored, view, 1)
         if stored is None and options.relative_std is None and options.std_floor == 0:
             raise InputError(
-                f"{path} has no variance: declare the depth uncertainty, for example with "
-                f"depth.options.relative_std=0.02"
+                f"depth file {path} has no variance: declare the depth uncertainty, for example "
+                f"with depth.options.relative_std=0.02"
             )
         if stored is not None and stored.shape != depth.shape:
-            raise InputError(f"{path}: variance {stored.shape} and depth {depth.shape} differ")
+            raise InputError(
+                f"{path}: the shapes of variance {stored.shape} and depth {depth.shape} differ"
+            )
         with np.errstate(invalid="ignore"):
             variance = np.maximum(
                 ((options.relative_std or 0.0) * depth) ** 2, options.std_floor**2
@@ -151,7 +153,7 @@ def _grayscale(path: Path, stored: NDArray[Any]) -> NDArray[Any]:
     if stored.ndim == 3 and stored.shape[2] == 3:
         if (stored == stored[..., :1]).all():
             return np.asarray(stored[..., 0])
-        raise InputError(f"{path} is a color image; depth has one channel")
+        raise InputError(f"depth file {path} is a color image; a depth map has one channel")
     return stored
 
 

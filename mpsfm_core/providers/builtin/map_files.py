@@ -49,7 +49,9 @@ def find_file(options: FileOptions, view: View, what: str) -> Path:
     if path is not None:
         return path
     wanted = f"{bases[1]}{suffixes[0] if len(suffixes) == 1 else '{' + ','.join(suffixes) + '}'}"
-    raise InputError(f"{what} of image {view.name!r}: there is no file {wanted}")
+    raise InputError(
+        f"{what} of image {view.name!r}: there is no file {wanted}; check the options of the files"
+    )
 
 
 def _find_ignoring_case(candidates: list[Path]) -> Path | None:
@@ -86,9 +88,13 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
     except InputError:
         raise
     except Exception as error:  # Parsers raise exceptions of any type for a damaged file.
-        raise InputError(f"{path} cannot be read: {type(error).__name__}: {error}") from error
+        raise InputError(
+            f"map file {path} cannot be read: {type(error).__name__}: {error}"
+        ) from error
     if main not in arrays:
-        raise InputError(f"{path} has no array {main!r}, only {', '.join(arrays) or 'none'}")
+        raise InputError(
+            f"map file {path} has no array {main!r}, only {', '.join(arrays) or 'none'}"
+        )
     return arrays
 
 
@@ -108,13 +114,13 @@ def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> No
     expected = 2 if channels == 1 else 3
     if values.ndim != expected or (channels > 1 and values.shape[2] != channels):
         wanted = "one channel" if channels == 1 else f"{channels} channels"
-        raise InputError(f"{path}: expected a map of {wanted}, it has shape {values.shape}")
+        raise InputError(f"map file {path} must have {wanted}, but has shape {values.shape}")
     height, width = values.shape[:2]
     aspect = (width / max(height, 1)) / (view.camera.width / view.camera.height)
     if not 1 - _MAX_ASPECT_DIFFERENCE < aspect < 1 + _MAX_ASPECT_DIFFERENCE:
         raise InputError(
-            f"{path} has {width}x{height} pixels and so does not cover image {view.name!r} "
-            f"({view.camera.width}x{view.camera.height})"
+            f"map file {path} has {width}x{height} pixels and does not cover image {view.name!r} "
+            f"({view.camera.width}x{view.camera.height}), because the aspect ratios differ"
         )
 
 
@@ -162,4 +168,4 @@ def _choose_channels(channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
     for name in _SINGLE_CHANNELS:
         if name in channels:
             return channels[name]
-    raise ValueError(f"none of its channels {', '.join(sorted(channels))} is known")
+    raise ValueError(f"none of the EXR channels {', '.join(sorted(channels))} is known")

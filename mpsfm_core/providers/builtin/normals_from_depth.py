@@ -51,7 +51,7 @@ class NormalsFromDepth:
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         """Return plane normals with variance; normals at depth edges and holes are invalid."""
         if depth is None:
-            raise ProviderError("from-depth needs a depth prior with its variance")
+            raise ProviderError("the normals provider from-depth requires depth with variance")
         return fit_normals(view.camera, depth, self._options)
 
 
@@ -72,7 +72,7 @@ def fit_normals(
         ProviderError: The depth prior has no variance.
     """
     if depth.variance is None:
-        raise ProviderError("from-depth needs a depth prior with its variance")
+        raise ProviderError("the normals provider from-depth requires depth with variance")
     rows, columns = depth.shape
     xy = rays(camera.resized(columns, rows), pixel_centers(columns, rows))[..., :2]
     inverse = 1.0 / np.where(depth.valid, depth.depth, 1.0).astype(np.float64)

@@ -81,11 +81,11 @@ class EncodedMessage:
         name = type(value).__name__
         if _TYPES.get(name) is type(value):
             return {"type": name, "fields": {k: self._plain(v) for k, v in _fields(value)}}
-        raise DataError("value", f"a {name} cannot be sent to another process")
+        raise DataError("value", f"a value of type {name} cannot be sent to another process")
 
     def _allocate(self, array: NDArray[Any]) -> list[Any]:
         if array.dtype.hasobject:
-            raise DataError("value", "an array of objects cannot be sent to another process")
+            raise DataError("value", "an array of Python objects cannot be sent to another process")
         start, self.size = self.size, self.size + _aligned(array.nbytes)
         self.arrays.append(array)
         return [array.dtype.str, list(array.shape), start]
@@ -112,7 +112,7 @@ def decode_message(text: bytes, block: UInt8, copy: bool) -> Any:
     try:
         return _Decoder(block, copy).build(json.loads(text))
     except (ValueError, KeyError, TypeError, AttributeError, MemoryError, RecursionError) as error:
-        raise DataError("value", f"does not follow the protocol: {error}") from error
+        raise DataError("value", f"the received message is malformed: {error}") from error
 
 
 class _Decoder:

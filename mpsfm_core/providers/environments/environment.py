@@ -157,7 +157,9 @@ def create_environment(
         ProviderError: The environment cannot be created. A partly created environment is removed.
     """
     if not _NAME.fullmatch(name):
-        raise InputError(f"{name!r} is not made of lower-case letters, digits and - . _")
+        raise InputError(
+            f"environment name {name!r} may only have lower-case letters, digits and - . _"
+        )
     environment = Environment(environments_folder() / name)
     if environment.folder.exists():
         raise InputError(f"{environment.label} exists; 'mpsfm env remove {name}' removes it")
@@ -224,10 +226,11 @@ def _run(command: list[str], label: str) -> None:
     try:
         done = subprocess.run(command, capture_output=True, text=True)
     except OSError as error:
-        raise ProviderError(f"{label} cannot be created: {error}") from error
+        raise ProviderError(f"{label} cannot be created, no such command: {error}") from error
     if done.returncode:
         lines = [line for line in (done.stderr or done.stdout).splitlines() if line.strip()]
         reason = next((line for line in lines if "rror" in line), lines[-1] if lines else "")
         raise ProviderError(
-            f"{label} cannot be created: {' '.join(command[:4])} ...: {reason.strip()}"
+            f"{label} cannot be created: the command {' '.join(command[:4])} ... fails: "
+            f"{reason.strip()}"
         )

@@ -95,8 +95,8 @@ class Worker:
             self.close()
             raise ProviderError(
                 f"{label} has mpsfm-core {greeting['core']}, whose protocol version "
-                f"{versions} differs from {(PROTOCOL, API_VERSION)}: create it again with "
-                f"'mpsfm env create'"
+                f"{versions} differs from {(PROTOCOL, API_VERSION)}: create the "
+                f"environment again with 'mpsfm env create'"
             )
 
     @property

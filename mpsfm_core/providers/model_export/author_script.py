@@ -74,7 +74,9 @@ class ExportJob:
         """Load a checkpoint into a network and raise an error if a parameter is missing."""
         missing = model.load_state_dict(state, strict=False).missing_keys
         if missing:
-            raise SystemExit(f"the checkpoint lacks {missing[0]} and {len(missing) - 1} more")
+            raise SystemExit(
+                f"the checkpoint lacks parameter {missing[0]} and {len(missing) - 1} more"
+            )
 
     def export(
         self,

@@ -73,7 +73,8 @@ def export_model(
     for folder in code:
         if not folder.is_dir():
             raise InputError(
-                f"{folder} is no folder: git clone https://github.com/{recipe.repository}"
+                f"source checkout {folder} is no folder; create it by "
+                f"git clone https://github.com/{recipe.repository}"
             )
     weights = None
     if checkpoint != RANDOM:
@@ -86,7 +87,7 @@ def export_model(
         made = Path(scratch) / target.name
         script = importlib.util.find_spec(recipe.script)
         if script is None or script.origin is None:
-            raise ProviderError(f"the plugin of {name} has no script {recipe.script!r}")
+            raise ProviderError(f"the plugin that exports {name} has no module {recipe.script!r}")
         try:
             run_script(Path(script.origin), code, made, weights=weights, size=size, python=python)
         except ProviderError as error:

@@ -111,15 +111,15 @@ def read_values(path: Path, kind: str) -> Mapping[str, Any]:
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"calibration file {str(path)!r} cannot be read: {error}") from error
     if not isinstance(content, Mapping):
-        raise ConfigError(f"{path} does not contain a mapping")
+        raise ConfigError(f"calibration file {path} does not contain a mapping")
     check_version(content, FORMAT, path, ConfigError)
     if "provenance" not in content:
         return {key: value for key, value in content.items() if key != VERSION}
     if content.get("kind") != kind:
-        raise ConfigError(f"{path} is a calibration of {content.get('kind')}, not of {kind}")
+        raise ConfigError(f"file {path} is a calibration of {content.get('kind')}, not of {kind}")
     values = content.get("calibration")
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{path}: calibration: must be a mapping")
+        raise ConfigError(f"{path}: the key calibration must be a mapping")
     return values
 
 

@@ -131,7 +131,7 @@ def test_tiny_and_empty_maps(context: ProviderContext) -> None:
 def test_needs_a_depth_with_variance(context: ProviderContext) -> None:
     bare = DepthPrior.from_arrays(np.full((24, 32), 2.0))
     for depth in (None, bare):
-        with pytest.raises(ProviderError, match="needs a depth prior"):
+        with pytest.raises(ProviderError, match="requires depth with variance"):
             NormalsFromDepth(NormalsFromDepthOptions(), context).predict(VIEW, depth)
 
 

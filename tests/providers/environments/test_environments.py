@@ -76,7 +76,7 @@ def test_in_a_configuration(registry):
 
 def test_a_place_is_said_once():
     assert ProviderConfig.model_validate({"use": "a", "environment": "b"}).use == "a@b"
-    with pytest.raises(ValueError, match="already selects one"):
+    with pytest.raises(ValueError, match="already selects it"):
         ProviderConfig.model_validate({"use": "a@c", "environment": "b"})
 
 
