@@ -149,7 +149,7 @@ def compare_prior(
             too few samples.
     """
     if (ground_truth is None) == (model is None):
-        raise InputError("give true maps or a model")
+        raise InputError("give either true maps or a COLMAP model to compare with")
     registry = registry or Registry.discover()
     run = _Run(photos, config, kind, registry, None, options or StudyOptions())
     with threadpool_limits(thread_count(config.runtime), user_api="blas"):

@@ -118,7 +118,7 @@ def _parse_result(text: str) -> tuple[str, Path]:
 
     name, _, folder = text.partition("=")
     if not (folder and re.fullmatch(r"[\w.-]+", name) and Path(folder).is_dir()):
-        raise InputError(f"--result {text}: must be NAME=FOLDER with an existing folder")
+        raise InputError(f"--result {text}: the value must be NAME=FOLDER with an existing folder")
     if name.split("-")[0] == OURS or name in PEER_METHODS:
         raise InputError(
             f"--result {text}: {name!r} is a method of the benchmark; choose another name"

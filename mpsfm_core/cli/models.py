@@ -155,7 +155,9 @@ def export(
         for key, recipe in exports.items()
     }
     if name not in known:
-        raise InputError(f"no installed plugin exports {name!r}{did_you_mean(name, known)}")
+        raise InputError(
+            f"no installed plugin exports the network {name!r}{did_you_mean(name, known)}"
+        )
     python = find_environment(environment).python if environment else None
     with _progress_bars() as progress:
         manifest = export_model(

@@ -148,7 +148,7 @@ def _check_in_subprocess(name: str, arguments: list[str]) -> int:
         return process.returncode
     signal_name = signal.Signals(-process.returncode).name
     raise ProviderError(
-        f"{name}: the check after the last listed one crashed the process ({signal_name})"
+        f"{name}: the check after the last listed check crashed the process ({signal_name})"
     )
 
 

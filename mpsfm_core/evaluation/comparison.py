@@ -114,7 +114,7 @@ def compare_benchmarks(
             group = (scene, config, bucket, _method_name(method, pairs[0]))
             differences.append(_compute_difference(group, errors, convention, resamples, rng))
     if not differences:
-        raise InputError("the two benchmarks have no set and method in common")
+        raise InputError("the two benchmarks have no test set and method in common")
     return differences
 
 

@@ -42,7 +42,7 @@ def read_external_records(
     }
     if not any(folders.values()):
         raise InputError(
-            f"{folder}: no model of a set of {scene.name}; expected as "
+            f"{folder}: no model of any test set of {scene.name}; expected as "
             f"{folder / scene.name / sets[0].name} (a COLMAP model or {TRANSFORMS})"
         )
     return [_build_record(label, scene, item, folders[item.name], config) for item in sets]

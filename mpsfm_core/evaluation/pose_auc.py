@@ -167,7 +167,7 @@ def pose_auc(
         ValueError: The array `errors` is empty.
     """
     if len(errors_deg) == 0:
-        raise ValueError("no pairs to evaluate")
+        raise ValueError("no image pairs to evaluate")
     return {threshold: convention.area(errors_deg, threshold) for threshold in thresholds}
 
 

@@ -66,7 +66,9 @@ def _match_images(images: Sequence[str], truth: Mapping[str, Pose]) -> list[str]
     matched = match_names(images, truth)
     missing = [name for name in images if name not in matched]
     if missing:
-        raise InputError(f"ground truth: no image (or more than one) called {', '.join(missing)}")
+        raise InputError(
+            f"ground truth: no image (or several images) with the name {', '.join(missing)}"
+        )
     return list(dict.fromkeys(matched.values()))
 
 

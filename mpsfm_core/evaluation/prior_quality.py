@@ -84,7 +84,9 @@ def read_depth(path: Path) -> Float32:
         check_size(read_bytes(path), path, InputOptions().max_pixels)
         stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.ndim != 2 or stored.dtype != np.uint16:
-        raise InputError(f"{path}: no 16-bit depth image; expected PNG in millimeters")
+        raise InputError(
+            f"{path}: the file is not a 16-bit depth image; expected PNG in millimeters"
+        )
     return np.asarray(stored * np.float32(_MILLIMETER))
 
 

@@ -107,7 +107,7 @@ def read_record(path: Path) -> BenchmarkRecord:
         content["truth"] = _restore_poses(content["truth"])
         return BenchmarkRecord(**content)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise InputError(f"{path}: not a record of a benchmark: {error}") from error
+        raise InputError(f"{path}: the file is not a benchmark record: {error}") from error
 
 
 def read_records(output: Path) -> list[BenchmarkRecord]:
@@ -118,7 +118,9 @@ def read_records(output: Path) -> list[BenchmarkRecord]:
     """
     paths = sorted((output / RUNS).glob("*/*/*/*.json"))
     if not paths:
-        raise InputError(f"{output}: no results of a benchmark; run mpsfm benchmark -o {output}")
+        raise InputError(
+            f"{output}: the folder has no benchmark results; run mpsfm benchmark -o {output}"
+        )
     return [read_record(path) for path in paths]
 
 

@@ -41,7 +41,7 @@ def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
             continue
         arrays = load_depth_map(path)
         if not {"depth", "valid"} <= arrays.keys():
-            raise InputError(f"{path}: not a depth map of mpsfm")
+            raise InputError(f"{path}: the file is not a depth map of mpsfm")
         depth, valid = arrays["depth"], arrays["valid"]
         true = read_depth(file)
         for name, scale in scales.items():
@@ -49,7 +49,9 @@ def evaluate_depth(output: Path, truth: Path) -> dict[str, Any]:
             if accuracy is not None:
                 accuracies[name].append(accuracy)
     if not accuracies["raw"]:
-        raise InputError(f"{output / 'depth'}: no depth map has a true one in {truth}")
+        raise InputError(
+            f"{output / 'depth'}: no depth map of the results has a true depth map in {truth}"
+        )
     return {name: mean_accuracy(images) for name, images in accuracies.items()}
 
 
@@ -88,7 +90,7 @@ def read_points(path: Path) -> Float64:
     """
     points, _ = read_ply(path)
     if not len(points):
-        raise InputError(f"{path}: has no points to compare")
+        raise InputError(f"{path}: the file has no points to compare")
     return points
 
 

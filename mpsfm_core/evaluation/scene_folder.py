@@ -99,7 +99,9 @@ class SceneFolder:
         selected = list(known) if buckets is None else list(buckets)
         for bucket in selected:
             if not any(_is_in_bucket(name, bucket) for name in known):
-                raise InputError(f"{self.path}: no bucket {bucket!r}; it has {', '.join(known)}")
+                raise InputError(
+                    f"{self.path}: no bucket {bucket!r}; the scene has {', '.join(known)}"
+                )
         return [item for item in self.sets if any(_is_in_bucket(item.bucket, b) for b in selected)]
 
 
@@ -115,7 +117,7 @@ def read_scene(path: Path, *, with_sets: bool = True) -> SceneFolder:
         InputError: Images or true poses are missing, or a test set has an image without true pose.
     """
     if not (path / "images").is_dir():
-        raise InputError(f"{path}: no scene folder; photos must be in images/")
+        raise InputError(f"{path}: not a scene folder; photos must be in images/")
     names = find_images(path / "images")
     poses = read_poses(path / "gt")
     truth = {name: poses[found] for name, found in match_names(names, poses).items()}
@@ -153,7 +155,7 @@ def _read_sets(file: Path) -> Iterator[tuple[str, int, list[str]]]:
     except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
         raise InputError(f"{file} cannot be read: {error}") from error
     if not isinstance(content, dict):
-        raise InputError(f"{file}: must map buckets to sets of images")
+        raise InputError(f"{file}: the file must map buckets to lists of test sets")
     check_version(content, FORMAT, file)
     content.pop(VERSION, None)
     for bucket, entries in content.items():
@@ -161,7 +163,7 @@ def _read_sets(file: Path) -> Iterator[tuple[str, int, list[str]]]:
         for group, sets in groups.items():
             name = f"{bucket}/{group}" if group != "" else str(bucket)
             if not isinstance(sets, list):
-                raise InputError(f"{file}: {name}: must be a list of sets")
+                raise InputError(f"{file}: {name}: the bucket must be a list of test sets")
             for number, entry in enumerate(sets):
                 images = entry.get("images") if isinstance(entry, dict) else entry
                 if not isinstance(images, list) or len(images) < 2:

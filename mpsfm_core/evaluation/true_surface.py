@@ -55,5 +55,5 @@ def build_true_surface(
         rotation, translation = poses[name]
         parts.append(thin_points(local @ rotation + camera_center(rotation, translation), spacing))
     if not sum(map(len, parts)):
-        raise InputError(f"{folder}: no image with a true pose has true depth here")
+        raise InputError(f"{folder}: no image with a true pose has a true depth map")
     return np.concatenate(parts)

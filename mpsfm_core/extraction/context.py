@@ -145,12 +145,14 @@ class ExtractionContext:
     def _record_failure(self, images: Sequence[int], error: MpsfmError) -> None:
         """Record a provider failure; raise ProviderRunError if over half of the images failed."""
         names = " and ".join(self.images[index].name for index in images)
-        _log.warning("%s is skipped: %s", names, error)
+        _log.warning("a provider failed, so %s is skipped: %s", names, error)
         if len(images) == 1:
             self.failures[images[0]] = str(error)
         if len(self.failures) > len(self.images) / 2:
-            count = f"{len(self.failures)} of {len(self.images)} photos failed"
-            raise ProviderRunError(f"{count}, the last with: {error}") from error
+            count = f"{len(self.failures)} of {len(self.images)} photos"
+            raise ProviderRunError(
+                f"providers failed on {count}, most recently with: {error}"
+            ) from error
 
     def key(self, provider: ActiveProvider, inputs: Sequence[object]) -> str:
         """Return the cache key of a provider's result."""

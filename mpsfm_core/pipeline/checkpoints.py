@@ -223,7 +223,7 @@ def read_checkpoint(path: Path) -> tuple[Mapping[str, Any], CheckpointArrays]:
         if missing:
             raise ValueError(f"no {', '.join(missing)}")
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise DataError("checkpoint", f"it is damaged ({error})") from error
+        raise DataError("checkpoint", f"the checkpoint file is damaged ({error})") from error
     return header, arrays
 
 

@@ -89,7 +89,9 @@ def _densify_model(
         photos, [poses[matched[photo.name]] for photo in photos], depths
     )
     if not posed.images:
-        raise InputError(f"{model}: has no points, from which the depth range is computed")
+        raise InputError(
+            f"{model}: the model has no points, from which the depth range is computed"
+        )
     view_of = _view_of(photos)
     disk = DiskArrays(cache_folder())
     dense, report = densify(
@@ -167,7 +169,9 @@ def mesh_model(
             source.images, [poses[name] for name in source.names], depths
         )
         if not posed.images:
-            raise InputError(f"{folder}: has no depth maps: run mpsfm dense first")
+            raise InputError(
+                f"{folder}: the result folder has no depth maps: run mpsfm dense first"
+            )
         mesh = mesh_depth_maps(posed, _view_of(source.images), options or MeshOptions())
         with replace_entries(source.folder, MESH) as written:
             write_mesh(written, mesh, source)

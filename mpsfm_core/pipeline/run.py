@@ -217,7 +217,8 @@ class _Run:
         if matcher.use != fast_pass.matcher.use:
             self._stages.warn(
                 f"matcher {matcher.use!r} is not used: the fast pass has the same features "
-                f"({fast_pass.features.use}) and matches all images; set fast_pass=null to use it"
+                f"({fast_pass.features.use}) and matches all images; set fast_pass=null to use "
+                f"the matcher"
             )
 
     def _extract_video_frames(self) -> None:
@@ -545,9 +546,11 @@ def _read_known_poses(model: Path, images: ImageSet, images_folder: Path) -> dic
     matched = match_names(images.names, poses)
     if not matched:
         difference = describe_name_difference(images.names, poses)
-        raise InputError(f"{model}: has a pose of none of the images; {difference}")
+        raise InputError(f"{model}: the model has a pose of none of the images; {difference}")
     if len(matched) < 2:
-        raise InputError(f"{model}: has a pose of {next(iter(matched))} only, two are needed")
+        raise InputError(
+            f"{model}: the model has a pose of {next(iter(matched))} only, two are needed"
+        )
     unmatched = sorted(poses.keys() - set(matched.values()))
     if unmatched:
         text = "%s: %d of its %d images are not among the photos: %s"

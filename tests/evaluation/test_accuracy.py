@@ -151,11 +151,14 @@ def test_evaluate_command_reports_depth_and_cloud(scene_folder: Path, tmp_path: 
     assert report["trajectory"]["rpe_rmse"] == pytest.approx(0, abs=1e-9)
     write_ply(tmp_path / "dense.ply", cloud[:0], np.zeros((0, 3), dtype=np.uint8))
     result = CliRunner().invoke(build_app(), arguments)
-    assert result.exit_code == 2 and "dense.ply: has no points" in result.stderr
+    assert result.exit_code == 2 and "dense.ply: the file has no points" in result.stderr
     write_depth(tmp_path / "other" / "x.png", flat)
     arguments[4] = str(tmp_path / "other")
     result = CliRunner().invoke(build_app(), arguments)
-    assert result.exit_code == 2 and "no depth map has a true one" in result.stderr
+    assert (
+        result.exit_code == 2
+        and "no depth map of the results has a true depth map" in result.stderr
+    )
 
 
 def test_evaluate_command_without_scan_uses_true_depth(scene_folder: Path, tmp_path: Path) -> None:

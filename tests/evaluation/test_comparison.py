@@ -75,7 +75,7 @@ def test_compare_benchmarks_few_sets_resamples_pairs() -> None:
 def test_compare_benchmarks_uses_common_sets() -> None:
     found = difference(records(1.0, sets=8), records(1.0, sets=6, seed=1)[1:])
     assert found.sets == 5
-    with pytest.raises(InputError, match="no set and method in common"):
+    with pytest.raises(InputError, match="no test set and method in common"):
         compare_benchmarks({"ours": records(1.0)}, {"colmap": records(1.0)})
 
 
@@ -94,7 +94,7 @@ def test_benchmark_command_compares_folders_and_methods(tmp_path: Path) -> None:
     assert "ours → colmap" in result.stdout
     with pytest.raises(InputError, match="no method 'openmvg'; it has"):
         read_benchmark(f"{tmp_path / 'a'}:openmvg")
-    with pytest.raises(InputError, match="no results of a benchmark"):
+    with pytest.raises(InputError, match="no benchmark results"):
         read_benchmark(str(tmp_path))
 
 

@@ -91,7 +91,9 @@ def test_external_records_missing_model_is_failed(
     assert first.error == "no model of this set"
     assert (first.errors_deg(CONVENTIONS["paper"]) == 180).all()
     assert not second.error
-    with pytest.raises(InputError, match=r"no model of a set of room; expected as .*minimal-00"):
+    with pytest.raises(
+        InputError, match=r"no model of any test set of room; expected as .*minimal-00"
+    ):
         read_external_records("theirs", tmp_path / "out", scene, scene.sets, "benchmark")
 
 

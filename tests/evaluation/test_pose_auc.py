@@ -185,5 +185,5 @@ def test_pose_auc_without_registration_is_zero() -> None:
     errors = pose_errors_deg({}, truth, VGGT)
     assert list(errors) == [180.0] * 3
     assert pose_auc(errors, VGGT) == {1: 0.0, 5: 0.0, 20: 0.0}
-    with pytest.raises(ValueError, match="no pairs"):
+    with pytest.raises(ValueError, match="no image pairs"):
         pose_auc(np.zeros(0), PAPER)

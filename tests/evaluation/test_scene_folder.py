@@ -33,7 +33,7 @@ def test_select_sets_by_bucket_and_group(scene_folder: Path) -> None:
     assert len(scene.select_sets(None)) == 3
     assert [item.bucket for item in scene.select_sets(["triplets"])] == ["triplets/20-40"] * 2
     assert [item.bucket for item in scene.select_sets(["all"])] == ["all"]
-    with pytest.raises(InputError, match="no bucket 'minimal'; it has all, triplets/20-40"):
+    with pytest.raises(InputError, match="no bucket 'minimal'; the scene has all, triplets/20-40"):
         scene.select_sets(["minimal"])
 
 

@@ -369,7 +369,9 @@ def test_on_error_skip_raises_if_most_images_fail(world) -> None:
     for name in world.names[1:]:
         world.break_on["depth", name] = fail
     runtime = RuntimeOptions(cache_dir=world.cache, workers=1, on_error="skip")
-    with pytest.raises(ProviderRunError, match=r"3 of 4 photos failed, the last with: provider"):
+    with pytest.raises(
+        ProviderRunError, match=r"failed on 3 of 4 photos, most recently with: provider"
+    ):
         world.extract(runtime=runtime)
 
 

@@ -50,7 +50,7 @@ def import_scene(kind: str, source: Path, target: Path, every: int = 1) -> Scene
     if kind not in IMPORTERS:
         raise InputError(f"no dataset {kind!r}{did_you_mean(kind, IMPORTERS)}")
     if target.exists() and any(target.iterdir()):
-        raise InputError(f"{target}: is not empty; choose a new folder")
+        raise InputError(f"{target}: the target folder is not empty; choose a new folder")
     try:
         frames = IMPORTERS[kind](source)[::every]
     except (OSError, ValueError) as error:

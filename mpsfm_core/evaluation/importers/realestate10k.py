@@ -23,7 +23,7 @@ def read_frames(source: Path) -> list[Frame]:
     """Read the extracted frames of a RealEstate10K video; frames without image file are skipped."""
     file = next((f for f in _candidates(source) if f.is_file()), None)
     if file is None:
-        raise InputError(f"{source}: no text file with cameras in it or next to it")
+        raise InputError(f"{source}: no text file with cameras in or next to the folder")
     photos = {path.stem: path for path in source.iterdir() if path.suffix.lower() in PHOTOS}
     frames = []
     for line in file.read_text(encoding="utf-8").splitlines()[1:]:

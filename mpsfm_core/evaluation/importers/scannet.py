@@ -65,6 +65,6 @@ def _depth_reader(
 def _camera(path: Path, size: tuple[int, int]) -> pycolmap.Camera:
     matrix = np.loadtxt(require_path(path, "intrinsics"))
     if matrix.shape != (4, 4):
-        raise InputError(f"{path}: not a 4 x 4 matrix")
+        raise InputError(f"{path}: the file contains no 4 x 4 matrix")
     fx, fy, cx, cy = matrix[0, 0], matrix[1, 1], matrix[0, 2] + 0.5, matrix[1, 2] + 0.5
     return pinhole_camera(size, float(fx), float(fy), float(cx), float(cy))

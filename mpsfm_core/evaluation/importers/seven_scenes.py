@@ -48,5 +48,5 @@ def read_frames(source: Path) -> list[Frame]:
 def _read(path: Path) -> Float32:
     stored = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
     if stored is None or stored.dtype != np.uint16:
-        raise InputError(f"{path}: no 16-bit depth image")
+        raise InputError(f"{path}: the file is not a 16-bit depth image")
     return np.where(stored == _UNKNOWN, 0, stored * np.float32(0.001)).astype(np.float32)

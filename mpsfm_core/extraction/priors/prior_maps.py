@@ -90,5 +90,5 @@ def _resize_valid(valid: Bool, grid: tuple[int, int]) -> Bool:
 
 def _variance(normals: NormalPrior) -> Float32:
     if normals.variance is None:
-        raise ValueError("the normals have no variance yet")
+        raise ValueError("normals need a variance before depth edges are marked")
     return normals.variance
