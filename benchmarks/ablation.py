@@ -92,7 +92,7 @@ def _file_name(variant: str) -> str:
 
 
 def _table(scene: str, rows: Sequence[BenchmarkRow], configs: Mapping[str, str]) -> str:
-    """Format one table per depth prior, with a row per mapper variant and a column per bucket."""
+    """Format one table per depth prior, with a row per mapper variant."""
     convention = CONVENTIONS["paper"]
     parts = [
         f"# Ablation on {scene}",

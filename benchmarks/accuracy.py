@@ -3,7 +3,7 @@
     python -m benchmarks.accuracy [--tables rendered_kitchen ...] [--output DIR] [--workers 1]
 
 Runs ``mpsfm benchmark`` and writes one file per table to benchmarks/results/. An interrupted
-benchmark resumes from the folder --output, whose report has all methods and AUC conventions. Scenes
+benchmark resumes from the folder --output, whose report.json has pose AUC of all methods. Scenes
 are in $MPSFM_SHARED or ../shared. The exit code is 1 if a pose AUC on rendered_kitchen is below its
 target.
 """
@@ -25,12 +25,12 @@ from mpsfm_core.evaluation.report import BenchmarkRow, build_rows, format_markdo
 PRIORS = ("sensor", "degraded", "config")
 """Depth priors of the benchmark; the prior ``config`` is the network FastDepth."""
 SEEDS = 12
-"""Number of seeds of degraded depth on rendered_kitchen.
+"""Number of random seeds of the simulated depth errors on the scene rendered_kitchen.
 
 Seeds change pose AUC on rendered_kitchen by several points, because its test sets have few images.
 """
 DEGRADED = ("degraded", *(f"degraded-{seed}" for seed in range(1, SEEDS)))
-"""Names of the degraded depth priors, one per seed."""
+"""Names of the depth priors with simulated errors, one per random seed."""
 TABLE_START = "Pose AUC in percent"
 """First words of the generated part of a result page; the text above is hand-written."""
 WINDOWS, FRAMES = 6, 5
@@ -43,7 +43,7 @@ class Comparison:
 
     ``configuration`` is the name of a YAML configuration and its settings. ``depth`` is the YAML
     block of the depth network, None for FastDepth. ``note`` is the text above the table of a new
-    page. ``ours_only`` omits the rows of COLMAP.
+    page. ``ours_only`` omits COLMAP's mappers from the table.
     """
 
     scene: str
@@ -69,7 +69,7 @@ NETWORK_BUCKETS: Mapping[str, tuple[str, ...]] = {
     "rendered_kitchen": ("minimal", "leq30", "all"),
     "hololens_room": ("leq5", "leq10", "leq30", "all"),
 }
-"""Buckets of each scene on which depth networks are compared."""
+"""Buckets (test sets grouped by overlap) of each scene on which depth networks are compared."""
 UNCONFIRMED = "unconfirmed", "mapping: {register_tentatively: true}\n"
 COMPARISONS: Mapping[str, Comparison] = {
     "rendered_kitchen": Comparison(
@@ -117,11 +117,11 @@ TARGETS: Mapping[tuple[str, str], tuple[float, float, float]] = {
     ("leq30", "ours-degraded"): (30, 65, 85),
     ("all", "ours-degraded"): (45, 80, 92),
 }
-"""Target pose AUC in percent at 1, 5 and 20 degrees on rendered_kitchen, by bucket and method."""
+"""Target pose AUC (percent at 1, 5, 20 degrees) on rendered_kitchen, by test sets and method."""
 
 
 def main() -> int:
-    """Run the comparisons and write their tables; return 1 if a target is missed, else 0."""
+    """Compare our mapper with COLMAP's; return 1 if pose AUC misses a target, else 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--tables", nargs="+", default=list(COMPARISONS), choices=COMPARISONS)
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))
@@ -162,7 +162,7 @@ def main() -> int:
 
 
 def _is_shown(row: BenchmarkRow, comparison: Comparison) -> bool:
-    """Return if the result page of a comparison shows a row of the benchmark report."""
+    """Return true if the table of a comparison contains a row of the benchmark report."""
     if row.method.startswith("chained-pnp"):
         return False
     return row.method.startswith("ours") or not comparison.ours_only
@@ -178,7 +178,7 @@ def _written_note(file: Path) -> str:
 
 
 def _pooled(record: BenchmarkRecord) -> BenchmarkRecord:
-    """Remove the seed from the label of a record with degraded depth, so that seeds are pooled."""
+    """Remove the seed of simulated depth errors from the label of a result, to pool all seeds."""
     return replace(record, label=re.sub(r"degraded-\d+$", "degraded", record.label))
 
 

@@ -5,9 +5,9 @@
 The scene hololens_room has two depth priors: FastDepth, and sensor depth with smooth errors
 (`mpsfm_core.testing.synthetic.degraded_depth`). Each depth prior is calibrated on the images
 outside the test sets. The std of each depth prior is declared in four ways: calibrated, 5 times too
-small, 5 times too large, and uncalibrated (defaults of another network). Coverage is the share of
-depth errors within the std, on the images of the test sets. Poses are computed with and without the
-estimation of depth noise. An interrupted benchmark resumes from the folder --output. Writes
+small, 5 times too large, and uncalibrated (the defaults for another network). Coverage is the share
+of depth errors within the std, on the images of the test sets. Poses are computed with and without
+the estimation of depth noise. An interrupted benchmark resumes from the folder --output. Writes
 benchmarks/results/calibration.md; scenes are in $MPSFM_SHARED or ../shared.
 """
 

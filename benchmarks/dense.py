@@ -2,9 +2,9 @@
 
     python -m benchmarks.dense [--cases fountain-all-config ...] [--true-poses] [--output DIR]
 
-A case is a scene, a bucket of its test sets and a depth prior. Reconstructions of the test sets are
-stored in the output folder and reused. With ``--true-poses`` the mapper keeps the true poses fixed,
-and estimates depth scales, points and refined depth maps.
+A case is a scene, a bucket of its test sets (grouped by overlap) and a depth prior. Reconstructions
+of the test sets are stored in the output folder and reused. With ``--true-poses`` the mapper keeps
+the true poses fixed, and estimates depth scales, points and refined depth maps.
 
 Depth errors are computed in the scale of the camera centers, std coverage in the scale that fits
 the depth best. The fused cloud is aligned by camera centers and compared with all true depth maps
@@ -77,7 +77,7 @@ ANGLE, ERROR_PX = 3.0, 1.0
 
 @dataclass(frozen=True)
 class Case:
-    """Test sets of a scene and the depth prior (:mod:`mpsfm_core.evaluation.prior_quality`)."""
+    """Test sets of a scene, and the kind of depth prior of their images."""
 
     scene: str
     bucket: str
@@ -142,7 +142,7 @@ def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Recon
 
 
 def problem_of_case(name: str, output: Path) -> tuple[PreparedSets, list[EvaluationSet]]:
-    """Extract the mapping problems of the test sets of a case, or read them from the cache."""
+    """Extract the matches and priors of the test sets of a case, or read them from the cache."""
     case = CASES[name]
     scene = read_scene(shared_folder() / "data" / case.scene)
     sets = scene.select_sets([case.bucket])
@@ -244,7 +244,7 @@ def set_errors(
     map_metrics = [map_errors(each, scale, own_scale_factor) for each in common_pixels]
     cameras = {photo.name: photo.pinhole for photo in photos}
     accuracy = evaluate_dense_geometry(reconstruction, cloud, scene, cameras, TOLERANCES)
-    assert accuracy is not None  # never None, because scale and true depth are known
+    assert accuracy is not None  # scale and true depth are known
     result = {"abs_rel": accuracy["depth"]["abs_rel"], **_means(map_metrics)}
     for tolerance in map(str, TOLERANCES):
         centimetres = round(100 * float(tolerance))
@@ -268,7 +268,7 @@ class MapBesideTruth(NamedTuple):
 
     @classmethod
     def of(cls, depth: DepthPrior, truth: Float32, seen: Bool | None) -> MapBesideTruth:
-        """Collect pixels with estimated and true depth; ``seen`` (h, w) marks measured pixels."""
+        """Collect the pixels with true depth; ``seen`` is the mask of measured depth."""
         assert depth.variance is not None  # refined maps always have a std
         xy, depth_samples, true = sample_depth_at_truth(depth.depth, depth.valid, truth)
         variance, _ = sample_bilinear(depth.variance, depth.valid, xy)

@@ -68,7 +68,7 @@ def main() -> None:
 
 
 def measured(count: int) -> dict[str, float | None]:
-    """Run the dense stage on some photos, and measure memory and CPU time of the process."""
+    """Run the dense stage on a number of photos, and measure memory and CPU time of the process."""
     scene = read_scene(shared_folder() / "data" / "rendered_kitchen")
     assert scene.depth is not None
     photos = load_images(scene.images, scene.intrinsics, None, InputOptions())

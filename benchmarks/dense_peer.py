@@ -2,7 +2,7 @@
 
     python -m benchmarks.dense_peer [--cases kitchen-all-config ...] [--true-poses] [--output DIR]
 
-The other pipeline is pyarchinit-photogrammetry (GPL), a dependency of this benchmark only:
+The other pipeline is pyarchinit-photogrammetry (GPL), which only this benchmark needs:
 
     pip install --no-deps pyarchinit-photogrammetry pyarchinit-photogrammetry-core
 

@@ -4,10 +4,10 @@
 
 The reference is the published iteratively reweighted least squares, in scipy
 (`tests/optimize/integration_reference.py`): conjugate gradients with a Jacobi preconditioner, to
-1e-3 before each reweighting. The reference runs until its energy is at most 1e-4 above ours. Runs
-are interleaved. Ratios are those of median wall times, or of CPU times where stated. The scene
-hololens_room is used if $MPSFM_SHARED or ../shared has it. ``--json`` prints one JSON object as the
-last line.
+1e-3 before each reweighting. The reference iterates until its energy is at most 1e-4 above that of
+our integration. Runs are interleaved. Ratios are those of median wall times, or of CPU times where
+stated. The scene hololens_room is used if $MPSFM_SHARED or ../shared has it. ``--json`` prints one
+JSON object as the last line.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Problem:
 def smooth_noise(
     rng: np.random.Generator, shape: tuple[int, int], parts: dict[float, float]
 ) -> Float64:
-    """Create noise of unit variance as a sum of fields, {correlation length in pixels: share}."""
+    """Create unit-variance noise; ``parts`` gives the weight of each correlation length in px."""
     total = np.zeros(shape)
     for length, share in parts.items():
         step = max(1.0, length / 4)
@@ -251,7 +251,7 @@ def bench_scaling(repeats: int) -> dict[str, Any]:
 def bench_accuracy(
     problems: list[Problem], options: IntegrationOptions | None = None
 ) -> dict[str, float] | None:
-    """Compute mean depth errors before and after integration; None without problems."""
+    """Compute mean depth errors before and after depth integration; None without problems."""
     if not problems:
         return None
     rows = []

@@ -5,8 +5,8 @@
 The scenes are the synthetic halls of :mod:`benchmarks.everyday`, with calibrated depth priors and
 prior maps as large as those of photos. The time of a step includes all called functions. The
 paper's times of global and local steps are summed. The paper's times are of ETH3D on the authors'
-machine, so compare the growth with the number of images. All image numbers run in one process, in
-increasing order, so peak memory is that of the present number.
+machine, so compare the growth with the number of images. All scenes run in one process, from few to
+many images, so the peak memory listed for a scene is that scene's.
 """
 
 from __future__ import annotations

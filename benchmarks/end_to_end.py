@@ -5,8 +5,8 @@
 COLMAP runs SIFT, exhaustive matching and the incremental mapper, as ``colmap
 automatic_reconstructor``, with the default number of threads. ``mpsfm reconstruct`` runs with an
 empty cache and compiled kernels, without the dense stage and the report. Both programs use true
-intrinsics. The table lists pose AUC in percent (convention `paper`), and wall time of one run on an
-idle machine.
+intrinsics. The printed table lists pose AUC in percent (convention `paper`), and wall time of one
+run on an idle machine.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def main() -> None:
 
 
 def compared(scene: SceneFolder) -> list[str]:
-    """Yield the table rows of a scene: COLMAP, and each configuration of ``mpsfm reconstruct``."""
+    """Yield a table row for COLMAP and for each configuration of ``mpsfm reconstruct``."""
     folder = scene.images.parent
     rows = []
     with tempfile.TemporaryDirectory() as work:

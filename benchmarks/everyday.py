@@ -6,10 +6,10 @@
 Scenes are synthetic halls with boxes, seen by cameras along a path
 (:mod:`mpsfm_core.testing.synthetic.halls`). Neighboring views overlap well, keypoints have 0.7 px
 of noise and 5 % of the matches are outliers. Each run has its own process, which loads compiled
-code before the time starts. Times are medians over repeats; runs of both mappers are interleaved.
-Memory is the peak of the process. Compare wall times if ``--threads`` is above 1. ``--only``
-selects from :data:`VARIANTS`, mapper settings that differ from the defaults. ``--json`` prints one
-JSON object as the last line.
+code before timing starts. Times are medians over repeats; runs of both mappers are interleaved.
+Memory is the peak resident memory of the process. With ``--threads`` above 1, compare wall times
+instead of CPU times. ``--only`` selects from :data:`VARIANTS`, mapper settings that differ from the
+defaults. ``--json`` prints one JSON object as the last line.
 """
 
 from __future__ import annotations

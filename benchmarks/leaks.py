@@ -4,7 +4,8 @@
 
 Every run passes three rendered photos of a synthetic room through all stages. Results of providers
 come from the cache after the first run. Prints memory, Python objects, open files and threads of
-the process. Slopes are fitted to the second half of the runs. Writes benchmarks/results/leaks.md.
+the process. The growth of memory per run is fitted to the second half of the runs. Writes
+benchmarks/results/leaks.md.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ VIEWS = 200
 
 
 class Case(NamedTuple):
-    """Scene with descriptors and pairwise two-view overlap (n, n); ``matched`` may be unknown."""
+    """Scene with descriptors, pairwise two-view overlap (n, n), and pairs that can be matched."""
 
     names: Sequence[str]
     descriptors: Sequence[Float32]

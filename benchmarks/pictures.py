@@ -51,7 +51,7 @@ def on_terminal(*arguments: str, code: int = 0) -> str:
     while True:
         try:
             part = os.read(ours, 65536)
-        except OSError:  # on Linux, the command closed the terminal
+        except OSError:  # Linux: the command has closed the terminal
             break
         if not part:
             break
@@ -161,8 +161,8 @@ def shoot_viewer(browser: Any, folder: Path) -> None:
         address = next(filter(None, (re.search(r"http://\S+", line) for line in process.stdout)))
         browser.get(address[0])
         wait_for(browser, "location.protocol === 'http:' && document.querySelector('canvas')")
-        time.sleep(20)  # the page loads before the scene
-        # close the warning of viser about browsers without a GPU
+        time.sleep(20)  # the 3D scene appears later than the page
+        # Close viser's warning about browsers without a GPU.
         close = "document.querySelectorAll('.mantine-Notification-closeButton')"
         browser.execute_script(f"{close}.forEach((button) => button.click())")
         time.sleep(2)

@@ -4,12 +4,12 @@
 
 Scenes are hololens_room (sensor depth), rendered_kitchen (exact depth and normals) and fountain
 (points triangulated with true poses, up to scale). Depth metrics are AbsRel and the share with
-delta < 1.25, after scaling each image by the ratio of the medians, and this scale. Uncertainty
-metrics of log depth are the share of errors within one std, and AUSE. AUSE is the area between the
-sparsification curve and the ideal curve, compared with the AUSE of a constant std. The metric of
-normals is the median angular error. Every image has equal weight. Times are CPU and wall time per
-photo in one thread. Writes benchmarks/results/priors.md; scenes and FastDepth are in $MPSFM_SHARED
-or ../shared.
+delta < 1.25, after scaling each depth map by the ratio of the medians, and the median of these
+ratios. Uncertainty metrics of log depth are the share of errors within one std, and AUSE. AUSE is
+the area between the sparsification curve and the ideal curve, compared with the AUSE of a constant
+std. The metric of normals is the median angular error. Every image has equal weight. Times are CPU
+and wall time per photo in one thread. Writes benchmarks/results/priors.md; scenes and FastDepth are
+in $MPSFM_SHARED or ../shared.
 """
 
 from __future__ import annotations

@@ -1,14 +1,14 @@
-"""Photos of unknown cameras with the default configuration: ours and COLMAP's defaults.
+"""Accuracy of our defaults and COLMAP's defaults on photos of unknown cameras.
 
     python -m benchmarks.real_photos [SET ...] [--photos FOLDER] [--seeds 1] [--without-colmap]
         [--set KEY=VALUE ...] [--output FILE] [--json]
 
-Each set is a folder with ``images/`` and, if there is a reference, a COLMAP model ``gt/``. No
-intrinsics are given. COLMAP uses SIFT, all pairs, the incremental mapper and one SIMPLE_RADIAL
-camera per image. Pose AUC counts all pairs; an unregistered image has an error of 180 degrees.
-Rotation errors are those after alignment to the image with the smallest median error. Camera
-centers are compared with GPS after a similarity transform, horizontally. ``--json`` prints one JSON
-object as the last line.
+Each set of photos is a folder with ``images/`` and, if there is a reference, a COLMAP model
+``gt/``. Neither program gets intrinsics. COLMAP uses SIFT, all pairs, the incremental mapper and
+one SIMPLE_RADIAL camera per image. Pose AUC counts all pairs; an unregistered image has an error of
+180 degrees. Rotation errors are those after alignment to the image with the smallest median error.
+Camera centers are compared with GPS after a similarity transform, horizontally. ``--json`` prints
+one JSON object as the last line.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ from mpsfm_core.report.verdict import judge
 SETS = ("sacre_coeur", "mobilebrick", "lund_door", "seneca")
 CONVENTION = CONVENTIONS["paper"]
 MAX_ROTATION_DEG = 2.0
-"""Largest rotation error of a correct image. [ours]"""
+"""Maximum rotation error in degrees of an image whose pose counts as correct. [ours]"""
 MIN_GPS_POSITIONS = 4
-"""Smallest number of GPS positions that are compared: three fit a similarity transform. [ours]"""
+"""Minimum number of GPS positions to evaluate; three always fit a similarity transform. [ours]"""
 NUM_GPS_ITERATIONS = 20
-"""Iterations of the trimmed fit to GPS. [ours]"""
+"""Number of iterations of the trimmed alignment of camera centers to GPS. [ours]"""
 
 
 def main() -> None:
-    """Parse the command line and run."""
+    """Parse the command line, reconstruct all sets of photos, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("sets", nargs="*", default=list(SETS), metavar="SET")
     parser.add_argument("--photos", type=Path, default=Path("../shared/photos"))
@@ -86,7 +86,8 @@ def reconstruct_with_defaults(
 ) -> tuple[list[pycolmap.Reconstruction], str]:
     """Return the models of ``mpsfm reconstruct IMAGES``, largest first, and the verdict.
 
-    The verdict includes the codes of its doubts. There are no models if the run fails.
+    The verdict includes the names of the reasons for doubt. The list of models is empty if the
+    reconstruction fails.
     """
     offline = ["runtime.offline=true", "dense.enabled=false"]
     try:
@@ -124,8 +125,8 @@ def measure(models: Sequence[pycolmap.Reconstruction], folder: Path) -> dict[str
     """Measure registered images, pose AUC, rotation, focal and distortion errors, GPS residual.
 
     Args:
-        models: Models of the set, largest first; errors are those of the first one.
-        folder: Folder of the set.
+        models: Models of one set of photos, largest first; only the largest model is evaluated.
+            folder: Folder of the set of photos.
     """
     names = sorted(path.name for path in (folder / "images").iterdir())
     row: dict[str, Any] = {
@@ -198,13 +199,13 @@ def measure_gps_residual(poses: Mapping[str, Pose], images: Path) -> float | Non
 
 
 def get_distortion(camera: pycolmap.Camera) -> float:
-    """Return the first radial coefficient, 0 for a pinhole camera."""
+    """Return the first radial distortion coefficient of a camera, 0 for a pinhole camera."""
     extra = list(camera.extra_params_idxs())
     return float(camera.params[extra[0]]) if extra else 0.0
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format a Markdown table with one line per run."""
+    """Format a Markdown table with one row per reconstruction."""
     lines = [
         "| set | method | registered | AUC@1/5/20 | within 2 deg | max. rotation error, deg "
         "| focal error, median / max. | k1 (reference) | GPS median, m | s | verdict |",

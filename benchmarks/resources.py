@@ -4,7 +4,7 @@
 
 The rendered photos show a synthetic hall, which gives one component, or several unconnected rooms,
 one component each. Runs use SIFT with 1024 keypoints, exact depth from files, and pairs of
-neighboring photos. Prints a table row for each case.
+neighboring photos. Prints a table row for each reconstruction.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ runtime: {{workers: {workers}, cache_dir: {folder}/cache}}
 
 @dataclass(frozen=True)
 class Case:
-    """Case with number of photos, rooms (0: a hall), photo size and width of prior maps."""
+    """Test scene: number of photos and rooms (0: a hall), size of photos and prior maps."""
 
     count: int
     rooms: int
@@ -69,7 +69,7 @@ CASES = {
 
 
 def main() -> None:
-    """Run the cases, and print measured and estimated memory and disk space."""
+    """Reconstruct all test scenes, and print measured and estimated memory and disk space."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("cases", nargs="*", metavar="CASE", help=", ".join(CASES))
     print("| case | groups | MB predicted, measured | results predicted, measured |")

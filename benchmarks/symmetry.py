@@ -64,7 +64,7 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
             if pose is not None:
                 scene.registered = everything & (room != room[image])
                 scene.translations[image] = truth + pose[:, 3] - case.poses[image][:, 3]
-                # the observed points stay, because only the pose of the view is wrong
+                # keep the observations, because only the pose of the view is wrong
                 scene.tracks.point_of[scene.graph.keypoints_of(int(image))] = NO_POINT
             start = time.perf_counter()
             check = DepthConsistencyCheck(scene, options.consistency).check_image(

@@ -3,11 +3,12 @@
 Usage: ``python -m benchmarks.conformance [NETWORK ...] [--checkouts DIR]``.
 
 DIR (default ``$MPSFM_CHECKOUTS``) contains checkouts of the networks' repositories and of required
-libraries. Each folder is named after the export, with the commit that the plugin names. A network
-without checkout is skipped, and the table lists the commands that create the checkout. Packages
-that the authors' code imports may be in ``DIR/packages`` (``pip install --target``). RoMa and
-NetVLAD run in the Python environment that --environment names (default ``vismatch``). ``mpsfm env
-create`` creates this environment with mpsfm-vismatch, vismatch and onnx.
+libraries. Each checkout folder has the network's name in ``mpsfm models export``, at the commit
+pinned by our plugin. A network without checkout is skipped, and the table lists the commands that
+create the checkout. Packages that the authors' code imports may be in ``DIR/packages`` (``pip
+install --target``). RoMa and NetVLAD run in the Python environment that --environment names
+(default ``vismatch``). ``mpsfm env create`` creates this environment with mpsfm-vismatch, vismatch
+and onnx.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 
 Compared: TypeAlias = Callable[[Path], dict[str, float]]
-"""Function from the folder of the checkouts to the largest difference of each output."""
+"""Function that maps the folder of checkouts to the largest difference of each network output."""
 _HOLDS = {"normals, deg": 0.06, "positions, px": 1e-2, APART: np.inf}
 _TOLERANCE = 1e-3
 """Maximum relative difference of depth and std between our provider and the authors' code.
@@ -77,7 +78,7 @@ def main() -> int:
 
 
 def _missing(wanted: Mapping[str, tuple[str, str]], checkouts: Path | None) -> str:
-    """Return the reason why a network cannot be compared, or an empty text.
+    """Return the reason why a network cannot be compared, or an empty string.
 
     ``wanted`` contains the required repository and commit of each folder of checkouts.
     """

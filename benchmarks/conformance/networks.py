@@ -27,9 +27,10 @@ class Network:
     ``export`` is the name for ``mpsfm models export``. ``script`` is the file in the folder
     ``authors`` that runs the original code of the network. ``size`` is the network size for the
     export, and ``described`` its text in the table. ``libraries`` maps folders of further checkouts
-    to repository and commit. ``packages`` are installed by ``pip install --no-deps``. ``provider``
-    returns kind, name and options of our provider for an ONNX file. ``ask`` calls our provider with
-    ``views`` photos. ``compare`` computes the largest differences from the authors' arrays.
+    to repository and commit. ``packages`` lists the Python packages to install by ``pip install
+    --no-deps``. ``provider`` returns kind, name and options of our provider for an ONNX file.
+    ``ask`` calls our provider with ``views`` photos. ``compare`` computes the largest differences
+    from the authors' arrays.
     """
 
     export: str
@@ -60,12 +61,12 @@ class Hosted:
 
 
 def relative(ours: NDArray[Any], theirs: NDArray[Any], where: Bool) -> float:
-    """Compute the largest relative difference of two arrays; NaN for empty arrays."""
+    """Compute the largest relative difference of two arrays, or NaN if the arrays are empty."""
     return float(np.abs(ours[where] / theirs[where] - 1).max()) if where.any() else np.nan
 
 
 def angle_deg(ours: NDArray[Any], theirs: NDArray[Any], where: Bool) -> float:
-    """Compute the largest angle in degrees between unit vectors; NaN for empty arrays."""
+    """Compute the largest angle in degrees between unit vectors, or NaN if there are none."""
     if not where.any():
         return np.nan
     a, b = ours[where].astype(np.float64), theirs[where].astype(np.float64)

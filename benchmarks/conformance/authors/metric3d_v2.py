@@ -14,8 +14,10 @@ _PADDING = (123.675, 116.28, 103.53)
 job = ExportJob.from_arguments()
 model = network(job.size)
 last = model.model.depth_model.decoder.normal_predictor[-1]
-last.bias.data += torch.tensor([0.0, 0.0, -10.0])  # let normals face the camera
-for index, (image, camera) in enumerate(photos(job)):  # inference as in hubconf.py of Metric3D
+last.bias.data += torch.tensor([0.0, 0.0, -10.0])  # let predicted normals face the camera
+
+# Photos are resized and padded as in Metric3D's hubconf.py.
+for index, (image, camera) in enumerate(photos(job)):
     height, width = image.shape[:2]
     scale = min(SIZE[0] / height, SIZE[1] / width)
     rgb = cv2.resize(

@@ -32,7 +32,7 @@ for block in model.encoder.backbone.blocks:  # replace identity layers
     torch.nn.init.constant_(block.ls1.gamma, 1.0)
     torch.nn.init.constant_(block.ls2.gamma, 1.0)
 last = [module for module in model.normal_head.modules() if isinstance(module, torch.nn.Conv2d)]
-last[-1].bias.data += torch.tensor([0.0, 0.0, -1.0])  # let normals face the camera
+last[-1].bias.data += torch.tensor([0.0, 0.0, -1.0])  # let predicted normals face the camera
 for index, (image, camera) in enumerate(photos(job)):
     fov = math.degrees(2 * math.atan(camera["width"] / 2 / camera["fx"]))
     model.onnx_compatible_mode = True

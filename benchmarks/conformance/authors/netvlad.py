@@ -62,7 +62,7 @@ with torch.inference_mode():
     for path in photos:
         image = scope["cv2"].imread(path)[..., ::-1].astype(np.float32)
         size = image.shape[:2][::-1]
-        if max(size) > 1024:  # as the configuration "netvlad" of hloc
+        if max(size) > 1024:  # maximum image size of hloc's configuration "netvlad"
             new = tuple(round(x * (1024 / max(size))) for x in size)
             image = scope["resize_image"](image, new, "cv2_area")
         batch = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)) / 255)[None]

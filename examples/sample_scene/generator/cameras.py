@@ -47,7 +47,7 @@ class Truth:
     """Exact depth and normal maps of a rendered view.
 
     Depth (h, w) is along z in meters. Normals (h, w, 3) are unit vectors in the camera frame that
-    face the camera. Both are 0 for pixels without a surface.
+    face the camera. Depth and normals are 0 for pixels without a surface.
     """
 
     depth: Float64
