@@ -53,7 +53,12 @@ def spec(kind: Kind, name: str, *capabilities: str, options: str | None = None) 
         (
             spec("matcher", "ToldMatcher", "dense", "pair-depth", options="ToldOptions"),
             told,
-            {"matcher-no-features", "matcher-few-features", "name-does-not-matter"},
+            {
+                "matcher-no-features",
+                "matcher-few-features",
+                "matcher-many-features",
+                "name-does-not-matter",
+            },
         ),
         (
             spec("multiview", "ToldGroup", *EVERYTHING, options="ToldOptions"),
