@@ -67,7 +67,7 @@ def reconstruct(
     If many matches observe no common 3D point, the mapper runs again with other random seeds. If
     guessed focal lengths were far off, the mapper runs again with the refined focal lengths. The
     run with the most matches that observe common 3D points is kept. The same problem, options and
-    machine give the same bits, also if an interrupted run continues from a checkpoint.
+    machine give bit-identical results, also if an interrupted run continues from a checkpoint.
 
     Args:
         problem: Images with depth and normal priors, and geometrically verified matches.

@@ -53,7 +53,7 @@ def select_run(runs: Sequence[MapperRun], options: ConsistencyOptions) -> Mapper
     """Select the run whose largest component explains the most matches.
 
     Among runs that explain equal shares of the match scores, the result that occurs in most runs is
-    selected. Among several such results, the agreement of depth maps decides.
+    selected. Among several most frequent results, the agreement of depth maps decides.
     """
     max_ratio = max(run.largest_explained_ratio for run in runs)
     candidates = [

@@ -5,19 +5,20 @@ in front of the surface in that image, both depth maps contradict each other, be
 sees empty space where the pixel has a surface. A pixel behind the surface of the other image is
 occluded. A contradiction of depth maps has one of two causes.
 
-* The depth is wrong. The errors of log depth in both images have normal distributions with standard
-  deviations ``s`` and ``s'``. The likelihood of the contradiction is ``L = E_e[exp(-(e' / s')^2 /
-  2)]`` over the errors ``e`` along the pixel's ray, where ``e'`` is the log-depth difference
-  between the other surface and the shifted pixel, or 0 if the shifted pixel is occluded or outside
-  the other image. At wide angles, an error of depth also shifts the pixel laterally in the other
-  image. The likelihood is the expectation over ``e`` instead of the maximum, because some error
-  nearly always shifts the pixel past a depth edge.
+* In the first case, the depth of an image is wrong. The errors of log depth in both images have
+  normal distributions with standard deviations ``s`` and ``s'``. The likelihood of the
+  contradiction is ``L = E_e[exp(-(e' / s')^2 / 2)]`` over the errors ``e`` along the pixel's ray,
+  where ``e'`` is the log-depth difference between the other surface and the shifted pixel, or 0 if
+  the shifted pixel is occluded or outside the other image. At wide angles, an error of depth also
+  shifts the pixel laterally in the other image. The likelihood is the expectation over ``e``
+  instead of the maximum, because some error nearly always shifts the pixel past a depth edge.
 
-* The pose is wrong. The surface in the other image is then independent of the pixel.
+* In the second case, the pose of an image is wrong. A wrong pose makes the surface in the other
+  image independent of the pixel.
 
-A pixel is a violation if ``L`` is below the likelihood of a deviation of ``max_deviation`` standard
-deviations. The violation ratio (beta in the paper) is the share of violating pixels, summed over
-both directions.
+A pixel is a violation if its likelihood ``L`` is below that of a depth error of ``max_deviation``
+standard deviations. The violation ratio (beta in the paper) is the share of violating pixels,
+summed over both directions.
 
 The depth check needs the standard deviation of depth at each pixel, because a good prior can be
 wrong in one spot. Triangulated points that do not depend on the prior measure this standard

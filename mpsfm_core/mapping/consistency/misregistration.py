@@ -49,7 +49,7 @@ class Misregistration(NamedTuple):
     """Number of matches that contradict the poses, minus number of matches that support them."""
     splits: bool = False
     """True if one pair connects the images to the model and several pairs contradict this
-    connection. The images are then deregistered if no other poses are found for them."""
+    connection. Such images are deregistered if no other poses are found for them."""
 
 
 class ContradictedCut(NamedTuple):
@@ -162,8 +162,8 @@ def _find_contradicted_images(
 
     Args:
         registered: (n,) bool.
-        contradicting: (n, n) unexplained matches of contradicting pairs.
-        explained: (n, n) explained matches.
+        contradicting: (n, n) number of unexplained matches of each contradicting image pair.
+        explained: (n, n) number of matches of each image pair that observe common points.
 
     Returns:
         Images, each with its excess of contradicting matches.
@@ -186,8 +186,8 @@ def find_contradicted_cuts(
 
     Args:
         registered: (n,) bool.
-        contradicting: (n, n) unexplained matches of contradicting pairs.
-        explained: (n, n) explained matches.
+        contradicting: (n, n) number of unexplained matches of each contradicting image pair.
+        explained: (n, n) number of matches of each image pair that observe common points.
     """
     images = np.flatnonzero(registered)
     explained = explained[np.ix_(images, images)]

@@ -4,8 +4,8 @@ Look-alike places give hundreds of matches that one relative pose explains. The 
 look-alike places differ, so a wrong relative pose puts surfaces where the other image sees empty
 space.
 
-1. The relative pose of each verified pair is checked for depth consistency. If this pose is
-   inconsistent, other pose hypotheses are checked in the order of their support.
+1. The relative pose of each verified pair is checked for depth consistency. If the relative pose of
+   a pair is inconsistent, other pose hypotheses are checked in the order of their support.
 2. The matches of a pair are weighted by the support of the best depth-consistent pose, relative to
    the best supported pose.
 3. A pair without a depth-consistent pose may still be correct, if few or bad matches make its
@@ -45,7 +45,7 @@ from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimato
 
 MAX_ROTATION_ERROR_DEG = 30.0
 """Maximum angle between the relative rotation of a pair and the relative rotation that
-depth-consistent pairs imply. The value allows for errors of some degrees along a chain of pairs.
+depth-consistent pairs imply, with a margin for errors of some degrees along a chain of pairs.
 [ours]"""
 
 

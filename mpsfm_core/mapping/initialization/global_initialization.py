@@ -6,8 +6,8 @@
 2. Keep the largest component of the view graph whose edges are on cycles. An edge of the view graph
    on no cycle cannot be verified by other pairs.
 3. Average the relative rotations by IRLS with a Cauchy loss.
-4. Solve for the scales of the depth priors, then for the camera centers. Both steps are linear
-   least-squares problems, solved by IRLS with a Cauchy loss.
+4. Solve for the scales of the depth priors, then for the camera centers. Depth scales and camera
+   centers are the solutions of linear least-squares problems, solved by IRLS with a Cauchy loss.
 5. Remove the image pairs that disagree with the estimated poses, and return the poses of the
    largest component that remains.
 
@@ -45,7 +45,7 @@ MAX_ROTATION_ERROR_DEG = 5.0
 [ours]"""
 MAX_CENTER_ERROR = 0.3
 """Maximum distance between the measured and the estimated relative camera center of a pair,
-relative to its baseline. The value allows direction errors of several degrees. [ours]
+relative to its baseline, with a margin for direction errors of several degrees. [ours]
 """
 PLANAR_WEIGHT = 0.1
 """Weight of each match of a pair that a homography also explains, because a planar scene has two
@@ -144,10 +144,10 @@ def average_rotations(
     gives the initial rotations. The edges of the view graph must form one connected component.
 
     Args:
-        a: (m,) index of the first image of each edge.
-        b: (m,) index of the second image of each edge.
+        a: (m,) index of the first image of each view-graph edge.
+        b: (m,) index of the second image of each view-graph edge.
         b_from_a: (m, 3, 3) relative rotations ``R[b] @ R[a].T``.
-        weights: (m,) weights of the edges.
+        weights: (m,) weight of each graph edge.
         num_images: Number of images.
 
     Returns:
@@ -169,10 +169,10 @@ def average_differences(
     """Solve ``x[b] - x[a] = differences`` for node values ``x`` by IRLS with a Cauchy loss.
 
     Args:
-        a: (m,) index of the first node of each edge.
-        b: (m,) index of the second node of each edge.
+        a: (m,) index of the first node of each graph edge.
+        b: (m,) index of the second node of each graph edge.
         differences: (m, ...) measured differences ``x[b] - x[a]``.
-        weights: (m,) weights of the edges.
+        weights: (m,) weight of each graph edge.
         num_nodes: Number of nodes.
 
     Returns:
@@ -295,8 +295,8 @@ def find_cycle_edges(a: Int64, b: Int64, num_nodes: int) -> Bool:
     that the edge closes. A forest edge is a bridge if its accumulated label is 0.
 
     Args:
-        a: (m,) index of the first node of each edge.
-        b: (m,) index of the second node of each edge. No pair of graph nodes may occur twice.
+        a: (m,) index of the first node of each graph edge.
+        b: (m,) index of the second node of each graph edge. No pair of graph nodes may occur twice.
         num_nodes: Number of nodes.
 
     Returns:

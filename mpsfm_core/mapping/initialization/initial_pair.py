@@ -53,8 +53,8 @@ class InitialPairSelector:
     ) -> list[VerifiedPair]:
         """Rank the image pairs for initialization (COLMAP's ``FindInitialImagePair``).
 
-        Image pairs are ranked by their number of matches. The first pairs are ranked again by the
-        support of their relative poses (option ``num_compared``).
+        Image pairs are ranked by their number of matches. The pairs with most matches are ranked
+        again by the support of their relative poses (option ``num_compared``).
 
         Args:
             pose_estimator: Pose estimator on a scene without registered images.

@@ -163,7 +163,8 @@ def measure_local_depth_noise(
 def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
     """Return whitened log-depth differences (m,) of matches, and the group (m,) of each match.
 
-    A group contains the matches of one cell of the first image with one second image.
+    A group contains the matches between one grid cell of the first image of a pair and the second
+    image.
     """
     graph, tracks = scene.graph, scene.tracks
     point = tracks.point_of[graph.source]

@@ -61,8 +61,8 @@ def compute_normal_log_likelihood(residuals: Float64, std: float) -> float:
     """Compute the mean log likelihood of Sampson errors under a truncated normal distribution.
 
     Args:
-        residuals: (m,) float64 residuals below ``MAX_RESIDUAL``.
-        std: Standard deviation of the normal distribution.
+        residuals: (m,) float64 Sampson errors below ``MAX_RESIDUAL``.
+        std: Standard deviation of the truncated normal distribution.
     """
     norm = std * np.sqrt(np.pi / 2) * erf(MAX_RESIDUAL / (std * np.sqrt(2)))
     return float(-0.5 * (residuals**2).mean() / std**2 - np.log(norm))
@@ -72,8 +72,8 @@ def compute_student_log_likelihood(residuals: Float64, scale: float) -> float:
     """Compute the mean log likelihood of Sampson errors under the best truncated t distribution.
 
     Args:
-        residuals: (m,) float64 residuals below ``MAX_RESIDUAL``.
-        scale: Scale of the Cauchy loss that corresponds to the distribution.
+        residuals: (m,) float64 Sampson errors below ``MAX_RESIDUAL``.
+        scale: Scale of the Cauchy loss that corresponds to the Student's t distribution.
     """
     spread = np.log1p((residuals / scale) ** 2).mean()
     return float((-(DEGREES_OF_FREEDOM + 1) / 2 * spread - _log_norms(scale)).max())

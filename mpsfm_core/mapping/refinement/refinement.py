@@ -1,7 +1,7 @@
 """Local and global refinement by bundle adjustment and depth integration (paper 3.3).
 
 The paper alternates bundle adjustment and depth integration. A depth map that was refined with
-points agrees with these points, and so keeps them from moving in the next bundle adjustment.
+points agrees with these points, and so keeps the points from moving in the next bundle adjustment.
 Therefore bundle adjustment uses the scaled depth priors, unless the option ``bundle_depth`` is
 ``refined``.
 """
@@ -115,8 +115,8 @@ class Refiner:
         Args:
             image: A registered image.
             others: Images whose mean scale a metric prior is compared with. Points whose scale
-                differs from the mean by more than ``MAX_DEPTH_RATIO`` are ignored. Without points,
-                the image takes the mean scale.
+                differs from the mean by more than ``MAX_DEPTH_RATIO`` are ignored. If no points
+                remain, the image takes the mean scale.
         """
         scene = self.scene
         depth_map = scene.maps[image]

@@ -1,9 +1,9 @@
 """2D-3D correspondences of an image that is to be registered.
 
 Each match to a registered image gives one correspondence between a keypoint of the new image and a
-3D point. The point is triangulated, or lifted from the depth of the registered image (paper section
-3.2). If the depth of the registered image is unknown, the point may be anywhere on a part of the
-matched keypoint's ray.
+3D point. The 3D point of a match is triangulated, or lifted from the depth of the registered image
+(paper section 3.2). If the depth of the registered image is unknown, the point may be anywhere on a
+part of the matched keypoint's ray.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ def find_correspondences(
     """Collect the 2D-3D correspondences of an image with the given registered images.
 
     A match uses the triangulated point of its keypoint if the triangulation angle suffices.
-    If the angle is too small, the 3D point lies on the part of the matched keypoint's ray that the
-    depth prior allows.
+    If the triangulation angle is too small, the 3D point lies on the part of the matched keypoint's
+    ray that the depth prior allows.
 
     Args:
         scene: The scene with the registered images.

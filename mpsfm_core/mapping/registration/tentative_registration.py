@@ -42,7 +42,7 @@ def register_tentatively(
 
     Args:
         reconstruction: The largest component.
-        components: The other components. If one image of such a component is registered, the whole
+        components: The other components. If one image of another component is registered, the whole
             component is registered with the same transformation.
         problem: The mapping problem that was reconstructed.
         options: Options of the mapper.
