@@ -1,8 +1,8 @@
-"""Read YAML files and ``--set`` overrides into one checked :class:`Config`.
+"""Read configuration files and ``--set`` overrides into one checked :class:`Config`.
 
-A configuration file may extend a shipped configuration or another file with ``extends:``. Mappings
-are merged key by key, and other values replace those of the parent file. Merging a file with its
-parent file has three exceptions:
+A configuration file may extend a shipped configuration or another file with ``extends:``. YAML
+mappings are merged key by key, and all other values replace those of the parent file. Merging a
+file with its parent file has three exceptions:
 
 * A provider block with another ``use:`` than the parent file drops all keys of the parent's block,
   because another provider has different options.
@@ -70,7 +70,8 @@ def load_config(
     Args:
         name_or_path: Name of a shipped configuration, or a YAML file (a slash, .yaml or .yml marks
             a file).
-        overrides: Settings such as ``masks.0.use=sky``, which replace those of the files.
+        overrides: Settings such as ``masks.0.use=sky``, which replace those of the configuration
+        files.
         registry: Providers that the configuration may name, by default ``Registry.discover()``.
         complete: If false, required provider options may be missing (null in the result).
 
@@ -153,10 +154,10 @@ def _read_chain(path: Path, children: tuple[Path, ...] = ()) -> list[_Layer]:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read: {error}") from error
+        raise ConfigError(f"{path}: the configuration file cannot be read: {error}") from error
     data = parse_yaml(text, str(path)) or {}
     if not isinstance(data, dict):
-        raise ConfigError(f"{path}: must be a mapping, is a {type(data).__name__}")
+        raise ConfigError(f"{path}: the file must be a mapping, is a {type(data).__name__}")
     check_version(data, FORMAT, path, ConfigError)
     data.pop(VERSION, None)
     parent = data.pop("extends", None)
@@ -216,7 +217,7 @@ def _merge_items(base: list[Any], change: Mapping[str, Any]) -> list[Any]:
     for key, value in change.items():
         index = int(key)
         if index > len(items):
-            raise IndexError(f"entry {index} of a list that has {len(items)}")
+            raise IndexError(f"no list entry {index}, because the list has {len(items)} entries")
         items[index : index + 1] = [_merge(items[index] if index < len(items) else None, value)]
     return items
 
@@ -284,7 +285,7 @@ def check_provider_config(
     registry: Registry,
     complete: bool = True,
 ) -> ProviderConfig:
-    """Check a block with one provider; fill in the options of provider and wrappers.
+    """Check a provider block without fallbacks; fill in the options of provider and wrappers.
 
     Args:
         path: Path of the provider block in the configuration, for error messages.

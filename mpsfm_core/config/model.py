@@ -48,8 +48,8 @@ class RuntimeOptions(Options):
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device on which providers run, where ``auto`` uses a GPU if one is available."""
     cache_dir: Path | None = None
-    """Folder of weights, extraction results and checkpoints; null uses the platform's cache
-    folder."""
+    """Folder of network weights, extraction results and checkpoints, by default the platform's
+    cache folder."""
     executor: str = "threads"
     """Executor that runs the providers, either in ``threads`` of this process or in the workers of
     a plugin (``dask``, ``ray``), which share ``cache_dir`` and the images."""
@@ -110,9 +110,10 @@ class Config(Options):
     multiview}``."""
     depth: ProviderConfig
     normals: ProviderConfig
-    """Provider of normals; ``use: same-network`` uses the normals of the depth network."""
+    """Provider of normals; With ``use: same-network``, the depth network also predicts the
+    normals."""
     masks: tuple[ProviderConfig, ...] = ()
-    """Mask providers. A pixel is used if no mask excludes the pixel."""
+    """Mask providers. Providers of masks; a pixel is used if no mask excludes the pixel."""
     verification: VerificationOptions = Field(default_factory=VerificationOptions)
     adjustment: AdjustmentOptions = Field(default_factory=AdjustmentOptions)
     extraction: ExtractionOptions = Field(default_factory=ExtractionOptions)

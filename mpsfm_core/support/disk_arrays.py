@@ -79,7 +79,7 @@ class DiskArrays:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self._folder) as file:
-                file.write(bytes(size))  # reserves disk space; a sparse file could fail later
+                file.write(bytes(size))  # reserve disk space, as writes to a sparse file could fail
                 file.flush()
                 chunk = mmap.mmap(file.fileno(), size)
         except OSError as error:

@@ -52,7 +52,7 @@ def write_file(
         path: File to write.
         content: Content as bytes, as text (encoded as UTF-8), or as a function that writes to an
         open file.
-        temporary: Folder on the same disk for the incomplete file; the folder of `path` by default.
+        temporary: Folder for the incomplete file on the same disk as `path`, by default its folder.
 
     Raises:
         OSError: the file cannot be written.
@@ -182,7 +182,7 @@ def _read_plan(scratch: Path) -> tuple[list[str], list[str]]:
             raise ValueError("the scratch folder contains a symbolic link")
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise InputError(
-            f"{path}: not written by mpsfm ({error}); remove {scratch} after a check"
+            f"{path}: the file was not written by mpsfm ({error}); remove {scratch} after a check"
         ) from error
     return entries, new
 
@@ -202,7 +202,7 @@ def _clear_up(output: Path) -> None:
 
 @contextmanager
 def _lock(folder: Path) -> Iterator[bool]:
-    """Lock a folder until the end of the block; yield False if locks are unsupported.
+    """Lock a folder until the ``with`` block ends; yield False if locks are unsupported.
 
     The folder itself is locked, so no lock file remains. Windows and some network disks do not
     support folder locks. Without folder locks, concurrent runs are not detected, and scratch
@@ -236,7 +236,9 @@ def _create_folder(output: Path) -> list[Path]:
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"{output}: cannot be the output folder: {error.strerror}") from error
+        raise InputError(
+            f"{output}: this path cannot be the output folder: {error.strerror}"
+        ) from error
     return missing
 
 

@@ -40,7 +40,7 @@ def check_version(
         raise error(f"{path}: its {VERSION} is {str(value)[:60]!r}, not a number from 1 on")
     if number > known:
         raise error(
-            f"{path}: is of format {number}, written by a newer mpsfm-core; this version reads "
-            f"formats up to {known}: pip install --upgrade mpsfm-core, or create the file again"
+            f"{path}: the file is of format {number}, written by a newer mpsfm-core; this version "
+            f"reads formats up to {known}: pip install --upgrade mpsfm-core, or create the file again"
         )
     return number

@@ -49,7 +49,7 @@ def thread_limit() -> int:
 
 
 def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Call a function on every item in parallel threads; return the results in order."""
+    """Call a function on every list item in parallel threads; return the results in order."""
     with ThreadPoolExecutor(thread_limit()) as pool:
         return list(pool.map(function, items))
 

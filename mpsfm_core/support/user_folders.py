@@ -21,7 +21,7 @@ def user_cache_folder() -> Path:
     if variable:
         try:
             return Path(variable).expanduser()
-        except RuntimeError:  # "~" fails for an account without a home folder
+        except RuntimeError:  # Expanding "~" fails for an account without a home folder.
             return Path(variable)
     try:
         return Path(platformdirs.user_cache_dir("mpsfm"))

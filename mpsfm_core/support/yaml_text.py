@@ -1,4 +1,4 @@
-"""YAML 1.2 scalars, errors for repeated keys, and line numbers.
+"""Reading and writing of YAML 1.2, with errors for repeated keys, and line numbers.
 
 PyYAML itself follows YAML 1.1, where ``no`` is false, ``1e-3`` a text and ``2024-01-01`` a date.
 """
@@ -69,9 +69,9 @@ def parse_yaml(text: str, source: str) -> Any:
         return yaml.load(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
         line = f":{error.problem_mark.line + 1}" if error.problem_mark else ""
-        raise ConfigError(f"{source}{line}: not valid YAML: {error.problem}") from error
+        raise ConfigError(f"{source}{line}: the text is not valid YAML: {error.problem}") from error
     except yaml.YAMLError as error:
-        raise ConfigError(f"{source}: not valid YAML: {error}") from error
+        raise ConfigError(f"{source}: the text is not valid YAML: {error}") from error
     except RecursionError as error:
         raise ConfigError(f"{source}: the YAML text is nested too deeply") from error
 

@@ -34,7 +34,7 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 Check = Callable[[ContractCase], str | None]
 """Type of a contract check, a function that returns nothing or a remark if the provider passes.
-Otherwise the function raises ``CheckFailed`` or ``CheckSkipped``."""
+A check that fails or does not apply raises ``CheckFailed`` or ``CheckSkipped``."""
 
 Status = Literal["pass", "fail", "skip", "xfail"]
 SetupSource = ContractSetup | Callable[[Path], ContractSetup] | None
@@ -68,7 +68,7 @@ class CheckResult:
     id: str
     """Id of the check, such as ``depth-is-z``."""
     status: Status
-    """Outcome of the check, where ``xfail`` is a failure that the ContractSetup declares as
+    """Outcome of the contract check, where ``xfail`` is a failure that the plugin declares as
     expected."""
     message: str
     """Reason why the check failed or was skipped, or the remark of a check that passed."""
@@ -236,7 +236,7 @@ def run_checks(
 
 
 def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
-    """Find the providers that a name on the command line denotes.
+    """Find the providers that the name of a provider, plugin or distribution denotes.
 
     Args:
         registry: Registry to search.
@@ -274,7 +274,7 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
 
 
 def find_plugin(registry: Registry, name: str) -> ProviderStatus | None:
-    """Find a plugin without usable providers, which has only hooks or failed to load.
+    """Find a plugin without usable providers, which offers only hooks or failed to load.
 
     Args:
         registry: Registry to search.
@@ -291,11 +291,11 @@ def parse_setup(assignments: Sequence[str]) -> ContractSetup | None:
     """Parse provider options of the command line into a ContractSetup.
 
     Args:
-        assignments: Texts ``key=value`` or ``group.key=value`` with YAML values.
+        assignments: Option assignments ``key=value`` or ``group.key=value`` with YAML values.
 
     Returns:
-        ContractSetup with these options; None without assignments, so that the ContractSetup of the
-        plugin is used.
+        ContractSetup with the provider options, or None without assignments, so that the plugin's
+        own ContractSetup is used.
 
     Raises:
         InputError: a text is not an assignment ``key=value``.

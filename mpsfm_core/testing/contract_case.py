@@ -68,8 +68,8 @@ class ContractSetup:
     """Function that is called with each synthetic view before the provider runs on the view, for
     instance to write a file."""
     expected_failures: Mapping[str, str] = field(default_factory=dict)
-    """Reason of each expected failure by check id. If the provider passes such a check
-    nevertheless, the check is reported as failed."""
+    """Reason of each expected failure by the id of the contract check. If a provider passes a check
+    that is expected to fail, the check is reported as failed."""
 
     def __post_init__(self) -> None:
         if self.truth_source == "prepared" and self.prepare is None:
@@ -199,7 +199,7 @@ class ContractCase:
 
         Args:
             view: Modified image that replaces the image ``example.view``.
-            example: Synthetic view that supplies all other inputs.
+            example: Synthetic view that supplies all inputs of the provider except the image.
             provider: Provider instance to use instead of the one that all checks share.
             auxiliary: Depth or features for the provider, by default from
                 :meth:`make_auxiliary_input`.
@@ -218,7 +218,7 @@ class ContractCase:
         return run(self._validated_spec, provider, view)
 
     def make_auxiliary_input(self, view: View, example: Example) -> Any:
-        """Return depth for a normals provider, features for a sparse matcher, else None."""
+        """Return the input depth of a normals provider or features of a sparse matcher."""
         if self.kind == "matcher":
             return self.extract_features(view, example.partner.view)
         if self.kind != "normals" or not (self.declares("needs-depth") or self._ground_truth):

@@ -31,7 +31,7 @@ Appearance = Literal["painted", "textured"]
 _SKY = ((120, 170, 235), (200, 220, 245))
 """RGB of the sky at the upper and lower border of a textured synthetic view."""
 _COS_MAX_CREASE = np.cos(np.deg2rad(20.0))
-"""Cosine of 20 degrees, above which an angle between neighboring normals counts as an edge."""
+"""Smallest cosine between neighboring normals on a smooth surface, that of 20 degrees."""
 
 
 @dataclass(frozen=True, eq=False)

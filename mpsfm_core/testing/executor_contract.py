@@ -1,4 +1,4 @@
-"""Contract checks of executors, for the tests of a plugin that provides an executor."""
+"""Contract checks for plugins with an executor, which distributes work to processes."""
 
 from __future__ import annotations
 
@@ -281,7 +281,7 @@ def _extract(
 
 
 def _read_cache(cache: Path) -> dict[str, bytes]:
-    """Read the cached arrays of an extraction, without the records of runs."""
+    """Read the arrays that an extraction wrote to its cache, without the records of runs."""
     root = cache / "extraction"
     kinds = ("features", "matcher", "normals", "depth")
     return {

@@ -26,7 +26,7 @@ class GroundTruthOptions(Options):
 
 
 class GroundTruth:
-    """Ground truth of synthetic views and of all painted views.
+    """Ground truth of synthetic views and of all views whose colors encode depth and normals.
 
     Known synthetic views and their mirror images are recognized by their pixels. Depth and normals
     of any other view, for instance a crop made by a wrapper, are decoded from colors that encode

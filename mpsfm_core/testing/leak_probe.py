@@ -15,7 +15,8 @@ class ProcessUsage(NamedTuple):
     """Resources that this process uses after garbage collection."""
 
     memory_mb: float
-    """Resident memory of the process in MB (1e6 bytes), on Linux without memory already freed."""
+    """Resident memory of the process in MB (1e6 bytes); on Linux, memory already freed is
+    excluded."""
     objects: int
     """Number of objects that Python's garbage collector tracks."""
     files: int

@@ -53,7 +53,7 @@ def select_comparable(valid: Bool, truth: TrueMaps) -> Bool:
         truth: Ground-truth maps (h, w) on the pixel grid of the provider's map.
 
     Returns:
-        Mask (h, w) of the valid pixels away from edges.
+        Mask (h, w) of the valid pixels that are away from surface edges.
 
     Raises:
         CheckFailed: the map has too few valid pixels for a comparison.
@@ -138,7 +138,7 @@ def _normalized_positions(shape: tuple[int, int]) -> Float64:
 def _solve_shift(error: Float64, slopes: list[Float64], positions: Float64) -> MapShift:
     """Fit shift and stretch to ``error = constant - dot(slope, shift + stretch * position)``.
 
-    The least-squares fit has a second pass that excludes outliers.
+    The least-squares fit is repeated once without outliers.
 
     Args:
         error: Errors (n, k) of a map at n pixels in k channels.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 
 class CheckFailed(Exception):
-    """The provider under test violates the contract as the message describes."""
+    """The provider under test violates the contract in the way that the message describes."""
 
 
 class CheckSkipped(Exception):
-    """The contract check does not apply to a provider for the reason in the message."""
+    """The contract check does not apply to the provider, for the reason in the message."""

@@ -32,15 +32,15 @@ MAX_SLOPE = 4.0
 """Largest slope that a color encodes, of a surface seen at 76 degrees from its normal; one color
 step is at most 1.8 degrees."""
 RELATIVE_STD = 0.05
-"""Relative std of depth that test networks and prepared files report."""
+"""Relative std of depth that small test networks and prepared depth files report."""
 NORMALS_STD = 0.1
-"""Std of normals in rad that test networks and prepared files report."""
+"""Std of normals in rad that small test networks and prepared normal files report."""
 
 _HALF = 127.5
 
 
 def paint(depth: NDArray[Any], normals: NDArray[Any], valid: Bool) -> UInt8:
-    """Encode depth and normals as the colors of a painted view.
+    """Encode depth and normals as the colors of a synthetic view.
 
     Args:
         depth: z-depth (h, w) in meters, clipped at :data:`MAX_DEPTH`.
@@ -60,7 +60,7 @@ def paint(depth: NDArray[Any], normals: NDArray[Any], valid: Bool) -> UInt8:
 
 
 def decoder() -> tuple[Float64, Float64]:
-    """Return weights and bias of the affine layer that decodes a painted pixel.
+    """Return weights and bias of the affine layer that decodes depth and normal from a color.
 
     Returns:
         Weights (4, 3) and bias (4,) of the affine decoder. The product ``weights @ rgb + bias`` for
@@ -74,14 +74,14 @@ def decoder() -> tuple[Float64, Float64]:
 
 
 def read_depth(rgb: NDArray[Any]) -> Float64:
-    """Decode the depth (...) in meters from painted RGB (..., 3); 0 without a surface."""
+    """Decode depth (...) in meters, 0 without a surface, from the RGB colors (..., 3) of a view."""
     weights, bias = decoder()
     depth: Float64 = rgb.astype(np.float64) @ weights[0] + bias[0]
     return depth
 
 
 def read_normals(rgb: NDArray[Any]) -> Float64:
-    """Decode normals (..., 3), not normalized, from painted RGB (..., 3)."""
+    """Decode normals (..., 3), not normalized, from the RGB colors (..., 3) of a view."""
     weights, bias = decoder()
     normals: Float64 = rgb.astype(np.float64) @ weights[1:].T + bias[1:]
     return normals

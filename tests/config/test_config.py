@@ -205,7 +205,7 @@ class TestOverrides:
 
     def test_override_beyond_end_of_list_is_an_error(self, load: Load) -> None:
         message = error_of(load, "extends: fast-cpu\n", "masks.2.use=files")
-        assert message == "--set masks.2.use=files: entry 2 of a list that has 0"
+        assert message == "--set masks.2.use=files: no list entry 2, because the list has 0 entries"
 
 
 class TestErrors:
@@ -224,7 +224,10 @@ class TestErrors:
             ("depth: onnx\n", ":2: depth: "),
             ("depth:\n  wrap:\n  - use: flap\n", ":4: depth.wrap.0.use: no wrapper provider"),
             ("depth:\n  wrap:\n  - use: tilt\n", ":4: depth.wrap.0.use: 'tilt' does not wrap"),
-            ("runtime: {seed: 1}\nruntime: {seed: 2}\n", ":3: not valid YAML: key 'runtime' rep"),
+            (
+                "runtime: {seed: 1}\nruntime: {seed: 2}\n",
+                ":3: the text is not valid YAML: key 'runtime' rep",
+            ),
             ("runtime: [\n", "not valid YAML"),
             ("depth:\n  calibration: {relative: 1}\n", ":3: depth.calibration.relative: unknown"),
             ("depth:\n  calibration: nowhere.yaml\n", ":3: depth.calibration: calibration file"),

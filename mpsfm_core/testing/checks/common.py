@@ -4,8 +4,8 @@ A contract check is a function whose only argument, the
 :class:`~mpsfm_core.testing.contract_case.ContractCase`, contains the provider under test. A
 contract check returns nothing or a remark if the provider passes, and otherwise raises
 ``CheckFailed`` or ``CheckSkipped`` with the reason. The id of a contract check is the function name
-without ``check_`` and with dashes. The first line of its docstring states what the check requires
-of the provider; the rest gives the reason or the limits of the check.
+without ``check_`` and with dashes. The first line of a check's docstring states what the check
+requires of the provider; the rest gives the reason or the limits of the check.
 
 Most contract checks use one view of 192 x 144 pixels, so that a small network needs only a fraction
 of a second. Outputs of a provider are compared bit for bit, because a run reuses cached outputs.
@@ -60,7 +60,7 @@ def check_specification(case: ContractCase) -> str:
     """Require that the registry accepts the specification and the options of the ContractSetup."""
     fault, hint = find_spec_fault(case.spec)
     if fault:
-        raise CheckFailed(f"the specification {fault}; {hint}")
+        raise CheckFailed(f"the provider specification {fault}; {hint}")
     if (
         case.spec.kind == "wrapper"
         and not {"wraps-depth", "wraps-normals"} & case.spec.capabilities
@@ -126,7 +126,7 @@ def check_output_rules(case: ContractCase) -> None:
 def check_deterministic(case: ContractCase) -> None:
     """Require bitwise equal output from repeated calls and from two instances.
 
-    Outputs are cached, and a run with a fixed seed must be repeatable.
+    Outputs of providers are cached, and a run with a fixed seed must be repeatable.
     """
     first = case.run(case.example)
     _require_same(first, case.run(case.example), "in a second call")
@@ -173,14 +173,14 @@ def check_name_does_not_matter(case: ContractCase) -> None:
     if case.declares("uncached"):
         raise CheckSkipped("declares 'uncached'")
     if case.setup.prepare is not None:
-        raise CheckSkipped("the ContractSetup prepares one file per view name")
+        raise CheckSkipped("the provider reads one prepared file per view name")
     expected = case.run(case.example)
     renamed = replace(case.example.view, name="another/name.jpg")
     _require_same(expected, case.run_on_view(renamed, case.example), "of a renamed view")
 
 
 def check_intrinsics_declared(case: ContractCase) -> None:
-    """Require ``intrinsics-aware`` if the output depends on the focal length.
+    """Require the capability ``intrinsics-aware`` if the output depends on the focal length.
 
     Without the capability ``intrinsics-aware``, the cache of a run would return the output for a
     camera with another focal length.
@@ -254,7 +254,7 @@ def check_pickles(case: ContractCase) -> None:
 
 
 def check_offline(case: ContractCase) -> None:
-    """Require that construction and calls open no socket once the weights are local.
+    """Require that a provider opens no network connection once its weights are local.
 
     The check detects sockets opened by Python code, not those of native libraries.
     """
@@ -299,7 +299,7 @@ def check_memory_released(case: ContractCase) -> str:
 
 
 def check_speed(case: ContractCase) -> str:
-    """Report the time of construction and of two calls; this check never fails."""
+    """Report how long the construction and two calls of the provider take, without ever failing."""
     started = time.perf_counter()
     provider = case.create_provider()
     constructed = time.perf_counter()
@@ -376,7 +376,7 @@ def check_masked(case: ContractCase) -> None:
 
 
 STANDALONE = (check_specification, check_construction, check_light_import)
-"""Contract checks that do not call the provider."""
+"""Contract checks that do not call the provider under test."""
 
 COMMON = (
     check_deterministic,
@@ -398,7 +398,7 @@ COMMON = (
     check_flat,
     check_masked,
 )
-"""Contract checks that call the provider, in the order to run them."""
+"""Contract checks that call the provider under test, in the order to run them."""
 
 
 def _require_same(expected: object, answer: object, when: str) -> None:

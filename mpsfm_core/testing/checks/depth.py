@@ -25,14 +25,14 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.painted_views import RELATIVE_STD, read_depth
 
 RAY_TOLERANCE = 0.25
-"""Largest exponent p in ``depth = z * (ray length / z) ** p``: 0 for z-depth, 1 for ray length.
-The depth of correct providers has an exponent of 0.002 on synthetic views."""
+"""Largest accepted exponent p in ``depth = z * (ray length / z) ** p``, which is 0 for z-depth and
+1 for ray length. The depth of correct providers has an exponent of 0.002 on synthetic views."""
 FLIP_TOLERANCE = 0.3
 """Largest accepted relative depth difference between a view and the mirrored or enlarged view if
 the ground truth is unknown. Trained networks are not exactly symmetric, but wrongly rotated or
 cropped depth maps cause larger differences."""
 FOCAL_FACTOR = 1.5
-"""Focal length of the second camera relative to the first in ``check_depth_intrinsics``."""
+"""Ratio of the two focal lengths for which ``check_depth_intrinsics`` compares depth."""
 _FOCAL_RANGE = (1.2, 1.9)
 """Accepted range of the depth ratio between two cameras whose focal lengths have the ratio 1.5. A
 network with a canonical camera model has a depth ratio of 1.5. A depth ratio of 1 means that the
@@ -115,7 +115,7 @@ def check_depth_orientation(case: ContractCase) -> None:
 
 
 def check_depth_validity(case: ContractCase) -> str:
-    """Require that pixels with a surface are valid and pixels of the sky are not."""
+    """Require that depth is valid at pixels with a surface and invalid at pixels of the sky."""
     case.require_truth("painted", "prepared")
     prior = _run(case)
     return require_true_validity(prior.valid, case.example.truth(prior.shape))
@@ -167,7 +167,7 @@ def check_depth_same_in_larger_view(case: ContractCase) -> str:
 
 
 def check_depth_intrinsics(case: ContractCase) -> str:
-    """Require that ``intrinsics-aware`` depth grows with the focal length.
+    """Require that depth of an ``intrinsics-aware`` provider grows with the focal length.
 
     An object with the same image size through a longer lens is farther away.
     """
@@ -290,6 +290,6 @@ def _median_deviation(prior: DepthPrior, expected: Any, where: Any) -> float:
 
 
 def _median_deviation_from_truth(prior: DepthPrior, example: Example) -> float:
-    """Return the median relative deviation of depth from the true depth, up to a factor."""
+    """Return the median relative deviation from the true depth, up to a common factor."""
     truth = example.truth(prior.shape)
     return _median_deviation(prior, truth.depth, truth.valid)

@@ -17,15 +17,15 @@ at most 0.08 for XFeat."""
 LARGE_SIZE = (4096, 3072)
 """Width and height in pixels of a view with 12.6 megapixels, the size of phone photos."""
 _SAME_KEYPOINT_PX = 2.5
-"""Largest distance in pixels at which keypoints of a view and the rotated view are the same. A
-half-pixel mistake in x and y moves such keypoints apart by 1.4 pixels."""
+"""Largest distance in pixels between a keypoint and its repetition in the rotated view. A
+half-pixel mistake in x and y moves a keypoint and its repetition apart by 1.4 pixels."""
 _MIN_REPEATED_RATIO = 0.2
 """Smallest ratio of keypoints that must be found again in the rotated view. The ratio of repeated
 keypoints is 0.85 for SIFT, 0.28 for XFeat, and below 0.15 for DISK."""
 _MIN_COUNT = 8
 _MIN_INSIDE_RATIO = 0.8
 """Smallest accepted ratio of keypoints on the textured part of a view. Some keypoints are outside
-because detectors respond to the border of the texture."""
+of the textured part because detectors respond to its border."""
 _MIN_CORRECT_RATIO = 0.3
 """Smallest accepted ratio of correct descriptor matches (mutual nearest neighbors within three
 standard deviations of the true position). The ratio of correct matches is 0.6 for SIFT and 0.01 for
@@ -93,8 +93,8 @@ def check_features_pixel_convention(case: ContractCase) -> str:
 def check_features_large_view(case: ContractCase) -> str:
     """Require keypoints in pixels of a large view, even if the provider reduces the image.
 
-    The large view has 12.6 megapixels. Only the lower right corner of the view has texture.
-    Keypoints of a reduced image that are not scaled back are outside of this corner.
+    Only the lower right corner of the view with 12.6 megapixels has texture.
+    Keypoints of a reduced image that are not scaled back are outside of the textured corner.
     """
     case.require_truth("image")
     import cv2  # The import is local, because pytest loads this module when it collects tests.

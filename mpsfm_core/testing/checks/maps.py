@@ -46,7 +46,7 @@ def require_reported_std(variance: Float32, expected_std: Float64) -> str:
 
 
 def require_true_validity(valid: Bool, truth: TrueMaps) -> str:
-    """Require that pixels are valid exactly where the view shows a surface.
+    """Require that a depth or normal map is valid exactly where the view shows a surface.
 
     Args:
         valid: Boolean mask (h, w) of the valid pixels of a depth or normal map.

@@ -15,7 +15,7 @@ from mpsfm_core.testing.painted_views import read_depth
 
 
 def check_mask_polarity(case: ContractCase) -> str:
-    """Require True for usable pixels and False for the sky."""
+    """Require a mask that is True for usable pixels and False for the sky."""
     case.require_truth("painted", "prepared", "image")
     answer, truth = case.run(case.example), case.example.truth()
     agreement = float((answer == truth.valid)[truth.edge_free].mean())

@@ -46,8 +46,9 @@ def check_matcher_order(case: ContractCase) -> str:
 def check_matcher_pixel_convention(case: ContractCase) -> str:
     """Require dense matches in COLMAP's pixel convention.
 
-    If a view is matched with its copy at half the size, matched coordinates are halved exactly.
-    Matched coordinates with integer pixel centers are shifted instead.
+    If a view is matched with its copy at half the size, the matched coordinates in the copy are
+    exactly half as large. Matched coordinates with integer pixel centers differ from half the
+    coordinates.
     """
     if not case.declares("dense"):
         raise CheckSkipped("sparse matches have the positions of the keypoints")
@@ -147,7 +148,7 @@ def check_matcher_pair_depth(case: ContractCase) -> str:
     if max(_depth_error(depth.depth_a, b), _depth_error(depth.depth_b, a)) < 0.5 * error:
         raise CheckFailed("depth_a and depth_b are swapped")
     if error > DEPTH_TOLERANCE:
-        raise CheckFailed(f"depth has a relative error of {error:.2g}")
+        raise CheckFailed(f"the depth of the image pair has a relative error of {error:.2g}")
     return f"relative error {error:.2g}"
 
 

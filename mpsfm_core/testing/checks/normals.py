@@ -47,7 +47,7 @@ def check_normals_frame(case: ContractCase) -> str:
     prior = _run(case)
     angle = map_errors.error_quantile(map_errors.angle_errors_deg(prior, case.example))
     if angle > NORMALS_TOLERANCE_DEG:
-        raise CheckFailed(f"normals are {angle:.0f} degrees off{_explain_error(prior, case)}")
+        raise CheckFailed(f"the normals are {angle:.0f} degrees off{_explain_error(prior, case)}")
     return f"angle {angle:.2f} degrees"
 
 
@@ -76,9 +76,9 @@ def check_normals_pixel_convention(case: ContractCase) -> str:
 
 
 def check_normals_validity(case: ContractCase) -> str:
-    """Require that pixels with a surface are valid and pixels of the sky are not.
+    """Require that normals are valid at pixels with a surface and invalid at pixels of the sky.
 
-    The check needs a provider with ``truth_source="prepared"``, because views whose colors encode
+    The check of the validity needs ``truth_source="prepared"``, because views whose colors encode
     normals have a normal at every pixel.
     """
     case.require_truth("prepared")
@@ -115,7 +115,7 @@ def check_normals_same_in_larger_view(case: ContractCase) -> str:
     large = case.example.sized(2 * width, 2 * height)
     angle = map_errors.error_quantile(map_errors.angle_errors_deg(case.run(large), large))
     if angle > NORMALS_TOLERANCE_DEG:
-        raise CheckFailed(f"normals are {angle:.0f} degrees off in an enlarged view")
+        raise CheckFailed(f"the normals are {angle:.0f} degrees off in an enlarged view")
     return f"angle {angle:.2f} degrees"
 
 
