@@ -44,7 +44,7 @@ def check_decodable(data: bytes, path: Path) -> None:
     """Decode an image at 1/8 size; raise :class:`InputError` if it is damaged or not an image."""
     if is_cut_jpeg(data):
         raise InputError(f"image {path} is cut off: its end is missing. Copy it again")
-    if find_decoder(data, path) is None:  # formats other than JPEG are decoded in full here
+    if find_decoder(data, path) is None:  # upright_size decodes other formats in full
         decode_stored(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
 

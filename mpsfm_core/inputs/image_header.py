@@ -51,7 +51,7 @@ class ImageHeader:
 
         The 35 mm equivalent focal length is preferred, relative to the image diagonal (CIPA
         DCG-001). Without a 35 mm equivalent, the focal length is multiplied by the focal-plane
-        resolution. Values that no lens has are ignored.
+        resolution. Focal lengths that no lens has are ignored.
 
         Returns:
             Focal length in pixels, None if EXIF has none or the image was cropped.
@@ -240,7 +240,7 @@ def tiff_entries(block: bytes, offset: int | None = None) -> Iterator[tuple[int,
     """Yield tag, type, value count and value offset of each entry of a TIFF directory.
 
     Args:
-        block: TIFF structure. Iteration stops at the end of the data if the directory is cut off.
+        block: TIFF structure. If the directory is cut off, only complete entries are yielded.
         offset: byte offset of the TIFF directory, by default of the first directory.
     """
     order = {b"II": "<", b"MM": ">"}.get(block[:2])
@@ -260,7 +260,7 @@ def tiff_entries(block: bytes, offset: int | None = None) -> Iterator[tuple[int,
 
 def _read_directory(block: bytes, order: str, offset: int) -> dict[int, float]:
     tags = {}
-    with suppress(struct.error):  # a directory that is cut off keeps the entries before the cut
+    with suppress(struct.error):  # entries before the end of a cut-off TIFF directory are used
         for tag, kind, number, place in tiff_entries(block, offset):
             layout = _TYPE_FORMATS.get(kind)
             if layout is None or number != 1:

@@ -127,8 +127,8 @@ class SourceImage:
 class ImageSet:
     """Images of a run in a fixed order, with undistorted views on demand.
 
-    About 512 MB of undistorted images are cached. All methods are thread-safe. The attribute
-    ``left_out`` maps names of unusable images to the reasons.
+    About 512 MB of undistorted images are cached. All methods of the class are thread-safe. The
+    attribute ``left_out`` maps names of unusable images to the reasons.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class ImageSet:
 
     @property
     def names(self) -> list[str]:
-        """Names of the images in order."""
+        """Names of the images in the order of the run."""
         return [image.name for image in self.images]
 
     def view(self, index: int) -> View:
@@ -274,7 +274,7 @@ def load_images(
 
     Raises:
         InputError: fewer than two images, unreadable files, missing or repeated names in the list,
-            or intrinsics for other image sizes. The message names the faulty file.
+            or intrinsics for other image sizes. The error message names the faulty file.
     """
     options = options or InputOptions()
     if names is None:

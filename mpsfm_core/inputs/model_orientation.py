@@ -1,8 +1,9 @@
 """Convert COLMAP models from stored pixels to upright images (after EXIF rotation).
 
 COLMAP ignores the EXIF orientation, so that its cameras, poses and keypoints belong to stored
-pixels. MP-SfM uses upright images instead. The EXIF orientation maps camera coordinates by
-``x_upright = D x_stored``, where ``D`` permutes the x and y axes and flips their signs.
+pixels. MP-SfM uses upright images, after EXIF rotation. The EXIF orientation maps camera
+coordinates by ``x_upright = D x_stored``, where ``D`` permutes the x and y axes and flips their
+signs.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def orient_model(
         images, the world is mirrored too.
 
     Raises:
-        InputError: EXIF mirrors some of the images and not others.
+        InputError: the EXIF orientation mirrors only some of the images.
     """
     files = _find_image_files(model, images_folder, match)
     turned = {i: f for i, f in files.items() if f.orientation != 1}

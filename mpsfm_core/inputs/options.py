@@ -17,8 +17,8 @@ class VideoOptions(Options):
     """Median motion of tracked points between selected frames over the image diagonal. Larger
     motion selects fewer frames [3 to 5 degrees of rotation of a phone]."""
     overlap: float = expert(0.7, gt=0, lt=1)
-    """Share of still tracked points below which the next frame is selected. A larger share selects
-    more frames."""
+    """Share of still tracked points below which the next frame is selected. A larger share of
+    tracked points selects more frames."""
     max_frames: int = Field(300, ge=2)
     """Maximum number of frames of a video. If more frames are selected, an evenly spaced subset is
     used."""
@@ -29,8 +29,8 @@ class InputOptions(Options):
 
     max_image_size: int | None = Field(None, ge=32)
     """Maximum longer side in pixels of the images; larger images are downscaled, and null keeps the
-    size [paper 4]. The command of the MP-SfM reference code uses 1200. Larger images give more
-    accurate keypoints and take more time."""
+    size [paper 4]. The command of the MP-SfM reference code downscales images to 1200 pixels.
+    Larger images give more accurate keypoints and take more time."""
     max_pixels: int = expert(250_000_000, ge=1024)
     """Maximum number of pixels of an image or mask. Larger images are rejected before decoding,
     because a small file can decode to gigabytes [above all cameras on the market]."""

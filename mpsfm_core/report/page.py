@@ -55,7 +55,7 @@ def write_report(folder: Path) -> Path:
 
     Raises:
         InputError: the folder has no results, or the results are damaged.
-        OSError: the disk is full.
+        OSError: the report page cannot be written, for example because the disk is full.
     """
     result = ResultFolder.open(folder)
     try:

@@ -52,7 +52,7 @@ class Viewer(Protocol):
         ...
 
     def wait(self) -> None:
-        """Block until the user closes the viewer; return if it only writes files."""
+        """Block until the user closes the viewer, unless the viewer only writes files."""
         ...
 
 
@@ -109,7 +109,7 @@ def read_scene(folder: Path) -> tuple[SceneState, ColoredPoints, Pictures]:
     """Read a scene from a result folder, COLMAP model or ``transforms.json`` with ``images/``.
 
     Raises:
-        InputError: the folder has none of these three inputs.
+        InputError: the folder has no results, no COLMAP model and no ``transforms.json``.
     """
     if (folder / SUMMARY).is_file():
         result = ResultFolder.open(folder)

@@ -50,10 +50,11 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
         problem: mapping problem with images and verified pairs.
 
     Returns:
-        Plain data with the following keys. ``parts``: image names of each connected part of the
-        covisibility graph, largest part first. ``median_angle_deg``: median over the 3D points of
-        the maximum triangulation angle in degrees. ``images``: number of 3D points, number of 3D
-        points with at least three images, and share of explained matches, by image name.
+        Plain data with the keys ``parts``, ``median_angle_deg`` and ``images``. ``parts`` are the
+        image names of each connected part of the covisibility graph, largest part first.
+        ``median_angle_deg`` is the median over the 3D points of the maximum triangulation angle.
+        ``images`` are the number of 3D points, the number of 3D points with at least three images,
+        and the share of explained matches, by image name.
     """
     images = reconstruction.confirmed_images
     explained = count_explained_matches(reconstruction, problem)

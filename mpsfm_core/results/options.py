@@ -19,8 +19,8 @@ class ResultOptions(Options):
     dense_cloud: bool = True
     """Write ``dense.ply``."""
     dense_max_points: int = expert(2_000_000, ge=1)
-    """Maximum number of points in ``dense.ply``, 32 bytes each. Of more depth pixels, a random
-    subset is used."""
+    """Maximum number of points in ``dense.ply``, 32 bytes each. If more depth pixels remain, a
+    random subset is used."""
     dense_max_relative_std: float = expert(0.1, gt=0)
     """Maximum relative depth std of pixels in ``dense.ply``. A larger maximum gives more and less
     accurate points. If more than three quarters of the pixels exceed the maximum, the most certain

@@ -119,7 +119,7 @@ def describe_pairs(
     Args:
         extraction: report of the extraction of features, priors and matches.
         mapping: result of the mapper.
-        problem: input of the mapper.
+        problem: mapping problem, the input of the mapper.
     """
     described = []
     models = mapping.reconstructions[:1]
@@ -151,7 +151,7 @@ def describe_reconstructions(
     Args:
         mapping: result of the mapper.
         models: COLMAP models of the reconstructions.
-        problem: input of the mapper.
+        problem: mapping problem, the input of the mapper.
     """
     return [
         {**_describe(reconstruction, model), "evidence": describe_evidence(reconstruction, problem)}
