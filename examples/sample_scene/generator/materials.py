@@ -12,7 +12,7 @@ Colour = tuple[float, float, float]
 
 
 class Shader:
-    """Matte Blender material built from shader nodes; ``position`` is the world position."""
+    """Matte Blender material of shader nodes (``position`` is the node of the world position)."""
 
     def __init__(self, roughness: float = 0.8) -> None:
         self.material = bpy.data.materials.new("material")

@@ -1,6 +1,6 @@
-"""Sample room, 6.4 m x 5.2 m x 2.7 m, and the camera path in it.
+"""Room of the sample scene, 6.4 m x 5.2 m x 2.7 m, and the camera path in the room.
 
-World: x east, y north, z up, origin in the south-west corner of the floor.
+World axes are x east, y north, z up; the origin is the south-west corner of the floor.
 """
 
 from __future__ import annotations
