@@ -73,7 +73,7 @@ class CalibrationResult:
     """Result of a calibration with the calibration file and the report."""
 
     file: CalibrationFile
-    """Fitted calibration with the data about its origin."""
+    """Fitted calibration with the provider and images of its origin."""
     report: dict[str, Any]
     """All values of the calibration report as plain data."""
 
@@ -96,8 +96,8 @@ def calibrate(
         config: Configuration whose ``depth`` or ``normals`` provider is calibrated.
         kind: Kind of the provider, depth or normals.
         ground_truth: Options of the provider ``files``, which reads the true depth or normal maps.
-        model: COLMAP model whose points are true depth. Without true maps and model, the images are
-            reconstructed repeatedly until the std converges.
+        model: COLMAP model whose points give the true depth. Without true maps and model, the
+            images are reconstructed repeatedly until the std converges.
         alignments: Candidate alignments of prior depth to true depth, by default only the scale for
             metric networks, and all alignments for non-metric networks.
         options: Options of pixel sampling, cross-validation and bootstrap.
@@ -136,11 +136,11 @@ def compare_prior(
     the returned samples.
 
     Args:
-        photos: Images on which prior and truth are compared.
+        photos: Images on which prior and true maps are compared.
         config: Configuration with the depth or normals provider.
         ground_truth: Options of the provider ``files``, which reads the true depth or normal maps.
         kind: Kind of the provider, depth or normals.
-        model: COLMAP model whose points are true depth.
+        model: COLMAP model whose points give the true depth.
         options: Options of the pixel sampling.
         registry: Registry of plugins.
 
@@ -306,7 +306,7 @@ def _last_folders(folder: Path) -> str:
 
 
 def _strip_folders(value: Any) -> Any:
-    """Replace existing paths in nested plain data by file names, so that results are portable."""
+    """Replace paths of existing files in nested plain data by portable file names."""
     if isinstance(value, dict):
         return {key: _strip_folders(content) for key, content in value.items()}
     if isinstance(value, list):

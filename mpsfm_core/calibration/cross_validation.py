@@ -123,8 +123,9 @@ def evaluate_calibrations(
 ) -> dict[str, Any]:
     """Compute the metrics of each fold's calibration on the test images of the fold.
 
-    The metrics pool all images after scaling each depth map. The coverage (ratio of errors within
-    1, 2 and 3 stds) is also reported per fold, and without scaling for metric priors.
+    The metrics pool the errors of all images, after scaling each prior depth map to true depth. The
+    coverage (ratio of errors within 1, 2 and 3 stds) is also reported per fold, and without scaling
+    for metric priors.
     """
     scaled, std = _apply(held_out, calibrations, scaled=True)
     metrics = compute_metrics(concatenate_residuals(scaled), np.concatenate(std))

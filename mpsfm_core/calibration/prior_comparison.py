@@ -59,7 +59,7 @@ class PriorComparison:
 
     @property
     def provider(self) -> ActiveProvider:
-        """Provider of the priors that are calibrated."""
+        """Provider whose depth or normal priors are compared."""
         return (self._kind == "normals" and self._raw.normals) or self._raw.depth
 
     def with_files(self, options: Mapping[str, Any]) -> CalibrationData:

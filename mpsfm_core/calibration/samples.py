@@ -103,7 +103,7 @@ class Residuals:
     step: Float64
     """(n,) maximum difference of log depth to the four neighboring pixels; 0 for normals."""
     image: Int64
-    """(n,) image index of each sample."""
+    """(n,) index of the image of each sample."""
     magnitude: Float64
     """(n,) absolute depth error in meters or normal error in rad."""
     unit: Float64

@@ -49,7 +49,7 @@ class StdFit:
     """Fitted model of the std, the maximum of m scaled terms."""
 
     names: tuple[str, ...]
-    """Names of the m terms of the std."""
+    """Names of the m terms of the modeled std."""
     values: Float64
     """(m,) fitted factors ``theta_j`` of the std terms."""
     edge_ratio: float | None
@@ -61,8 +61,8 @@ class StdFit:
     shares: Float64
     """(m,) ratio of samples for which each term is the largest."""
     limits: Float64
-    """(m,) factors below which a term is rarely the largest, so that the data do not determine its
-    factor."""
+    """(m,) std factors below which a term is rarely the largest, so that the data do not determine
+    the factor."""
     log_density: Float64
     """(images,) mean log density of the errors of each image."""
 

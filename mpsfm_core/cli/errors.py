@@ -35,7 +35,7 @@ class CommandGroup(TyperGroup):
 
 
 def handle_sigterm() -> None:
-    """Make SIGTERM end a command like Ctrl-C.
+    """Install a signal handler that makes SIGTERM end a command like Ctrl-C.
 
     Call this function after the import of pycolmap, because pycolmap installs a signal handler.
     """

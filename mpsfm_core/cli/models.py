@@ -182,7 +182,7 @@ def verify(
     targets: Annotated[list[str] | None, typer.Argument(metavar="[NAME_OR_URI...]")] = None,
     cache: CacheDir = None,
 ) -> None:
-    """Verify the hashes of weights; without arguments, of all local default weights."""
+    """Verify the hashes of weights files, by default of all local default weights."""
     from mpsfm_core.providers.weights import WeightStore
 
     store = WeightStore(cache)
@@ -226,7 +226,7 @@ def _select_files(targets: list[str]) -> list[WeightsFile]:
     """Find the unique weights files of provider names and URIs.
 
     Raises:
-        InputError: A target is neither a provider with weights nor a URI.
+        InputError: A name is neither a provider with weights nor a URI.
     """
     from mpsfm_core.data.errors import InputError, did_you_mean
     from mpsfm_core.providers import WeightsFile

@@ -118,7 +118,7 @@ def new(
         Path, typer.Option("--output", "-o", metavar="DIR", help="Create the package here.")
     ] = Path(),
 ) -> None:
-    """Create a plugin package with a provider that passes its contract, to fill in your method."""
+    """Create a plugin package with a template provider that passes the contract checks."""
     from mpsfm_core.testing.scaffold import write_plugin
 
     for path in write_plugin(name, kind, output):

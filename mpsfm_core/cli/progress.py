@@ -98,7 +98,7 @@ class ProgressBars:
         self._progress.update(self._run, description=description, completed=1, total=1)
 
     def _update_run(self) -> None:
-        """Update remaining time and registered images at the bar of the whole run."""
+        """Update remaining time and number of registered images at the progress bar of the run."""
         parts = (format_remaining_time(self._remaining.seconds()), self._registered)
         self._progress.update(self._run, description=" - ".join(("run", *filter(None, parts))))
 

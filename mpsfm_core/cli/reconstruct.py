@@ -109,7 +109,7 @@ def run(
         config: Name or file path of the configuration.
         quiet: If true, print neither progress nor summary.
         viewer: Name of a viewer that shows the run.
-        arguments: Further arguments of :func:`mpsfm_core.pipeline.run.reconstruct`.
+        arguments: Further arguments that are passed to :func:`mpsfm_core.pipeline.run.reconstruct`.
     """
     from mpsfm_core.cli.progress import show_progress
     from mpsfm_core.cli.view import show_run

@@ -118,7 +118,7 @@ def trajectory_errors(
 
 
 def _steps(poses: Sequence[Pose], scale: float) -> Pose:
-    """Compute ``b_from_a`` of successive images: rotations (n - 1, 3, 3), translations."""
+    """Compute rotations (n - 1, 3, 3) and translations ``b_from_a`` of successive images."""
     rotations = np.stack([rotation for rotation, _ in poses])
     translations = scale * np.stack([translation for _, translation in poses])
     relative = rotations[1:] @ rotations[:-1].transpose(0, 2, 1)

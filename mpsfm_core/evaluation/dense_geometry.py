@@ -55,8 +55,8 @@ def evaluate_dense_geometry(
 ) -> dict[str, Any] | None:
     """Compare depth maps and cloud of a reconstruction with the true depth of a scene.
 
-    A similarity transform of the camera centers aligns the reconstruction. The points of the true
-    depth maps of the reconstructed images are the true cloud.
+    A similarity transform of the camera centers aligns the reconstruction. The cloud is compared
+    with the points of the true depth maps of the reconstructed images.
 
     Args:
         model: Reconstruction of the test set with depth maps.

@@ -3,8 +3,8 @@
 Test sets are sampled for buckets, each with a maximum three-view overlap. A test set starts with a
 random image. An image is added if its two-view overlap with an image of the set is sufficient and
 no triplet exceeds the three-view overlap of the bucket. A test set is complete when no image can be
-added. Test sets of a bucket differ by at least two images. The sampling is deterministic for given
-overlap and seed.
+added. Test sets of a bucket differ by at least two images. The sampling is deterministic for the
+same image overlap and random seed.
 
 In contrast to the paper, all triplets of a set in the bucket ``minimal`` satisfy the overlap limit.
 The paper adds images of higher overlap to these sets, to span a whole scene.
@@ -56,7 +56,7 @@ class SamplingOptions:
     attempts: int = 20
     """Number of random start images that are tried per requested test set."""
     seed: int = 0
-    """Random seed of the sampling."""
+    """Random seed for the sampling of test sets."""
 
 
 def sample_buckets(overlap: Overlap, options: SamplingOptions | None = None) -> dict[str, Any]:

@@ -21,7 +21,7 @@ def describe(
     candidates: list[CandidateMatches],
     outcomes: list[TwoViewGeometry],
 ) -> dict[str, Any]:
-    """Describe pairs, images and providers of an extraction.
+    """Describe pairs, images and providers of an extraction as plain data.
 
     Args:
         context: Context of the extraction with images, failures and providers.

@@ -85,7 +85,7 @@ def resolve_providers(
         blocks: Names of the configuration blocks that get a provider; other blocks stay unchanged.
 
     Returns:
-        The configuration with one provider per block, and the choices.
+        The configuration with one provider per block, and the reasons of the choices.
 
     Raises:
         ConfigError: a provider or a file named in its options is missing, or the providers are
@@ -205,7 +205,7 @@ class _ProviderSearch:
         return candidate
 
     def _same_network(self, depth: ProviderConfig, block: ProviderConfig) -> ProviderConfig:
-        """Return the normals block with the provider and options of the depth block."""
+        """Return the normals configuration with provider and options of the depth provider."""
         if "joint-normals" not in self._registry.spec("depth", depth.use).capabilities:
             raise ConfigError(f"the depth provider {depth.use!r} gives no normals")
         return block.model_copy(update={"use": depth.use, "options": depth.options})

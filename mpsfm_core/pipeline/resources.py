@@ -3,7 +3,7 @@
 The memory estimate is the sum of a fixed part, the caches, and the largest of three stages:
 extraction, dense depth and results. Constants are bytes per pixel of arrays in memory, or derived
 from the peak resident memory of a stage (CPython 3.11 on Linux, [tuned: benchmarks.resources]). The
-estimate assumes a single component, which needs most memory.
+estimate assumes a single connected component of images, which needs most memory.
 """
 
 from __future__ import annotations

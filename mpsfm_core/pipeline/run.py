@@ -202,7 +202,8 @@ class _Run:
     def _resolve_providers(self) -> None:
         """Choose providers and download their weights before any image is decoded."""
         if not is_video(self._source.images):
-            find_images(self._source.images)  # a missing folder must not cause downloads
+            # A missing image folder raises an error before any weights are downloaded.
+            find_images(self._source.images)
         with self._stages.stage("providers"):
             for text in self._config.warnings:
                 self._stages.warn(text)
@@ -210,7 +211,7 @@ class _Run:
             self._warn_of_unused_matcher()
 
     def _warn_of_unused_matcher(self) -> None:
-        """Warn if the fast pass matches all images, so that the chosen matcher never runs."""
+        """Warn if the fast first pass matches all images, so that the chosen matcher never runs."""
         fast_pass, matcher = self._config.fast_pass, self._config.matcher
         if fast_pass is None or matcher is None or self._config.has_second_pass:
             return

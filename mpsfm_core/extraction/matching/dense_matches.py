@@ -1,4 +1,4 @@
-"""Conversion of dense matches to keypoint matches, by snapping to features or sampling."""
+"""Conversion of dense matches to matches of existing or newly sampled keypoints."""
 
 from __future__ import annotations
 

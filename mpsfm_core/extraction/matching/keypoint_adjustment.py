@@ -81,7 +81,7 @@ class AdjustedKeypoints(NamedTuple):
 
 
 class PairSide(NamedTuple):
-    """One view of an image pair, with the matched keypoints."""
+    """Gray image and matched keypoints of one view of an image pair."""
 
     camera: PinholeCamera
     image: Float32

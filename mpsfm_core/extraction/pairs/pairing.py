@@ -85,7 +85,7 @@ def filter_pairs(
     Args:
         pairs: Image pairs as image indices.
         names: Names of all images.
-        answers: Pairs of image names that each filter accepts, in any order.
+        answers: Pairs of image names that each plugin's filter accepts, in any order.
     """
     accepted = [frozenset(frozenset(pair) for pair in answer) for answer in answers]
     return [
