@@ -48,6 +48,6 @@ def percent(area: Mapping[float, float]) -> str:
 
 
 def print_progress(record: BenchmarkRecord, known: bool) -> None:
-    """Print to stderr that a benchmark run is complete, or was read from an earlier benchmark."""
+    """Print to stderr that a step of a benchmark is complete, or was read from an earlier run."""
     what = "known" if known else record.error or f"{record.cpu_seconds:.1f} s"
     print(f"{record.config} {record.set_name} {record.label}: {what}", file=sys.stderr)

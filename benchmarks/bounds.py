@@ -34,7 +34,7 @@ HEADER = (
 
 
 def main() -> None:
-    """Map all test sets with and without true initial poses, and write the table of pose AUC."""
+    """Map all test sets from true initial poses and from scratch, and write the table of AUC."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--buckets", nargs="+", default=["minimal", "leq30"])
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks"))

@@ -269,7 +269,7 @@ class MapBesideTruth(NamedTuple):
     @classmethod
     def of(cls, depth: DepthPrior, truth: Float32, seen: Bool | None) -> MapBesideTruth:
         """Collect the pixels with true depth; ``seen`` is the mask of measured depth."""
-        assert depth.variance is not None  # refined maps always have a std
+        assert depth.variance is not None  # refined depth maps always have a std
         xy, depth_samples, true = sample_depth_at_truth(depth.depth, depth.valid, truth)
         variance, _ = sample_bilinear(depth.variance, depth.valid, xy)
         measured_mask = np.zeros(depth.shape, np.bool_) if seen is None else seen

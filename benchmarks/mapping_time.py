@@ -3,10 +3,10 @@
     python -m benchmarks.mapping_time [--scenes rendered_kitchen ...] [--output DIR]
 
 Each test set has twice as many evenly spaced frames as the previous test set. Matches are those of
-XFeat and LighterGlue, and depth priors are true depth; only mapping is timed. A small test set is
-mapped first to load compiled code. COLMAP runs without and with structure-less registration, the
-default since version 4. Writes benchmarks/results/mapping_time.md. Run this benchmark on an idle
-machine.
+XFeat and LighterGlue, and depth priors are true depth; the time excludes extraction and matching. A
+small test set is mapped first to load compiled code. COLMAP runs without and with structure-less
+registration, the default since version 4. Writes benchmarks/results/mapping_time.md. Run this
+benchmark on an idle machine.
 """
 
 from __future__ import annotations

@@ -48,7 +48,7 @@ class Matches:
     reach: int = 10**9
 
     def hall(self, views: int, errors: PriorErrors, seed: int) -> HallProblem:
-        """Create a synthetic hall with these degraded matches."""
+        """Create a synthetic hall with degraded matches, and depth priors with errors."""
         hall = make_hall_problem(views, errors, seed=seed, **self.options)  # type: ignore[arg-type]
         rng = np.random.default_rng(seed)
         selected = [

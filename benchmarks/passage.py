@@ -68,7 +68,7 @@ def _cpu_ms(asked: Worker, call: dict[str, Any]) -> float:
         return sum(sum(process.cpu_times()[:2]) for process in processes)
 
     rounds = []
-    for _ in range(1 + _ROUNDS):  # the first call allocates the shared memory
+    for _ in range(1 + _ROUNDS):  # the first call of the provider allocates the shared memory
         begin = spent()
         for _ in range(_CALLS):
             asked.ask(call, 60)

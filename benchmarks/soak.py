@@ -60,7 +60,7 @@ class Life:
 
     @property
     def resumed(self) -> str:
-        """Return the message of the process about the resumed mapping."""
+        """Return the message in which the process states from where mapping resumes."""
         return next((line for line in self.said if "continues from a checkpoint" in line), "")
 
 

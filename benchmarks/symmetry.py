@@ -77,7 +77,7 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
 
 
 class Observed(ModelMaintenance):
-    """Scene that records every depth check: if the pose was wrong, and if it was rejected."""
+    """Scene that records for every depth check if the pose is wrong, and if it is rejected."""
 
     case: SymmetricProblem
     verdicts: list[tuple[bool, bool]]
@@ -89,7 +89,7 @@ class Observed(ModelMaintenance):
         return reason
 
     def _misplaced(self, image: int) -> bool:
-        """Return if an image is registered nearer to its position in the other room."""
+        """Return true if an image is registered nearer to its position in the other room."""
         scene, poses = self.scene, np.array(self.case.poses)
         if self.first is None or self.size == 2:
             others = scene.registered.copy()

@@ -5,7 +5,7 @@ from mpsfm_core.testing.painted_views import decoder
 
 
 def contract(folder):
-    """Write weights that decode the depth that is painted into the contract views."""
+    """Write test weights, which compute depth from the colors of the contract test images."""
     colours, bias = decoder()
     np.savez(
         folder / "tiny.npz",

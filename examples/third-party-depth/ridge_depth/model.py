@@ -18,12 +18,12 @@ class RidgeDepth:
             self._regression = Regression(**stored)
 
     def predict(self, view):
-        depth = self._regression(features(view.image))  # meters along z, 80 x 60 pixels
+        depth = self._regression(features(view.image))  # z-depth in meters, 80 x 60 pixels
         return DepthPrior.from_arrays(depth)
 
 
 class Regression:
-    """Ridge regression, linear in the features and in random cosines of them."""
+    """Ridge regression of depth, linear in image features and in random cosines of them."""
 
     def __init__(self, mean, scale, directions, phases, weights=None):
         self._scaling, self._cosines, self._weights = (mean, scale), (directions, phases), weights
@@ -38,7 +38,7 @@ class Regression:
 
 
 def features(rgb):
-    """Compute color, position, and color and contrast of two neighborhoods, (60, 80, 13)."""
+    """Compute features (60, 80, 13): color, position, and contrast of two neighborhoods."""
     small = cv2.resize(rgb, (COLUMNS, ROWS), interpolation=cv2.INTER_AREA) / np.float32(255)
     place = np.meshgrid(np.linspace(-1, 1, COLUMNS), np.linspace(-1, 1, ROWS))
     planes = [small, *(axis[..., None] for axis in place)]

@@ -1,4 +1,4 @@
-"""The contract of MP-SfM."""
+"""Contract tests of MP-SfM for the depth provider ridge-depth."""
 
 from mpsfm_core.testing import contract_tests
 
