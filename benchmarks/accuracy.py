@@ -117,7 +117,7 @@ TARGETS: Mapping[tuple[str, str], tuple[float, float, float]] = {
     ("leq30", "ours-degraded"): (30, 65, 85),
     ("all", "ours-degraded"): (45, 80, 92),
 }
-"""Target pose AUC (percent at 1, 5, 20 degrees) on rendered_kitchen, by test sets and method."""
+"""Target pose AUC in percent at 1, 5, 20 degrees on rendered_kitchen, by bucket and method."""
 
 
 def main() -> int:

@@ -65,7 +65,7 @@ TOLERANCES = (0.02, 0.05)
 NEAR = 0.1
 """Maximum relative depth error of a pixel that counts as accurate."""
 WAYS = ("mapper", "dense", "without prior")
-"""Sources of depth maps: the mapper, the dense stage, and the dense stage without depth prior.
+"""Sources of depth maps: mapper, dense stage, and dense stage without depth prior.
 
 Without depth prior, the dense stage only knows the depth range of the triangulated points.
 """

@@ -1,11 +1,11 @@
-"""Accuracy on low-overlap photos with SIFT before networks (fast pass), networks only, SIFT only.
+"""Accuracy on low-overlap photos with SIFT, with matching networks, and with both in turn.
 
     python -m benchmarks.low_overlap [--scenes rendered_kitchen ...] [--buckets minimal ...]
 
-Compares the configurations `fast-cpu`, `fast-cpu` without fast pass (``fast_pass: null``), and
-`sift`. The measure is the mean pose AUC over the test sets of each bucket in percent, convention
-`paper`. A test set without a reconstruction counts as zero registered images. Seconds are wall
-times of whole runs, with features and depth from the cache.
+Compares the configurations `fast-cpu`, `fast-cpu` without the preceding SIFT pass (``fast_pass:
+null``), and `sift`. The measure is the mean pose AUC over the test sets of each bucket in percent,
+convention `paper`. A test set without a reconstruction counts as zero registered images. Seconds
+are wall times of whole runs, with features and depth from the cache.
 """
 
 from __future__ import annotations

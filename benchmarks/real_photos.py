@@ -41,7 +41,7 @@ CONVENTION = CONVENTIONS["paper"]
 MAX_ROTATION_DEG = 2.0
 """Maximum rotation error in degrees of an image whose pose counts as correct. [ours]"""
 MIN_GPS_POSITIONS = 4
-"""Minimum number of GPS positions to evaluate; three always fit a similarity transform. [ours]"""
+"""Minimum number of GPS positions to evaluate; any three fit a similarity well. [ours]"""
 NUM_GPS_ITERATIONS = 20
 """Number of iterations of the trimmed alignment of camera centers to GPS. [ours]"""
 

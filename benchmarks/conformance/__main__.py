@@ -36,7 +36,7 @@ from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 
 Compared: TypeAlias = Callable[[Path], dict[str, float]]
-"""Function that maps the folder of checkouts to the largest difference of each network output."""
+"""Function that returns the largest difference of each network output, given the checkouts."""
 _HOLDS = {"normals, deg": 0.06, "positions, px": 1e-2, APART: np.inf}
 _TOLERANCE = 1e-3
 """Maximum relative difference of depth and std between our provider and the authors' code.

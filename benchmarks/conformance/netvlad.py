@@ -20,7 +20,7 @@ _CAMERAS = ((640, 480, 500.0), (333, 500, 500.0), (1601, 1203, 500.0), (900, 130
 _LARGEST = 1024
 """Longer side in pixels to which hloc shrinks photos for NetVLAD."""
 APART = "(two photos)"
-"""Label of the distance between descriptors of different photos, a scale for the differences."""
+"""Label of the descriptor distance between different photos, a scale for the differences."""
 
 
 def compare(environment: Environment, checkout: Path) -> dict[str, float]:

@@ -17,7 +17,7 @@ from mpsfm_core.providers.environments.environment import Environment
 AUTHORS = Path(__file__).parent / "authors"
 _SAMPLES = Path(__file__).parents[2] / "examples" / "sample_scene" / "images"
 _CAMERAS = ((640, 480, 620.0), (333, 500, 410.0), (517, 389, 900.0))
-"""Width, height and focal length in pixels of the photos: landscape, portrait, and odd sizes."""
+"""Width, height, focal length in pixels of photos: landscape, portrait, odd sizes."""
 
 
 def photos(

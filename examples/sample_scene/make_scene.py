@@ -1,4 +1,4 @@
-"""Generate the sample scene: build a room, render photos, and simulate depth and normal priors.
+"""Generate the sample scene: build a room, render photos, simulate depth and normal priors.
 
 Needs Blender as a Python module (bpy); README.md has the command that installs bpy.
 """
