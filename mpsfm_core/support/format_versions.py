@@ -41,6 +41,6 @@ def check_version(
     if number > known:
         raise error(
             f"{path}: the file is of format {number}, written by a newer mpsfm-core; this version "
-            f"reads formats up to {known}: pip install --upgrade mpsfm-core, or create the file again"
+            f"reads formats up to {known}: pip install --upgrade mpsfm-core, or recreate the file"
         )
     return number

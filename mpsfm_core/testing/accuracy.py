@@ -74,7 +74,7 @@ def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str
         wrong = (answer != truth.valid)[truth.edge_free]
         wrong_ratio = float(wrong.mean()) if wrong.size else 0.0
         if wrong_ratio > MASK_TOLERANCE:
-            raise CheckFailed(f"{wrong_ratio:.0%} of the pixels have the wrong value")
+            raise CheckFailed(f"in the mask {wrong_ratio:.0%} of the pixels have the wrong value")
         return f"{wrong_ratio:.1%} of the pixels have the wrong value"
     return _compare_matches(case, example, answer)
 
@@ -111,7 +111,7 @@ def require_small_shift(
     largest = central if case.truth_source == "image" else shift.largest
     if largest > limit:
         border = f"and by another ({shift.stretch_x:+.2f}, {shift.stretch_y:+.2f}) px at the border"
-        raise CheckFailed(f"content is {text} of the view {border}; {limit:.2f} is allowed")
+        raise CheckFailed(f"the map content is {text} of the view {border}; {limit:.2f} is allowed")
     return text
 
 
@@ -160,5 +160,5 @@ def _describe_shift(case: ContractCase, example: Example, shift: MapShift, answe
 
 def _require_at_most(quantity: str, value: float, limit: float) -> str:
     if not value <= limit:
-        raise CheckFailed(f"{quantity} {value:.3g}, at most {limit:.3g} is allowed")
+        raise CheckFailed(f"the {quantity} is {value:.3g}, at most {limit:.3g} is allowed")
     return f"{quantity} {value:.2g}"

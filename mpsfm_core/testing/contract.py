@@ -305,7 +305,7 @@ def parse_setup(assignments: Sequence[str]) -> ContractSetup | None:
         path, equals, value = text.partition("=")
         *parents, key = path.strip().split(".")
         if not (equals and key):
-            raise InputError(f"{text!r} must look like key=value")
+            raise InputError(f"option {text!r} must look like key=value")
         group = options
         for parent in parents:
             group = group.setdefault(parent, {})

@@ -51,7 +51,9 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
     coordinates.
     """
     if not case.declares("dense"):
-        raise CheckSkipped("sparse matches have the positions of the keypoints")
+        raise CheckSkipped(
+            "sparse matches have no positions of their own, only those of the keypoints"
+        )
     case.require_truth("image", "prepared")
     width, height = case.example.camera.size
     small, large = case.example.sized(width // 2, height // 2), case.example

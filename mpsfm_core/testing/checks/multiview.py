@@ -94,7 +94,9 @@ def check_multiview_poses(case: ContractCase) -> str:
                 f"the rotation between two views is off by {rotation_error:.1f} degrees{reason}"
             )
         if angle_between_deg(found[1], true[1]) > 10 * ROTATION_TOLERANCE_DEG:
-            raise CheckFailed("the translation between two views has another direction")
+            raise CheckFailed(
+                "the translation between two views has another direction than the true one"
+            )
         worst = max(worst, rotation_error)
     return f"off by {worst:.2g} degrees"
 
@@ -108,7 +110,7 @@ def check_multiview_pose_unit(case: ContractCase) -> str:
     factor = float(np.linalg.norm(found) / np.linalg.norm(true)) / unit
     if abs(np.log(factor)) > BASELINE_TOLERANCE:
         raise CheckFailed(
-            f"translations are {factor:.3g} times as long as the unit of depth implies"
+            f"predicted translations are {factor:.3g} times as long as the unit of depth implies"
         )
     return f"factor {factor:.3f}"
 

@@ -56,7 +56,8 @@ def check_retrieval_overlap(case: ContractCase) -> str:
     neighbor, unrelated = min(similarity[:2]), max(similarity[2:])
     if neighbor <= unrelated:
         raise CheckFailed(
-            f"similarity {neighbor:.3f} to a neighboring view, {unrelated:.3f} to another scene"
+            f"the similarity is {neighbor:.3f} to a neighboring view, but {unrelated:.3f} "
+            f"to another scene"
         )
     return f"similarity {neighbor:.3f} to a neighboring view, {unrelated:.3f} to another scene"
 

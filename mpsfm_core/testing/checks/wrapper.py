@@ -28,7 +28,7 @@ def check_wrapper_without_variance(case: ContractCase) -> None:
 def check_wrapper_keeps_unit(case: ContractCase) -> None:
     """Require that the wrapper keeps the flag ``metric`` of the wrapped provider's depth."""
     if case.kind != "depth":
-        raise CheckSkipped("applies to depth only")
+        raise CheckSkipped("the check applies to depth only")
     for metric in (True, False):
         if case.run(case.example, case.create_provider(metric=metric)).metric != metric:
             raise CheckFailed(
@@ -42,7 +42,7 @@ def check_wrapper_uses_the_provider(case: ContractCase) -> str:
     If the wrapped provider returns twice the depth, the wrapper has to return twice the depth.
     """
     if case.kind != "depth":
-        raise CheckSkipped("applies to depth only")
+        raise CheckSkipped("the check applies to depth only")
     once, twice = case.run(case.example), case.run(case.example, case.create_provider(scale=2.0))
     both = once.valid & twice.valid
     if not both.any():
@@ -61,7 +61,7 @@ def check_wrapper_hands_on_depth(case: ContractCase) -> None:
     The wrapped normals provider may need the depth prior, which it declares with ``needs-depth``.
     """
     if case.kind != "normals":
-        raise CheckSkipped("applies to normals only")
+        raise CheckSkipped("the check applies to normals only")
     case.run(case.example, case.create_provider())
     given = case.received_depth()
     if not given or any(depth is None for depth in given):
