@@ -147,11 +147,11 @@ class MappingProblem:
     def __post_init__(self) -> None:
         for pair in self.pairs:
             if pair.image_b >= len(self.images):
-                raise DataError("pairs", f"image {pair.image_b} does not exist")
+                raise DataError("pairs", f"a pair has image {pair.image_b}, which does not exist")
             for image, column in ((pair.image_a, 0), (pair.image_b, 1)):
                 rows = pair.matches[:, column]
                 if len(rows) and not 0 <= rows.min() <= rows.max() < self.num_keypoints(image):
-                    raise DataError("pairs", f"matches exceed the keypoints of image {image}")
+                    raise DataError("pairs", f"match indices exceed the keypoints of image {image}")
 
     def num_keypoints(self, image: int) -> int:
         """Return the number of keypoints of an image."""

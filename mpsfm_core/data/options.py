@@ -78,8 +78,9 @@ def parse_settings(
         path: Path of the validated settings in the configuration, for error messages.
 
     Raises:
-        SettingsError: Some settings are wrong. The error message gives the path and problem of each
-            wrong setting, and the closest valid key for each unknown key.
+        SettingsError: A setting has a wrong value or an unknown key, or is missing. The error
+            message gives the path and problem of each wrong setting, and the closest valid key for
+            each unknown key.
     """
     try:
         return model.model_validate(dict(values))

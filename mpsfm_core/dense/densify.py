@@ -53,8 +53,8 @@ from mpsfm_core.support.threads import thread_limit
 
 _T = TypeVar("_T", bound=np.generic)
 _NUM_SOURCES = 5
-"""Maximum number of source views per reference view. Raising this number gives more complete depth
-and takes longer [ours]."""
+"""Maximum number of source views per reference view. Raising this number gives more complete depth,
+but stereo takes longer [ours]."""
 _MATCH_STD_PX = 0.5
 """Assumed std of a stereo match in pixels, for the tolerance of the consistency check [ours]."""
 _MAX_COST = 0.9
@@ -134,7 +134,7 @@ def densify(
         reconstruction: Posed images with refined depth maps.
         view_of: Function that returns the undistorted view of an image, by image name.
         options: Options of multi-view stereo.
-        workers: Number of threads; None uses as many threads as the process may use.
+        workers: Number of worker threads (None uses all threads that the process may use).
         progress: Callback that receives the number of finished images and the number of all images.
         checkpoints: Storage of stereo depth, so that an interrupted run can resume (None stores
             nothing).
