@@ -244,7 +244,7 @@ def set_errors(
     map_metrics = [map_errors(each, scale, own_scale_factor) for each in common_pixels]
     cameras = {photo.name: photo.pinhole for photo in photos}
     accuracy = evaluate_dense_geometry(reconstruction, cloud, scene, cameras, TOLERANCES)
-    assert accuracy is not None  # scale and true depth are known
+    assert accuracy is not None  # because true depth is known
     result = {"abs_rel": accuracy["depth"]["abs_rel"], **_means(map_metrics)}
     for tolerance in map(str, TOLERANCES):
         centimetres = round(100 * float(tolerance))
@@ -281,8 +281,8 @@ class MapBesideTruth(NamedTuple):
 def own_scale(maps: Sequence[MapBesideTruth]) -> float:
     """Compute the median of true over estimated depth over the measured pixels of a test set.
 
-    All pixels are used if no pixel is measured. This scale is more accurate than the scale of a few
-    camera centers.
+    All pixels are used if no pixel is measured. The median depth ratio is more accurate than the
+    scale of a few camera centers.
     """
     ratios = [each.truth / each.depth for each in maps]
     measured_ratios = [ratio[each.measured] for ratio, each in zip(ratios, maps, strict=True)]

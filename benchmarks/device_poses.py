@@ -5,8 +5,8 @@
 The true poses of hololens_room are tracked by the HoloLens, with an accuracy of one or two degrees.
 Only one pair of the test set `minimal` can be registered, so pose AUC measures one relative pose.
 COLMAP registers a window of well overlapping frames around this pair, with two kinds of features.
-This benchmark evaluates with COLMAP's poses of the pair instead of the device poses. Writes
-benchmarks/results/device_poses.md.
+This benchmark computes pose AUC with COLMAP's poses of the image pair instead of the device poses
+as truth. Writes benchmarks/results/device_poses.md.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@
 
 COLMAP runs SIFT, exhaustive matching and the incremental mapper, as ``colmap
 automatic_reconstructor``, with the default number of threads. ``mpsfm reconstruct`` runs with an
-empty cache and compiled kernels, without the dense stage and the report. Both programs use true
-intrinsics. The printed table lists pose AUC in percent (convention `paper`), and wall time of one
-run on an idle machine.
+empty cache and compiled kernels, without the dense stage and the report. COLMAP and ``mpsfm
+reconstruct`` get the true intrinsics. The printed table lists pose AUC in percent (convention
+`paper`), and wall time of one run on an idle machine.
 """
 
 from __future__ import annotations

@@ -75,7 +75,7 @@ def measured(
     outcomes: dict[str, list[MethodResult]] = {label: [] for label in methods}
     for _ in range(repeats):
         for label, (method, options) in methods.items():
-            # one task per process, because peak memory is per process
+            # one reconstruction per process, because peak memory is per process
             tasks = [MethodRun(label, method, hall.problem, options, threads=threads)]
             outcomes[label] += [outcome for _, outcome in run_methods(tasks, 1)]
             print(f"{views} {prior} {label}: {outcomes[label][-1].seconds:.1f} s", file=sys.stderr)

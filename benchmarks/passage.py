@@ -1,8 +1,8 @@
 """CPU time of calls to providers in other environments, by ``python -m benchmarks.passage``.
 
 Calls a provider with a constant result through a worker process. Measures CPU time of the main
-process and the worker. View and depth map have one megapixel each, without and with variance. Each
-time is the smallest of several rounds, without validation of the result.
+process and the worker. View and depth map have one megapixel each, without and with variance. The
+printed CPU time is the smallest of several rounds, without validation of the depth map.
 """
 
 from __future__ import annotations

@@ -162,6 +162,7 @@ def shoot_viewer(browser: Any, folder: Path) -> None:
         browser.get(address[0])
         wait_for(browser, "location.protocol === 'http:' && document.querySelector('canvas')")
         time.sleep(20)  # the 3D scene appears later than the page
+
         # Close viser's warning about browsers without a GPU.
         close = "document.querySelectorAll('.mantine-Notification-closeButton')"
         browser.execute_script(f"{close}.forEach((button) => button.click())")

@@ -3,10 +3,11 @@
     python -m benchmarks.soak [--photos 300] [--kills 10] [--gap 30] [--seed 0] [--output DIR]
 
 The photos are noisy copies of the frames of hololens_room. Both reconstructions use SIFT features,
-pairs of neighboring frames, and depth and normals of `compact`. Both reconstructions run at the
-same time. One reconstruction gets SIGKILL after a random CPU time, uniform up to twice `--gap`
-seconds, and is restarted with the same command, `--kills` times. The benchmark compares all result
-files, and CPU time including child processes. Writes benchmarks/results/soak.md. Linux only.
+pairs of neighboring frames, and depth and normals of `compact`. The interrupted and the undisturbed
+reconstruction run at the same time. One reconstruction gets SIGKILL after a random CPU time,
+uniform up to twice `--gap` seconds, and is restarted with the same command, `--kills` times. The
+benchmark compares all result files, and CPU time including child processes. Writes
+benchmarks/results/soak.md. Linux only.
 """
 
 from __future__ import annotations

@@ -2,12 +2,12 @@
 
     python -m benchmarks.symmetry [--seeds 9] [--placed-only] [--output FILE]
 
-The first table (*placed*) starts from true poses and refined depth. The depth check compares each
-view at its true pose with all other views. The check also compares each view at the corresponding
-pose in the other room with the views of that room and of the corridor. The second table (*mapped*)
-runs the whole mapper, with and without the depth check. The registered pose of an image is wrong if
-it is nearer to the corresponding position in the other room than to the true position, relative to
-the first pair.
+The first table (*placed*) checks images at given poses, with refined depth. The depth check
+compares each view at its true pose with all other views. The check also compares each view at the
+corresponding pose in the other room with the views of that room and of the corridor. The second
+table (*mapped*) runs the whole mapper, with and without the depth check. The registered pose of an
+image is wrong if it is nearer to the corresponding position in the other room than to the true
+position, relative to the first pair.
 """
 
 from __future__ import annotations
