@@ -165,7 +165,7 @@ def select_listed_images(image_list: Path, names: list[str], folder: Path) -> li
 
 
 def walk_files(folder: Path) -> Iterator[str]:
-    """Yield relative paths, with forward slashes, of all files below a folder except hidden files.
+    """Yield relative paths with forward slashes of all files below a folder, except hidden ones.
 
     Symbolic links to folders are followed. A folder that several links reach is read once.
     """

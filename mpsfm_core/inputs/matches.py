@@ -90,7 +90,7 @@ class _Builder:
     def add(
         self, index: int, keypoints: Float64, size: tuple[int, int] | None, std_px: float
     ) -> None:
-        """Add the keypoints of an image that lie inside its undistorted view."""
+        """Add the keypoints of an image that are inside its undistorted view."""
         image = self._images[index]
         xy = image.view_pixels(_upright(self._source, image, keypoints, size))
         visible = np.isfinite(xy).all(axis=1) & inside(xy, image.pinhole.size)
