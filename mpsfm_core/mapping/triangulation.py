@@ -34,7 +34,7 @@ def complete_and_merge_tracks(
 
     Args:
         scene: The scene.
-        options: ``max_error_px`` limits the reprojection errors in pixels.
+        options: Options, where ``max_error_px`` limits the reprojection errors in pixels.
         images: Images whose tracks are completed, by default all registered images.
         create: Also create tracks from matches that observe no 3D point (COLMAP's
             ``Retriangulate``).
@@ -168,7 +168,7 @@ def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int])
 
     Args:
         scene: The scene.
-        options: ``max_error_px`` limits the reprojection errors in pixels.
+        options: Options, where ``max_error_px`` limits the reprojection errors in pixels.
         images: Images whose matched points are merged.
     """
     tracks, graph = scene.tracks, scene.graph
