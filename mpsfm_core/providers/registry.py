@@ -288,10 +288,10 @@ class Registry:
     def calibration(self, kind: Kind, config: ProviderConfig) -> Calibration:
         """Return the uncertainty model of a depth, multi-view or normals provider.
 
-        The first uncertainty model that is declared is returned. The order is the configuration,
-        each wrapper provider from the outermost to the innermost, the provider, and the default
-        values of the class. A wrapper or provider declares an uncertainty model by the plugin's
-        ``mpsfm_calibration`` hook or in its specification.
+        The uncertainty model is searched in the configuration, then in the wrapper providers from
+        the outermost to the innermost, then in the provider. If none of them declares an
+        uncertainty model, the default values of the class are used. A wrapper or provider declares
+        an uncertainty model by the plugin's ``mpsfm_calibration`` hook or in its specification.
 
         Args:
             kind: Kind of the provider, such as ``depth``.

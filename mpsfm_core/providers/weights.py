@@ -98,8 +98,8 @@ class WeightStore:
         Args:
             cache_dir: Cache folder, by default ``$MPSFM_CACHE`` or the platform's cache folder of
                 the user.
-            offline: True forbids downloads. By default, ``$MPSFM_OFFLINE`` or ``$HF_HUB_OFFLINE``
-                decides.
+            offline: True forbids downloads. By default, downloads are forbidden if
+                ``$MPSFM_OFFLINE`` or ``$HF_HUB_OFFLINE`` is set.
             progress: Function that is called during downloads, see :data:`Progress`.
         """
         folder = Path(cache_dir).expanduser() if cache_dir else user_cache_folder()

@@ -31,7 +31,7 @@ class DepthFiles:
         self._options = options
 
     def predict(self, view: View) -> DepthPrior:
-        """Read the depth map of a view from its file, in the resolution of the file.
+        """Read the depth map of an image from a file, in the resolution of the file.
 
         Args:
             view: Undistorted image; its name selects the map file.
@@ -40,8 +40,8 @@ class DepthFiles:
             Depth map with the variance of each pixel.
 
         Raises:
-            InputError: The file is missing, unreadable or does not cover the view. Also raised if
-                neither the file nor the options declare a variance.
+            InputError: The map file is missing, unreadable or does not cover the image, or neither
+                the depth file nor the options declare a variance.
         """
         path = find_file(self._options, view, "depth")
         arrays = read_arrays(path, "depth")
@@ -86,7 +86,7 @@ class NormalFiles:
         self._options = options
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """Read the normal map of a view from its file, in the resolution of the file.
+        """Read the normal map of an image from a file, in the resolution of the file.
 
         Args:
             view: Undistorted image; its name selects the map file.
@@ -96,7 +96,7 @@ class NormalFiles:
             Unit normals in the camera frame.
 
         Raises:
-            InputError: The file is missing, unreadable or does not cover the view.
+            InputError: The map file is missing, unreadable or does not cover the image.
         """
         path = find_file(self._options, view, "normals")
         arrays = read_arrays(path, "normals")
@@ -122,7 +122,7 @@ class MaskFiles:
         self._options = options
 
     def mask(self, view: View) -> Bool:
-        """Read the mask of a view and resize the mask to the view by nearest neighbor.
+        """Read a mask from a file and resize it to the image by nearest neighbor.
 
         Args:
             view: Undistorted image; its name selects the map file.
@@ -131,7 +131,7 @@ class MaskFiles:
             Mask (H, W) bool, True where a pixel may be used.
 
         Raises:
-            InputError: The file is missing, unreadable or does not cover the view.
+            InputError: The map file is missing, unreadable or does not cover the image.
         """
         path = find_file(self._options, view, "mask")
         values = read_arrays(path, "mask")["mask"]

@@ -46,8 +46,8 @@ class MutualNearest:
         Args:
             view_a: First undistorted image, whose name appears in error messages.
             view_b: Second undistorted image, whose name appears in error messages.
-            features_a: Features of the first view, with descriptors.
-            features_b: Features of the second view, with descriptors.
+            features_a: Features of the first image, with descriptors.
+            features_b: Features of the second image, with descriptors.
 
         Returns:
             Matches as pairs of keypoint indices with scores.

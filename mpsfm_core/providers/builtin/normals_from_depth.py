@@ -41,8 +41,8 @@ class NormalsFromDepth:
     accurate than they would be with independent errors of the declared std. A depth error of
     relative std ``s`` that varies over an angle of ``a`` radians tilts a surface by about ``s /
     a``. The option ``slope_std`` is the factor ``1 / a`` from relative depth std to normal std. The
-    normal variance is the sum of this term and the variance that the residuals of the plane fit
-    imply for independent pixel errors.
+    normal variance is the sum of the variance of this tilt and the variance that the residuals of
+    the plane fit imply for independent pixel errors.
     """
 
     def __init__(self, options: NormalsFromDepthOptions, context: ProviderContext) -> None:

@@ -38,7 +38,7 @@ class Sift:
         sift.normalization = (
             pycolmap.Normalization.L1_ROOT if options.root else pycolmap.Normalization.L2
         )
-        # COLMAP would print a line for each image.
+        # Without this log level, COLMAP prints a line for each image.
         if "GLOG_minloglevel" not in os.environ:
             pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, _WARNING)
 
