@@ -1,4 +1,4 @@
-"""Self-calibration decisions about the guessed focal lengths that bundle adjustment estimates.
+"""Self-calibration decisions about guessed focal lengths that bundle adjustment estimates.
 
 Bundle adjustment estimates log focal lengths with a normal prior, whose standard deviation depends
 on the source of the guess (EXIF, a network, or a default). A camera takes the estimated focal
