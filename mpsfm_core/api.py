@@ -31,7 +31,7 @@ def load_config(
 
     Raises:
         ConfigError: a setting is wrong. The error message has file and line of the wrong setting
-        and the nearest valid key.
+            and the nearest valid key.
     """
     from mpsfm_core.config import load_config
 

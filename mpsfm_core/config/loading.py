@@ -71,7 +71,7 @@ def load_config(
         name_or_path: Name of a shipped configuration, or a YAML file (a slash, .yaml or .yml marks
             a file).
         overrides: Settings such as ``masks.0.use=sky``, which replace those of the configuration
-        files.
+            files.
         registry: Providers that the configuration may name, by default ``Registry.discover()``.
         complete: If false, required provider options may be missing (null in the result).
 

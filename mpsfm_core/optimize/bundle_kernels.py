@@ -67,7 +67,7 @@ class BundleObservations(NamedTuple):
 
 
 class ParameterLayout(NamedTuple):
-    """Indices (slots) of the variable parameters in the linear system, -1 for constant parameters.
+    """Indices of the variable parameters in the linear system; -1 for constants.
 
     An image has a pose slot if its pose or the log scale of its depth map is variable.
     """

@@ -51,7 +51,7 @@ def write_file(
     Args:
         path: File to write.
         content: Content as bytes, as text (encoded as UTF-8), or as a function that writes to an
-        open file.
+            open file.
         temporary: Folder for the incomplete file on the same disk as `path`, by default its folder.
 
     Raises:
@@ -169,7 +169,7 @@ def _read_plan(scratch: Path) -> tuple[list[str], list[str]]:
 
     Raises:
         InputError: the file ``ready.json`` was not written by `replace_entries`, and its names
-        could be any path.
+            could be any path.
     """
     path = scratch / _READY
     try:

@@ -73,7 +73,7 @@ def log_errors(prior: DepthPrior, example: Example, *, any_scale: bool) -> Float
         prior: Predicted depth.
         example: Synthetic view that the depth belongs to.
         any_scale: If true, subtract the median of the logarithms, which removes a common factor of
-        all depths.
+            all depths.
     """
     truth = example.truth(prior.shape)
     where = select_comparable(prior.valid, truth)

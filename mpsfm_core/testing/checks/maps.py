@@ -35,7 +35,7 @@ def require_reported_std(variance: Float32, expected_std: Float64) -> str:
 
     Raises:
         CheckFailed: the median ratio of the standard deviations is above :data:`STD_FACTOR` or
-        below its inverse.
+            below its inverse.
     """
     factor = float(np.median(np.sqrt(variance.astype(np.float64)) / expected_std))
     if 1 / STD_FACTOR < factor < STD_FACTOR:
@@ -57,7 +57,7 @@ def require_true_validity(valid: Bool, truth: TrueMaps) -> str:
 
     Raises:
         CheckFailed: the ratio of wrongly valid or of wrongly invalid pixels exceeds
-        :data:`VALIDITY_TOLERANCE`.
+            :data:`VALIDITY_TOLERANCE`.
         CheckSkipped: the map is too coarse to separate surfaces from sky.
     """
     empty, full = truth.edge_free & ~truth.valid, truth.smooth
@@ -80,7 +80,7 @@ def require_monotonic_calibration(case: ContractCase, prior: DepthPrior | Normal
 
     Raises:
         CheckFailed: the calibrated variance is invalid, or does not grow with ``std_scale`` and
-        with
+            with
             the variance of the network.
     """
     calibration = case.calibration()

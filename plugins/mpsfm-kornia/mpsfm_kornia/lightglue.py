@@ -68,7 +68,7 @@ class LightGlueMatcher:
 
         Raises:
             ProviderError: The descriptors do not have the dimension that this LightGlue network
-            requires.
+                requires.
         """
         features_a, features_b = require_features(
             "LightGlue matches features", features_a, features_b

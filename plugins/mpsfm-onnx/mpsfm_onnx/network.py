@@ -33,7 +33,7 @@ class Network:
 
     Args:
         weights: Path or URI of the ONNX file. None selects the ONNX file that the description
-        names.
+            names.
         sha256: Expected SHA-256 hash of the file ``weights``.
 
     Raises:

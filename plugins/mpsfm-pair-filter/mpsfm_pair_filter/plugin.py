@@ -39,7 +39,7 @@ def read_scores(path: Path) -> Mapping[frozenset[str], float]:
 
     Raises:
         InputError: The CSV file cannot be read, or a line does not have two image names and a
-        score.
+            score.
     """
     scores: dict[frozenset[str], float] = {}
     try:
