@@ -4,7 +4,7 @@
 The error of the log of input depth is modeled as a Gaussian Markov random field on the pixels
 (Lindgren et al., 2011). The posterior std of input depth is lower near pixels with stereo depth,
 and equals the prior std far from such pixels. The planarity prior does not lower the posterior std,
-because surfaces without stereo depth often start behind an edge.
+because a surface without stereo depth often lies behind another surface instead of continuing it.
 """
 
 from __future__ import annotations

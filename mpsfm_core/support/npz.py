@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 MAX_BYTES = 4_000_000_000
 """Maximum bytes of the unpacked arrays of an NPZ file, unless the file itself is larger.
 
-A small compressed file could expand to any size. The limit is 16 bytes per pixel of the largest
-supported image [ours]."""
+A small compressed file could expand to any size. ``MAX_BYTES`` is 16 bytes for each pixel of
+the largest supported image [ours]."""
 _COMPRESSION_LEVEL = 1
 """Compression level of zlib; level 6 takes twice the time and makes depth maps 0.5 % smaller."""
 

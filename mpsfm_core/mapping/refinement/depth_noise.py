@@ -39,8 +39,8 @@ MIN_CONSTRAINED_ANGLE_DEG = 2.0
 two images suffice, because a wrong pose moves all points of an image, while an error of a few
 points is an error of the prior. [ours]"""
 NUM_NEIGHBORS = 7
-"""Number of nearest well-constrained points whose median error measures the depth prior. Four of
-seven points must contradict a depth prior to change its noise. [ours]"""
+"""Number of nearest well-constrained points whose median error measures the depth prior. The
+median changes if at least four of the seven points contradict the depth prior. [ours]"""
 MAX_NEIGHBOR_DISTANCE = 1 / 8
 """Maximum distance between a pixel and a well-constrained point, relative to the width of the depth
 map. Errors of depth priors do not correlate at larger distances. [ours]"""
