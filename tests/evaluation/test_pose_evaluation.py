@@ -33,7 +33,7 @@ def test_evaluate_returns_plain_data(model: pycolmap.Reconstruction, tmp_path: P
 def test_evaluate_unknown_image_raises(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
     model.write_binary(str(tmp_path))
     truth = read_poses(tmp_path)
-    with pytest.raises(InputError, match=r"no image .* called nowhere\.jpg"):
+    with pytest.raises(InputError, match=r"no image .* name nowhere\.jpg"):
         evaluate(truth, truth, images=["nowhere.jpg"])
     with pytest.raises(InputError, match="at least two"):
         evaluate(truth, truth, images=list(truth)[:1])
