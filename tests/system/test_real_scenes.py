@@ -59,7 +59,7 @@ def test_kitchen_with_hardly_any_overlap(reconstruct) -> None:
 def test_room_with_motion_blur(reconstruct, shared_data: Path, tmp_path: Path) -> None:
     pytest.importorskip("mpsfm_kornia")
     room = shared_data / "data" / "hololens_room"
-    names = read_scene(room).chosen(["all"])[0].images
+    names = read_scene(room).select_sets(["all"])[0].images
     listed = tmp_path / "images.txt"
     listed.write_text("\n".join(names))
     output = reconstruct("hololens_room", "features.options.max_keypoints=1500", images=listed)
