@@ -53,8 +53,7 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
         Plain data with the keys ``parts``, ``median_angle_deg`` and ``images``. ``parts`` are the
         image names of each connected part of the covisibility graph, largest part first.
         ``median_angle_deg`` is the median over the 3D points of the maximum triangulation angle.
-        ``images`` are the number of 3D points, the number of 3D points with at least three images,
-        and the share of explained matches, by image name.
+        ``images`` are the number of 3D points and the share of explained matches, by image name.
     """
     images = reconstruction.confirmed_images
     explained = count_explained_matches(reconstruction, problem)
@@ -66,14 +65,12 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
         explained.keys(),
     )
     supported = _count_per_image(explained, explained.keys())
-    track_lengths = _track_lengths(images, len(reconstruction.points))
     return {
         "parts": _connected_parts(images, len(reconstruction.points)),
         "median_angle_deg": _median_angle_deg(images, reconstruction.points),
         "images": {
             image.name: {
                 "points": int((image.point_ids >= 0).sum()),
-                "points_in_3_images": int((track_lengths[_rows(image)] >= 3).sum()),
                 "explained_ratio": round(
                     supported.get(image.name, 0) / max(matched.get(image.name, 0), 1), 4
                 ),
@@ -95,12 +92,6 @@ def _count_per_image(counts: dict[tuple[str, str], int], pairs: Any) -> dict[str
 def _rows(image: RegisteredImage) -> Int64:
     """Return the ids of the 3D points that an image observes."""
     return np.unique(image.point_ids[image.point_ids >= 0])
-
-
-def _track_lengths(images: tuple[RegisteredImage, ...], num_points: int) -> Int64:
-    """Count the images that observe each 3D point."""
-    rows = [_rows(image) for image in images]
-    return np.bincount(np.concatenate([*rows, np.zeros(0, np.int64)]), minlength=num_points)
 
 
 def _connected_parts(images: tuple[RegisteredImage, ...], num_points: int) -> list[list[str]]:
