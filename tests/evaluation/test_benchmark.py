@@ -110,7 +110,7 @@ def test_report_recall_curves_match_errors(output) -> None:
         page[page.index("<svg") : page.index("</svg>") + len("</svg>")]
     )
     texts = [element.text for element in drawing.iter("text")]
-    for text in ("share of pairs", "error of a pair up to", "0%", "100%", "20°", "colmap"):
+    for text in ("ratio of pairs", "error of a pair up to", "0%", "100%", "20°", "colmap"):
         assert texts.count(text) == 1
     curves = [element.get("points", "").split() for element in drawing.iter("polyline")]
     assert len(curves) == 3
@@ -138,7 +138,7 @@ def test_run_benchmark_second_run_uses_records(output, scene_folder: Path, confi
     assert len(times) == 3
     result = CliRunner().invoke(build_app(), arguments(scene_folder, config, folder))
     assert result.exit_code == 0 and result.stdout == out
-    assert result.stderr.count("images, known") == 3
+    assert result.stderr.count("images, cached") == 3
     assert {path: path.stat().st_mtime_ns for path in times} == times
 
 

@@ -102,7 +102,7 @@ def test_from_a_checkpoint_to_a_file_that_is_taken_by_name(
         ("net.forward = None", "code of net fails: TypeError.*needs torch, onnx, a_package"),
         (
             "torch.onnx.export = lambda *a, **k: real(shifted(), *a[1:], **k)",
-            "says something else than its authors' network",
+            "computes other outputs than its authors' network",
         ),
     ],
 )
