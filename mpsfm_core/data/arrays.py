@@ -20,7 +20,10 @@ Pose = tuple[Float64, Float64]
 
 
 def require_array(owner: object, name: str, dtype: Any, shape: tuple[int | None, ...]) -> None:
-    """Check dtype and shape of an array attribute and replace the attribute by a read-only view.
+    """Check dtype and shape of an array attribute, and make the attribute read-only.
+
+    The array is replaced by a view, or by a copy if it is not in C order, because sums and products
+    of arrays depend on the memory layout in the last bit.
 
     Args:
         owner: Data class instance.
@@ -43,7 +46,7 @@ def require_array(owner: object, name: str, dtype: Any, shape: tuple[int | None,
     if not matches:
         required_shape = "(" + ", ".join("any" if s is None else str(s) for s in shape) + ")"
         raise DataError(name, f"array must have shape {required_shape}, got {value.shape}")
-    view = value.view()
+    view = np.ascontiguousarray(value).view()
     view.flags.writeable = False
     object.__setattr__(owner, name, view)
 

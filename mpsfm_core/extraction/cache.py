@@ -21,6 +21,7 @@ from typing import Any, TypeVar, cast, get_args, get_origin, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
+from mpsfm_core.data.decisions import Reason
 from mpsfm_core.data.errors import OutputError
 from mpsfm_core.support.files import remove_temporary_files, write_file
 from mpsfm_core.support.npz import read_npz
@@ -103,24 +104,33 @@ def content_key(*parts: object) -> str:
 
 
 def digest(value: object) -> str:
-    """Return the SHA-256 of the arrays of a data object."""
+    """Return the SHA-256 of the arrays of a data object, whatever their memory layout.
+
+    Raises:
+        TypeError: The object contains something that is no array, number or text.
+    """
     sha256 = hashlib.sha256()
     for name, array in pack(value).items():
         sha256.update(f"{name} {array.dtype.str} {array.shape}\n".encode())
-        sha256.update(np.ascontiguousarray(array).data)
+        sha256.update(np.ascontiguousarray(array).reshape(-1).view(np.uint8).data)
     return sha256.hexdigest()
 
 
 def pack(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
     """Flatten a data object to a dictionary of arrays by field path; omit fields that are None."""
-    if isinstance(value, tuple) and value and is_dataclass(value[0]):
+    if isinstance(value, Reason):
+        value = json.dumps(value.to_json())
+    if isinstance(value, tuple):
         return {
             name: array
             for index, part in enumerate(value)
             for name, array in pack(part, f"{prefix}/{index}").items()
         }
     if not is_dataclass(value):
-        return {prefix or "value": np.asarray(value)}
+        array = np.asarray(value)
+        if array.dtype.hasobject:
+            raise TypeError(f"{prefix}: a {type(value).__name__} cannot be converted to an array")
+        return {prefix or "value": array}
     arrays: dict[str, NDArray[Any]] = {}
     for field in fields(value):
         content = getattr(value, field.name)

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
-from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.mapping.events import MappingEvents
 from mpsfm_core.mapping.model_selection import MapperRun
-from mpsfm_core.mapping.serialization import CheckpointArrays, deserialize, serialize
+from mpsfm_core.mapping.state import (
+    CheckpointArrays,
+    StateDict,
+    Stateful,
+    flatten_state,
+    unflatten_state,
+)
 
 
 class CheckpointStore(Protocol):
@@ -41,35 +45,31 @@ class MapperProgress(NamedTuple):
 
     runs: list[MapperRun]
     """Completed runs."""
-    mapper: object | None
-    """The mapper of the interrupted run. The interrupted run is None if all mapper runs are
-    complete."""
+    mapper: StateDict | None
+    """State of the mapper of the interrupted run, or None if all mapper runs are complete."""
 
 
 class Checkpointer:
     """Writer and reader of the checkpoints of the mapper."""
 
-    def __init__(
-        self, store: CheckpointStore | None, problem: MappingProblem, events: MappingEvents
-    ) -> None:
+    def __init__(self, store: CheckpointStore | None) -> None:
         self._store = store
-        self._shared = (problem, events)
 
     def load(self) -> MapperProgress:
-        """Restore the last mapper checkpoint, or return empty progress if none can be read."""
-        if self._store is None or (arrays := self._store.load()) is None:
-            return MapperProgress([], None)
-        try:
-            runs, mapper = deserialize(arrays, self._shared)
-        except (DataError, TypeError, ValueError) as error:
-            self._store.unreadable(str(error))
-            return MapperProgress([], None)
-        return MapperProgress(runs, mapper)
+        """Load the last mapper checkpoint, or return empty progress if none can be read."""
+        if self._store is not None and (arrays := self._store.load()) is not None:
+            try:
+                state = unflatten_state(arrays)
+                runs = [MapperRun.from_state_dict(run) for run in state["runs"]]
+                return MapperProgress(runs, state["mapper"])
+            except (DataError, KeyError, TypeError, ValueError) as error:
+                self._store.unreadable(str(error))
+        return MapperProgress([], None)
 
-    def save_if_due(self, progress: MapperProgress, num_registered: int) -> None:
+    def save_if_due(self, runs: list[MapperRun], mapper: Stateful, num_registered: int) -> None:
         """Save a checkpoint of the mapper if the storage requests one."""
         if self._store is not None and self._store.due():
-            self._save(progress, num_registered)
+            self._save(MapperProgress(runs, mapper.state_dict()), num_registered)
 
     def save_completed(self, runs: list[MapperRun]) -> None:
         """Save the completed mapper runs, in case a later pipeline stage is interrupted."""
@@ -78,4 +78,5 @@ class Checkpointer:
 
     def _save(self, progress: MapperProgress, num_registered: int) -> None:
         assert self._store is not None
-        self._store.save(serialize(tuple(progress), self._shared), num_registered)
+        runs = [run.state_dict() for run in progress.runs]
+        self._store.save(flatten_state({**progress._asdict(), "runs": runs}), num_registered)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Int64, MappingProblem, VerifiedPair
+from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, VerifiedPair
 from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.consistency.misregistration import Misregistration, detect_misregistrations
 from mpsfm_core.mapping.consistency.pair_consistency import PairConsistencyCheck
@@ -57,9 +57,6 @@ class Component:
         refiner: Object that runs bundle adjustment and depth integration.
     """
 
-    maintenance_type: type[ModelMaintenance] = ModelMaintenance
-    registration_type: type[IncrementalRegistration] = IncrementalRegistration
-
     def __init__(
         self,
         problem: MappingProblem,
@@ -67,19 +64,19 @@ class Component:
         pair_selector: InitialPairSelector,
         event_log: EventLog,
     ) -> None:
-        self.maintenance = self.maintenance_type(problem, options, event_log)
+        self.maintenance = ModelMaintenance(problem, options, event_log)
         self.scene, self.refiner = self.maintenance.scene, self.maintenance.refiner
         self._options, self._pair_selector, self._event_log = options, pair_selector, event_log
         self._pose_estimator = AbsolutePoseEstimator(self.scene, self.refiner, options)
-        self.registration = self.registration_type(self.maintenance, self._pose_estimator)
+        self.registration = IncrementalRegistration(self.maintenance, self._pose_estimator)
 
     @property
     def size(self) -> int:
         """Number of registered images."""
         return self.maintenance.size
 
-    def reweight_pairs(self, unregistered: Bool) -> MappingProblem:
-        """Return the problem with match scores of unregistered images reweighted by depth checks.
+    def compute_pair_weights(self, unregistered: Bool) -> Float64:
+        """Weight the match scores (p,) of the pairs of unregistered images by depth checks.
 
         This method requires a scene without registered images.
         """
@@ -88,7 +85,7 @@ class Component:
         options = self._options.model_copy(update={"seed": 0})
         pose_estimator = AbsolutePoseEstimator(self.scene, self.refiner, options)
         check = PairConsistencyCheck(pose_estimator, options)
-        return check.reweight_pairs(self.maintenance.problem, unregistered)
+        return check.compute_pair_weights(self.maintenance.problem, unregistered)
 
     def initialize_from_known_poses(self, unregistered: Bool) -> bool:
         """Register all unregistered images with a known input pose.

@@ -13,6 +13,7 @@ from mpsfm_core.mapping.events import MappingEvents
 from mpsfm_core.mapping.scene.conversion import capture_scene_state
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
 from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.mapping.state import StateDict, reasons_from_json, reasons_to_json
 
 
 class EventLog:
@@ -65,6 +66,22 @@ class EventLog:
         names = {image.name for model in models for image in model.images}
         reasons = {name: reason for name, reason in self.image_reasons.items() if name not in names}
         return MappingReport(reasons, self._pair_reasons, dict(self._seconds), dict(self._counts))
+
+    def state_dict(self) -> StateDict:
+        """Return the collected reasons and times for a checkpoint."""
+        return {
+            "image_reasons": reasons_to_json(self.image_reasons),
+            "pair_reasons": reasons_to_json(self._pair_reasons),
+            "seconds": dict(self._seconds),
+            "counts": dict(self._counts),
+        }
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore the collected reasons and times from a checkpoint."""
+        self.image_reasons = reasons_from_json(state["image_reasons"])
+        self._pair_reasons = reasons_from_json(state["pair_reasons"])
+        self._seconds.update(state["seconds"])
+        self._counts.update(state["counts"])
 
 
 def _initial_reasons(problem: MappingProblem) -> dict[str, Reason]:

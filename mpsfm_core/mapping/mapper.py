@@ -30,10 +30,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from mpsfm_core.data import Bool, MappingProblem
+from mpsfm_core.data import Bool, Float64, MappingProblem
 from mpsfm_core.data.decisions import ImageReason, Reason
-from mpsfm_core.mapping.checkpoints import Checkpointer, CheckpointStore, MapperProgress
+from mpsfm_core.mapping.checkpoints import Checkpointer, CheckpointStore
 from mpsfm_core.mapping.component import Component, do_nothing
+from mpsfm_core.mapping.consistency.pair_consistency import reweight_pairs
 from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.events import MappingEvents, NullMappingEvents
 from mpsfm_core.mapping.initialization.initial_pair import InitialPairSelector
@@ -49,7 +50,7 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.registration.tentative_registration import register_tentatively
 from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
-from mpsfm_core.mapping.serialization import canonicalize
+from mpsfm_core.mapping.state import StateDict
 
 MIN_ABSORBING_RATIO = 0.25
 """Minimum size of a component, relative to the largest component, to absorb images of completed
@@ -79,32 +80,30 @@ def reconstruct(
         Connected components, sorted by decreasing number of images, and the report.
     """
     options, events = options or MapperOptions(), events or NullMappingEvents()
-    problem = canonicalize(problem)
-    checkpointer = Checkpointer(checkpoints, problem, events)
+    checkpointer = Checkpointer(checkpoints)
     runs, interrupted = checkpointer.load()
     is_complete = bool(runs) and interrupted is None
-    reweighted_problem = None
+    pair_weights = None
     initial_problem = problem
     for run in runs:  # each completed mapper run may have refined focal lengths
         initial_problem = _apply_refined_focals(initial_problem, run, options) or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):
-        if interrupted is None:
-            run_options = options.model_copy(update={"seed": options.seed + number})
-            mapper = Mapper(initial_problem, run_options, events, reweighted_problem)
-        else:
-            assert isinstance(interrupted, Mapper)
-            mapper, interrupted = interrupted, None
+        run_options = options.model_copy(update={"seed": options.seed + number})
+        mapper = Mapper(initial_problem, run_options, events, pair_weights)
+        if interrupted is not None:
+            mapper.load_state_dict(interrupted)
+            interrupted = None
 
         def save_checkpoint(mapper: Mapper = mapper) -> None:
-            checkpointer.save_if_due(MapperProgress(runs, mapper), mapper.component.size)
+            checkpointer.save_if_due(runs, mapper, mapper.component.size)
 
         runs.append(mapper.run(save_checkpoint))
-        reweighted_problem = mapper.reweighted_problem
+        pair_weights = mapper.pair_weights
         if mapper.is_deterministic:
             break
         refined_problem = _apply_refined_focals(initial_problem, runs[-1], options)
         if refined_problem is not None:
-            initial_problem, reweighted_problem = refined_problem, None
+            initial_problem, pair_weights = refined_problem, None
         elif is_settled(runs, options.enough_explained):
             break
     checkpointer.save_completed(runs)
@@ -121,8 +120,7 @@ def _apply_refined_focals(
     """Return the problem with refined focal lengths, or None if they changed little."""
     if not run.models or not options.refinement.refine_focal:
         return None
-    refined = apply_refined_focal_lengths(problem, run.models[0], options.seed)
-    return None if refined is None else canonicalize(refined)
+    return apply_refined_focal_lengths(problem, run.models[0], options.seed)
 
 
 class Mapper:
@@ -135,22 +133,20 @@ class Mapper:
         component: The current component.
         models: The completed components.
         unregistered: (n,) bool mask of the images that are in no completed component.
-        reweighted_problem: The mapping problem with match scores reweighted by depth checks of
-            image pairs, or None before such checks.
+        pair_weights: (p,) float64 weights of the match scores of each image pair from depth
+            checks, or None before such checks.
     """
 
     component: Component
-    component_type: type[Component] = Component
 
     def __init__(
         self,
         problem: MappingProblem,
         options: MapperOptions,
         events: MappingEvents,
-        reweighted_problem: MappingProblem | None = None,
+        pair_weights: Float64 | None = None,
     ) -> None:
         self.problem = problem
-        self.reweighted_problem = reweighted_problem
         self.options = options
         self.event_log = EventLog(problem, events)
         self.models: list[Reconstruction] = []
@@ -159,6 +155,40 @@ class Mapper:
         self._num_components = 0
         self._is_growing = False
         self._uses_known_poses = sum(image.known_pose is not None for image in problem.images) >= 2
+
+        self._set_pair_weights(pair_weights)
+
+    def state_dict(self) -> StateDict:
+        """Return the state of the run, between two image registrations, for a checkpoint."""
+        return {
+            "component": self.component.maintenance.state_dict(),
+            "event_log": self.event_log.state_dict(),
+            "models": [model.state_dict() for model in self.models],
+            "num_components": self._num_components,
+            "pair_selector": self._pair_selector.state_dict(self._weighted_problem.pairs),
+            "pair_weights": self.pair_weights,
+            "unregistered": self.unregistered,
+            "uses_known_poses": self._uses_known_poses,
+        }
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore the state of a run from a checkpoint of the same problem and options."""
+        self._set_pair_weights(state["pair_weights"])
+        self._pair_selector.load_state_dict(state["pair_selector"], self._weighted_problem.pairs)
+        self.event_log.load_state_dict(state["event_log"])
+        self.models = [Reconstruction.from_state_dict(model) for model in state["models"]]
+        self.unregistered = state["unregistered"]
+        self._num_components = state["num_components"]
+        self._uses_known_poses = state["uses_known_poses"]
+        self.component = self._create_component()
+        self.component.maintenance.load_state_dict(state["component"])
+        self._is_growing = True
+
+    def _set_pair_weights(self, weights: Float64 | None) -> None:
+        self.pair_weights = weights
+        self._weighted_problem = (
+            self.problem if weights is None else reweight_pairs(self.problem, weights)
+        )
 
     @property
     def is_deterministic(self) -> bool:
@@ -215,8 +245,7 @@ class Mapper:
         return not self.is_deterministic
 
     def _create_component(self) -> Component:
-        problem = self.reweighted_problem or self.problem
-        return self.component_type(problem, self.options, self._pair_selector, self.event_log)
+        return Component(self._weighted_problem, self.options, self._pair_selector, self.event_log)
 
     def _initialize(self) -> bool:
         """Initialize the component from global poses, or else from an image pair.
@@ -226,9 +255,10 @@ class Mapper:
         """
         if self._initialize_globally():
             return True
-        if self.reweighted_problem is None and self.options.checks_pairs:
+        if self.pair_weights is None and self.options.checks_pairs:
             with self.event_log.timed("pair check"):
-                self.reweighted_problem = self.component.reweight_pairs(self.unregistered)
+                weights = self.component.compute_pair_weights(self.unregistered)
+            self._set_pair_weights(weights)
             self.component = self._create_component()
             if self._initialize_globally():
                 return True

@@ -19,6 +19,7 @@ from mpsfm_core.mapping.registration.image_selection import compute_pair_scores
 from mpsfm_core.mapping.registration.registration_history import RegistrationHistory
 from mpsfm_core.mapping.registration.threshold_schedule import ThresholdSchedule
 from mpsfm_core.mapping.scene.scene import Scene, Snapshot
+from mpsfm_core.mapping.state import StateDict, Stateful
 
 MAX_ROTATION_DEG = 3.0
 """Rotation of a camera in one global refinement above which depth consistency decides whether the
@@ -82,6 +83,28 @@ class ModelMaintenance:
         self._checked = state.checked.copy()
         self.refiner.noise, self.refiner.loss_scale = state.noise, state.loss_scale
         self.history.clear()
+
+    def state_dict(self) -> StateDict:
+        """Return the state of the model for a checkpoint."""
+        parts = {name: part.state_dict() for name, part in self._parts().items()}
+        return {**parts, "last_size": self._last_size, "checked": self._checked}
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore the state of the model from a checkpoint of the same mapping problem."""
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])
+        self._last_size = tuple(state["last_size"])
+        self._checked = state["checked"]
+
+    def _parts(self) -> dict[str, Stateful]:
+        """Return the parts of the model that have a state, in the order of their restoration."""
+        return {
+            "scene": self.scene,
+            "refiner": self.refiner,
+            "history": self.history,
+            "thresholds": self.thresholds,
+            "depth_check": self._depth_check,
+        }
 
     def clear(self, empty: Snapshot) -> None:
         """Reset the model to a scene without registered images."""

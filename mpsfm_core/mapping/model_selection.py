@@ -16,6 +16,7 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.mapping.consistency.depth_agreement import measure_depth_agreement
 from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
+from mpsfm_core.mapping.state import StateDict
 
 MAX_RATIO_DIFFERENCE = 0.01
 """Difference between the explained shares of the match scores below which two runs count as equal.
@@ -40,6 +41,21 @@ class MapperRun(NamedTuple):
     def size(self) -> int:
         """Number of images of the largest component."""
         return len(self.models[0].images) if self.models else 0
+
+    def state_dict(self) -> StateDict:
+        """Return the run for a checkpoint."""
+        return {
+            "models": [model.state_dict() for model in self.models],
+            "explained_ratios": self.explained_ratios,
+            "report": self.report.state_dict(),
+        }
+
+    @classmethod
+    def from_state_dict(cls, state: StateDict) -> MapperRun:
+        """Restore a run from a checkpoint."""
+        models = [Reconstruction.from_state_dict(model) for model in state["models"]]
+        report = MappingReport.from_state_dict(state["report"])
+        return cls(models, state["explained_ratios"], report)
 
 
 def is_settled(runs: Sequence[MapperRun], min_explained_ratio: float) -> bool:

@@ -26,10 +26,10 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.errors import DataError, OutputError
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stereo import StereoDepth
-from mpsfm_core.extraction.cache import Cache, cache_folder, content_key
+from mpsfm_core.extraction.cache import Cache, cache_folder, content_key, digest
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
-from mpsfm_core.mapping.serialization import CheckpointArrays, fingerprint
+from mpsfm_core.mapping.state import CheckpointArrays
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import core_version
 from mpsfm_core.support.files import remove_temporary_files, write_file
@@ -79,7 +79,8 @@ class MappingCheckpoints:
         every_s: float,
     ) -> None:
         self._folder = cache_folder(cache_dir) / "mapping"
-        self._path = self._folder / f"{fingerprint((problem, options))}.npz"
+        key = content_key(digest(problem), options.model_dump(mode="json"))
+        self._path = self._folder / f"{key}.npz"
         self._stages = stages
         self._every_s = self._wait_s = every_s
         self._total = len(problem.images)
@@ -178,7 +179,7 @@ class DenseCheckpoints:
         self._cache = Cache(cache_dir)
         self._reconstruction_key = content_key(
             code_key(),
-            fingerprint(reconstruction),
+            digest(reconstruction),
             list(image_keys),
             options.model_dump(mode="json"),
         )

@@ -21,7 +21,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mpsfm_core.config import load_config
-from mpsfm_core.data import DepthPrior, Features
+from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import InputError, MpsfmError, WeightsError
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.records import read_record
@@ -32,7 +32,7 @@ from mpsfm_core.inputs.image_search import read_image_list
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.intrinsics import read_intrinsics
 from mpsfm_core.inputs.models import read_model, read_poses
-from mpsfm_core.mapping.serialization import deserialize, serialize
+from mpsfm_core.mapping.state import flatten_state, unflatten_state
 from mpsfm_core.pipeline import checkpoints
 from mpsfm_core.providers.builtin.map_files import read_arrays
 from mpsfm_core.providers.registry import Registry
@@ -95,7 +95,7 @@ def as_cache_entry(path: Path) -> None:
 
 def as_state(path: Path) -> None:
     """Read a mutated file as a checkpoint of a mapping problem."""
-    deserialize(checkpoints.read_checkpoint(path)[1])
+    unflatten_state(checkpoints.read_checkpoint(path)[1])
 
 
 def as_hashes(path: Path) -> None:
@@ -137,9 +137,7 @@ _RECORD = json.dumps({
 def readers(registry: Registry) -> dict[str, tuple[bytes, Callable[[Path], object]]]:
     """Return for each file name the content of a well-formed file, and its reader."""
     depth = np.ones((4, 5), np.float32)
-    state = serialize(
-        {"a": np.arange(20.0), "b": [1, (2, "x")], "f": Features(np.ones((4, 2)), depth)}
-    )
+    state = flatten_state({"a": np.arange(20.0), "b": [1, {"c": depth, "d": "x"}]})
     header = np.frombuffer(b'{"code": "", "version": "", "registered": 1, "time": ""}', np.uint8)
     entry = archive(depth=depth, valid=depth > 0, variance=depth, metric=np.array(True))
     images = {

@@ -12,7 +12,6 @@ import os
 import shutil
 import signal
 import tempfile
-from collections import OrderedDict
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,7 @@ from mpsfm_core.extraction.empty_results import JointPrior
 from mpsfm_core.extraction.matching.verification import TwoViewGeometry
 from mpsfm_core.inputs import video
 from mpsfm_core.inputs.options import VideoOptions
-from mpsfm_core.mapping.serialization import serialize
+from mpsfm_core.mapping.state import flatten_state
 from mpsfm_core.pipeline import checkpoints
 from mpsfm_core.providers.environments.environment import Environment
 from mpsfm_core.providers.environments.worker import _description
@@ -69,11 +68,10 @@ runtime: {{workers: 1, cache_dir: {folder}/cache}}
 """
 KEY = "0" * 64
 STATE = {
-    "poses": [np.eye(3), (np.zeros(3), 0.5)],
-    "seen": OrderedDict(a={1, 2}, b=None),
-    "random": np.random.default_rng(4),
+    "poses": [{"rotation": np.eye(3), "support": 0.5}],
+    "seen": {"a": [1, 2], "b": None},
 }
-"""As the state of a mapper, whose own classes change with every version."""
+"""State like that of a mapper, whose fields change with every version."""
 
 
 def entries() -> dict[str, Any]:
@@ -128,7 +126,7 @@ def write_cache(output: Path) -> None:
     text = json.dumps({**header, "time": "2026-01-01 00:00:00"}).encode()
     (output / "cache" / "mapping").mkdir()
     with (output / "cache" / "mapping" / "checkpoint.npz").open("wb") as file:
-        state: Any = serialize(STATE)
+        state: Any = flatten_state(STATE)
         np.savez(file, header=np.frombuffer(text, np.uint8), **state)
     with serving() as server:
         server.files["/v1/model.onnx"] = b"weights"

@@ -1,4 +1,4 @@
-"""A mapper that ends early goes on to the very same result."""
+"""Checkpoints of the mapper: a resumed run gives the result of an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -10,17 +10,13 @@ import pytest
 
 from mpsfm_core.data import DepthPrior, MappingProblem, PinholeCamera
 from mpsfm_core.data.errors import DataError
+from mpsfm_core.extraction.cache import digest
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper, reconstruct
+from mpsfm_core.mapping.model_selection import MapperRun
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult
-from mpsfm_core.mapping.serialization import (
-    CheckpointArrays,
-    canonicalize,
-    deserialize,
-    fingerprint,
-    serialize,
-)
+from mpsfm_core.mapping.state import CheckpointArrays, flatten_state, unflatten_state
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -28,11 +24,11 @@ CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
 
 
 class Killed(Exception):
-    """The end, at any moment."""
+    """Interruption of the mapper."""
 
 
 class Memory:
-    """Keeps every state and ends the mapper after the ``last``."""
+    """Store of checkpoints that interrupts the mapper after the ``last`` one."""
 
     def __init__(self, states: list[CheckpointArrays], last: int) -> None:
         self.states, self.reasons = states, []
@@ -59,115 +55,107 @@ def same(a: CheckpointArrays, b: CheckpointArrays) -> bool:
     )
 
 
-def content(result: MappingResult, problem: MappingProblem) -> CheckpointArrays:
-    """All of a result but the seconds that it took."""
+def content(result: MappingResult) -> CheckpointArrays:
+    """Return all values of a result except the run times."""
     report = replace(result.report, seconds={})
-    return serialize(replace(result, report=report), problem)
-
-
-def thawed_poses(state: CheckpointArrays, problem: MappingProblem) -> CheckpointArrays:
-    _, mapper = deserialize(state, (problem, NullMappingEvents()))
-    return serialize(mapper.component.scene.snapshot())
+    models = [model.state_dict() for model in result.reconstructions]
+    return flatten_state({"models": models, "report": report.state_dict()})
 
 
 @pytest.fixture(scope="module")
 def problem() -> MappingProblem:
-    """Two groups that share no matches, with noise: several runs."""
+    """Return a noisy problem of two components, which needs several mapper runs."""
     noise = SyntheticNoise(keypoints_px=1.0, depth=0.05)
     whole = make_mapping_problem(
         room_scene(), CAMERA, arc_poses(6, 14.0), noise=noise, points_per_view=80, map_width=48
     )
     apart = tuple(p for p in whole.pairs if (p.image_a < 3) == (p.image_b < 3))
-    return canonicalize(MappingProblem(whole.images, apart))
+    return MappingProblem(whole.images, apart)
 
 
 OPTIONS = MapperOptions(max_runs=2, enough_explained=1.0)
 
 
 @pytest.fixture(scope="module")
-def undisturbed(problem: MappingProblem) -> tuple[MappingResult, list[CheckpointArrays]]:
+def uninterrupted(problem: MappingProblem) -> tuple[MappingResult, list[CheckpointArrays]]:
     memory = Memory([], -1)
     return reconstruct(problem, OPTIONS, checkpoints=memory), memory.states
 
 
-def test_every_attribute_comes_back(problem: MappingProblem, undisturbed) -> None:
-    _, states = undisturbed
-    shared = (problem, NullMappingEvents())
-    for state in states:
-        assert same(serialize(deserialize(state, shared), shared), state)
+def test_restored_mapper_has_the_state_of_the_checkpoint(
+    problem: MappingProblem, uninterrupted
+) -> None:
+    _, states = uninterrupted
+    for arrays in states[:-1]:
+        state = unflatten_state(arrays)
+        assert all(a.flags.c_contiguous or a.flags.f_contiguous for a in arrays.values())
+        options = OPTIONS.model_copy(update={"seed": len(state["runs"])})
+        mapper = Mapper(problem, options, NullMappingEvents())
+        mapper.load_state_dict(state["mapper"])
+        runs = [MapperRun.from_state_dict(run).state_dict() for run in state["runs"]]
+        assert same(flatten_state({"runs": runs, "mapper": mapper.state_dict()}), arrays)
 
 
-def test_a_resumed_run_ends_the_same_bit_for_bit(problem: MappingProblem, undisturbed) -> None:
-    result, states = undisturbed
+def test_resumed_run_gives_identical_result(problem: MappingProblem, uninterrupted) -> None:
+    result, states = uninterrupted
     assert len(states) >= 6
     assert len(result.reconstructions) == 2
     for first in (1, len(states) // 2 + 1):
         memory = Memory(states[:first], -1)
         again = reconstruct(problem, OPTIONS, checkpoints=memory)
-        assert same(content(again, problem), content(result, problem))
+        assert same(content(again), content(result))
         assert not memory.reasons
 
 
-def test_killed_after_each_state(problem: MappingProblem, undisturbed) -> None:
-    result, states = undisturbed
+def test_run_interrupted_after_each_checkpoint_gives_identical_result(
+    problem: MappingProblem, uninterrupted
+) -> None:
+    result, states = uninterrupted
     kept: list[CheckpointArrays] = []
     for last in range(1, len(states) + 1):
         with pytest.raises(Killed):
             reconstruct(problem, OPTIONS, checkpoints=Memory(kept, last))
-    # A state that is taken up is kept anew at once, so that each kill loses one step.
+    # A resumed mapper saves a checkpoint at once, so each interruption loses one step.
     again = reconstruct(problem, OPTIONS, checkpoints=Memory(kept, -1))
-    assert same(content(again, problem), content(result, problem))
+    assert same(content(again), content(result))
 
 
-def test_keeping_states_changes_nothing(problem: MappingProblem, undisturbed) -> None:
-    result, _ = undisturbed
-    assert same(content(reconstruct(problem, OPTIONS), problem), content(result, problem))
+def test_saving_checkpoints_does_not_change_result(problem: MappingProblem, uninterrupted) -> None:
+    result, _ = uninterrupted
+    assert same(content(reconstruct(problem, OPTIONS)), content(result))
 
 
-def test_a_damaged_state_is_a_new_start(problem: MappingProblem, undisturbed) -> None:
-    _, states = undisturbed
+def test_damaged_checkpoint_restarts_the_mapper(problem: MappingProblem, uninterrupted) -> None:
+    result, states = uninterrupted
     rng = np.random.default_rng(0)
-    broken = []
-    tree = states[0]["tree"].copy()
-    tree[rng.integers(len(tree), size=20)] = ord("x")
-    broken.append({**states[0], "tree": tree})
-    broken.append({"tree": states[0]["tree"]})
-    broken.append({})
-    broken.append({**states[0], "tree": np.frombuffer(b'{"format":0,"state":1}', np.uint8)})
-    broken.append({**states[0], "tree": np.frombuffer(b'{"format":1,"state":1}', np.uint8)})
-    for state in broken[:-1]:
+    text = states[0]["state"].copy()
+    text[rng.integers(len(text), size=20)] = ord("x")
+    name = next(name for name in states[0] if name != "state")
+    one_missing = {key: array for key, array in states[0].items() if key != name}
+    not_a_state = np.frombuffer(b'{"arrays":[],"state":1}', np.uint8)
+    for damaged in (
+        {**states[0], "state": text},
+        {"state": states[0]["state"]},
+        {},
+        one_missing,
+        {"state": not_a_state},
+    ):
         with pytest.raises(DataError, match="state: the checkpoint is damaged"):
-            deserialize(state, (problem, NullMappingEvents()))
-    memory = Memory([broken[-1]], 2)
-    with pytest.raises(Killed):
-        reconstruct(problem, OPTIONS, checkpoints=memory)
-    assert memory.reasons
-    assert same(thawed_poses(memory.states[1], problem), thawed_poses(states[0], problem))
-
-
-@pytest.mark.parametrize(
-    "path", ["os:system", "mpsfm_core.providers.registry:Registry", "subprocess:Popen"]
-)
-def test_no_other_classes_come_out_of_a_state(path: str) -> None:
-    text = f'{{"format":1,"state":{{"id":0,"object":"{path}","attributes":{{}}}}}}'
-    with pytest.raises(DataError, match="no class that a checkpoint may contain"):
-        deserialize({"tree": np.frombuffer(text.encode(), np.uint8)})
-
-
-def test_what_cannot_be_kept_is_named_with_its_place(problem: MappingProblem) -> None:
-    mapper = Mapper(problem, OPTIONS, NullMappingEvents())
-    mapper.event_log._seconds["lock"] = threading.Lock()
-    with pytest.raises(TypeError, match=r"state\.event_log\._seconds\['lock'\]: a _thread\.lock"):
-        serialize(mapper, (problem, mapper.event_log._events))
+            unflatten_state(damaged)
+    memory = Memory([one_missing], -1)
+    assert same(content(reconstruct(problem, OPTIONS, checkpoints=memory)), content(result))
+    assert len(memory.reasons) == 1 and f"the array {name} is missing" in memory.reasons[0]
 
 
 def moved(array: np.ndarray) -> np.ndarray:
-    """The same values elsewhere: a view, in Fortran's order."""
+    """Return the same values as a view in Fortran order."""
     return np.asfortranarray(np.stack([array, array]))[0]
 
 
-def test_how_a_problem_lies_in_memory_does_not_count(problem: MappingProblem, undisturbed) -> None:
-    result, states = undisturbed
+def test_memory_layout_of_problem_does_not_change_result(
+    problem: MappingProblem, uninterrupted
+) -> None:
+    result, states = uninterrupted
     images = tuple(
         replace(
             image,
@@ -180,48 +168,25 @@ def test_how_a_problem_lies_in_memory_does_not_count(problem: MappingProblem, un
         for image in problem.images
     )
     other = MappingProblem(images, problem.pairs)
-    assert not same(serialize(other), serialize(problem))
-    assert fingerprint(other) == fingerprint(problem) == fingerprint(canonicalize(other))
-    assert same(serialize(canonicalize(other)), serialize(canonicalize(problem)))
-    assert canonicalize(canonicalize(other).images[0]) is not images[0]
+    assert digest(other) == digest(problem)
+    assert digest(MappingProblem(problem.images, problem.pairs[1:])) != digest(problem)
     memory = Memory(states[: len(states) // 2], -1)
-    again = reconstruct(other, OPTIONS, checkpoints=memory)
-    assert same(content(again, other), content(result, problem))
-    fewer = MappingProblem(problem.images, problem.pairs[1:])
-    assert fingerprint(fewer) != fingerprint(problem)
+    assert same(content(reconstruct(other, OPTIONS, checkpoints=memory)), content(result))
 
 
-def test_options_come_back(problem: MappingProblem) -> None:
-    options = MapperOptions(seed=3, refinement={"global_growth": 0.5})
-    assert deserialize(serialize(options)) == options != MapperOptions()
-    assert not same(serialize(options), serialize(MapperOptions()))
-
-
-def test_arrays_keep_layout_sharing_and_protection() -> None:
-    owner = np.asfortranarray(np.arange(24.0).reshape(2, 3, 4))
-    frozen_array = np.arange(5)
-    frozen_array.flags.writeable = False
+def test_unflatten_state_restores_values_and_layout() -> None:
     state = {
-        "owner": owner,
-        "view": owner[1:, ::2, ::-1],
-        "permuted": np.arange(24.0).reshape(2, 3, 4).transpose(1, 2, 0).copy(order="K"),
-        "fixed": frozen_array,
+        "fortran": np.asfortranarray(np.arange(6.0).reshape(2, 3)),
         "empty": np.zeros((0, 3)),
-        "zero": np.zeros((), np.float32),
-        "scalar": np.float32(0.1),
-        "random": np.random.default_rng(3),
-        "bytes": b"\x00\xff",
-        "odd": [float("inf"), 1e-310, 2**70, "ä", {3, 4}, (1, (2,))],
-        7: owner,
+        "nested": [{"a/b": np.float32([1.5])}, None, [True, 2**70, float("inf"), 1e-310, "ä"]],
     }
-    came = deserialize(serialize(state))
-    assert came[7] is came["owner"] and came["owner"].flags.f_contiguous
-    for name in ("owner", "view", "permuted", "fixed", "empty", "zero"):
-        assert np.array_equal(came[name], state[name]) and came[name].strides == state[name].strides
-        assert came[name].dtype == state[name].dtype
-    came["owner"][1, 0, 3] = -1
-    assert came["view"][0, 0, 0] == -1
-    assert not came["fixed"].flags.writeable
-    assert type(came["scalar"]) is np.float32 and came["scalar"] == state["scalar"]
-    assert came["bytes"] == state["bytes"] and came["odd"] == state["odd"]
-    assert came["random"].random() == np.random.default_rng(3).random()
+    restored = unflatten_state(flatten_state(state))
+    assert restored["fortran"].flags.f_contiguous and restored["empty"].shape == (0, 3)
+    assert np.array_equal(restored["fortran"], state["fortran"])
+    assert restored["nested"][0]["a/b"].dtype == np.float32
+    assert restored["nested"][1:] == state["nested"][1:]
+
+
+def test_flatten_state_of_unsupported_value_names_its_path() -> None:
+    with pytest.raises(TypeError, match=r"mapper/locks/1: lock is no value of a state"):
+        flatten_state({"mapper": {"locks": [0, threading.Lock()]}})

@@ -81,7 +81,7 @@ class Scripted:
 
     script: Sequence[Sequence[float]] = ()
     is_deterministic = False
-    reweighted_problem = None
+    pair_weights = None
 
     def __init__(
         self, problem: MappingProblem, options: MapperOptions, events: object, weighed: object

@@ -10,7 +10,7 @@ import pytest
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.serialization import deserialize, serialize
+from mpsfm_core.mapping.state import flatten_state, unflatten_state
 from mpsfm_core.pipeline import checkpoints as module
 from mpsfm_core.pipeline.checkpoints import MappingCheckpoints
 from mpsfm_core.pipeline.stages import Stages
@@ -49,9 +49,9 @@ def opened(folder: Path, problem: MappingProblem, every_s: float = 0.0, **option
 def test_checkpoint_is_loaded_for_the_same_problem_only(tmp_path: Path, problem) -> None:
     checkpoints, _ = opened(tmp_path, problem)
     assert checkpoints.load() is None
-    checkpoints.save(serialize(STATE), 1)
+    checkpoints.save(flatten_state(STATE), 1)
     again, told = opened(tmp_path, problem)
-    assert deserialize(again.load())["b"] == "text"
+    assert unflatten_state(again.load())["b"] == "text"
     assert "continues from a checkpoint" in told[0] and "1 of 2 images" in told[0]
     assert opened(tmp_path, problem, seed=1)[0].load() is None
     fewer = MappingProblem(problem.images, ())
@@ -64,7 +64,7 @@ def test_checkpoint_is_loaded_for_the_same_problem_only(tmp_path: Path, problem)
 def test_checkpoint_of_other_code_is_not_used(
     tmp_path: Path, problem, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened(tmp_path, problem)[0].save(serialize(STATE), 1)
+    opened(tmp_path, problem)[0].save(flatten_state(STATE), 1)
     monkeypatch.setattr(module, "code_key", lambda: "another")
     checkpoints, told = opened(tmp_path, problem)
     assert checkpoints.load() is None
@@ -73,7 +73,7 @@ def test_checkpoint_of_other_code_is_not_used(
 
 @pytest.mark.parametrize("keep", [0, 10, 0.5, -1])
 def test_damaged_checkpoint_is_not_used(tmp_path: Path, problem, keep: float) -> None:
-    opened(tmp_path, problem)[0].save(serialize(STATE), 1)
+    opened(tmp_path, problem)[0].save(flatten_state(STATE), 1)
     (path,) = tmp_path.rglob("*.npz")
     data = path.read_bytes()
     path.write_bytes(data[: int(keep * len(data)) if 0 < keep < 1 else int(keep)])
@@ -91,7 +91,7 @@ def test_checkpoint_on_full_disk_warns_once(
     checkpoints, _ = opened(tmp_path, problem)
     assert checkpoints.due()
     monkeypatch.setattr(module, "write_file", full)
-    checkpoints.save(serialize(STATE), 1)
+    checkpoints.save(flatten_state(STATE), 1)
     assert "no checkpoints from now on" in caplog.text and "No space" in caplog.text
     assert not checkpoints.due()
 
@@ -107,7 +107,7 @@ def test_checkpoint_interval_grows_on_slow_disk(
     assert not checkpoints.due()
     clock[0] = 60.0
     assert checkpoints.due()
-    checkpoints.save(serialize(STATE), 1)
+    checkpoints.save(flatten_state(STATE), 1)
     clock[0] = 70.0 + 499
     assert not checkpoints.due()
     clock[0] = 70.0 + 500

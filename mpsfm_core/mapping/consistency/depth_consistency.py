@@ -50,6 +50,7 @@ from mpsfm_core.mapping.refinement.depth_noise import (
     measure_local_depth_noise,
 )
 from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.optimize.depth_integration import RefinedDepth
 from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, subsample_camera
 from mpsfm_core.support import jit
@@ -178,6 +179,33 @@ class DepthConsistencyCheck:
             ViolationCriteria(options.max_deviation, options.min_gap, by_target_area),
             limit,
         )
+
+    def state_dict(self) -> StateDict:
+        """Return the cached depth maps for a checkpoint, except those of replaced refined depth.
+
+        The local depth noise in a cached depth map depends on the points at the time of its
+        computation.
+        """
+        maps = self._scene.maps
+        return {
+            str(image): {
+                "is_refined": key.refined is not None,
+                "scale": key.scale,
+                "camera": {**vars(key.camera)},
+                "std_factor": key.std_factor,
+                "grid": grid._asdict(),
+            }
+            for image, (key, grid) in self._grids.items()
+            if key.refined is None or key.refined is maps[image].refined
+        }
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore the cached depth maps from a checkpoint, after the scene was restored."""
+        for image, cached in state.items():
+            refined = self._scene.maps[int(image)].refined if cached["is_refined"] else None
+            camera = PinholeCamera(**cached["camera"])
+            key = _DepthMapState(refined, cached["scale"], camera, cached["std_factor"])
+            self._grids[int(image)] = key, _DepthGrid(**cached["grid"])
 
     def _get_grid(self, image: int, std_factor: float) -> _DepthGrid:
         """Return the subsampled depth map of an image, from the cache if the map is unchanged."""

@@ -70,13 +70,16 @@ class PairConsistencyCheck:
             pose_estimator.scene, options.consistency, fill_holes=True
         )
 
-    def reweight_pairs(self, problem: MappingProblem, candidates: Bool) -> MappingProblem:
-        """Return the mapping problem with reweighted match scores and without inconsistent pairs.
+    def compute_pair_weights(self, problem: MappingProblem, candidates: Bool) -> Float64:
+        """Weight the match scores of each pair by its depth consistency.
 
         Args:
-            problem: The problem.
-            candidates: (n,) bool mask of the images whose pairs are checked. All other image pairs
-                stay unchanged.
+            problem: The mapping problem.
+            candidates: (n,) bool mask of the images whose pairs are checked.
+
+        Returns:
+            (p,) float64 weights in [0, 1], 1 for pairs that are not checked, and 0 for pairs to
+            remove.
         """
         min_matches = self._options.registration.min_inliers
         results = {
@@ -90,18 +93,18 @@ class PairConsistencyCheck:
             if result.support_ratio * len(pair) >= min_matches
         }
         match_graph, rotations = _average_consistent_pairs(consistent, len(problem.images))
-        pairs = []
-        for pair in problem.pairs:
+        weights = np.ones(len(problem.pairs))
+        for row, pair in enumerate(problem.pairs):
             result = results.get(pair, PairConsistency(pair.rotation, 1.0))
             if result.support_ratio > 0:
-                pairs.append(_scale_scores(pair, result.support_ratio))
+                weights[row] = result.support_ratio
                 continue
             a, b = pair.image_a, pair.image_b
             error_deg = rotation_angle_deg(rotations[b] @ rotations[a].T @ result.rotation.T)
             num_connecting = maximum_flow(match_graph, a, b).flow_value
-            if num_connecting <= len(pair) or error_deg <= MAX_ROTATION_ERROR_DEG:
-                pairs.append(pair)
-        return replace(problem, pairs=tuple(pairs))
+            if num_connecting > len(pair) and error_deg > MAX_ROTATION_ERROR_DEG:
+                weights[row] = 0.0
+        return weights
 
     def check_pair(self, pair: VerifiedPair) -> PairConsistency:
         """Check the depth consistency of the relative pose of an image pair."""
@@ -198,6 +201,16 @@ def _b_from_a(pair: VerifiedPair, initial: InitialPair) -> Float64:
     return rotation if initial.reference == pair.image_a else rotation.T
 
 
-def _scale_scores(pair: VerifiedPair, factor: float) -> VerifiedPair:
-    """Return the image pair with its match scores multiplied by a factor."""
-    return pair if factor == 1.0 else replace(pair, scores=pair.scores * np.float32(factor))
+def reweight_pairs(problem: MappingProblem, weights: Float64) -> MappingProblem:
+    """Return the problem with the match scores of each pair multiplied by a weight.
+
+    Args:
+        problem: The mapping problem.
+        weights: (p,) float64 weight of each pair in [0, 1], where 0 removes the pair.
+    """
+    pairs = (
+        pair if weight == 1.0 else replace(pair, scores=pair.scores * np.float32(weight))
+        for pair, weight in zip(problem.pairs, weights, strict=True)
+        if weight > 0
+    )
+    return replace(problem, pairs=tuple(pairs))

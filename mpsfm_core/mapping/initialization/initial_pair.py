@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, VerifiedPair
-from mpsfm_core.data.decisions import ImageReason, Reason
+from mpsfm_core.data.decisions import ImageReason, Reason, reason_from_json
 from mpsfm_core.geometry import triangulation_angle_deg
 from mpsfm_core.mapping.options import InitializationOptions, MapperOptions, RegistrationOptions
 from mpsfm_core.mapping.registration.correspondences import (
@@ -23,6 +23,7 @@ from mpsfm_core.mapping.registration.correspondences import (
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
 from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.mapping.triangulation import triangulate_midpoints
 
 
@@ -95,6 +96,28 @@ class InitialPairSelector:
     def reject_pair(self, pair: VerifiedPair, reason: Reason) -> None:
         """Record the reason why an image pair cannot initialize a component."""
         self._results[pair] = reason
+
+    def state_dict(self, pairs: Sequence[VerifiedPair]) -> StateDict:
+        """Return the estimated relative poses of image pairs for a checkpoint, by pair number."""
+        state: StateDict = {}
+        for number, pair in enumerate(pairs):
+            result = self._results.get(pair)
+            if isinstance(result, Reason):
+                state[str(number)] = {"reason": result.to_json()}
+            elif result is not None:
+                state[str(number)] = {**result._asdict(), "pose": {**vars(result.pose)}}
+        return state
+
+    def load_state_dict(self, state: StateDict, pairs: Sequence[VerifiedPair]) -> None:
+        """Restore the estimated relative poses of image pairs from a checkpoint."""
+        for number, result in state.items():
+            pair = pairs[int(number)]
+            if "reason" in result:
+                self._results[pair] = reason_from_json(ImageReason, result["reason"])
+            else:
+                self._results[pair] = InitialPair(
+                    **{**result, "pose": ScoredPose(**result["pose"])}
+                )
 
 
 def register_first_image(scene: Scene, image: int) -> None:

@@ -22,6 +22,7 @@ from mpsfm_core.mapping.refinement.keypoint_noise import measure_loss_scale
 from mpsfm_core.mapping.registration.image_selection import find_local_bundle
 from mpsfm_core.mapping.scene.focal_outcome import MIN_FOCAL_IMAGES, FocalOutcome
 from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, lift_low_parallax
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, BundleResult, adjust_bundle
 from mpsfm_core.optimize.covariance import compute_point_covariances, propagate_depth_variance
@@ -318,6 +319,24 @@ class Refiner:
         self.noise = self._integrator_noise = DepthNoise()
         self.loss_scale = self.options.bundle.reprojection_scale
         self.adapts_reprojection_loss = False
+
+    def state_dict(self) -> StateDict:
+        """Return the noise measurements and the fixed poses for a checkpoint."""
+        return {
+            "fixed": self.fixed,
+            "noise": list(self.noise),
+            "integrator_noise": list(self._integrator_noise),
+            "loss_scale": self.loss_scale,
+            "adapts_reprojection_loss": self.adapts_reprojection_loss,
+        }
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore the noise measurements and the fixed poses from a checkpoint."""
+        self.fixed = state["fixed"]
+        self.noise = DepthNoise(*state["noise"])
+        self._integrator_noise = DepthNoise(*state["integrator_noise"])
+        self.loss_scale = state["loss_scale"]
+        self.adapts_reprojection_loss = state["adapts_reprojection_loss"]
 
     def _integrate(self, image: int, covariances: Float64, angles: Float64) -> None:
         scene, tracks = self.scene, self.scene.tracks

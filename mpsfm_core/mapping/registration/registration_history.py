@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool
-from mpsfm_core.data.decisions import Reason
+from mpsfm_core.data.decisions import ImageReason, Reason, reason_from_json
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
+from mpsfm_core.mapping.state import StateDict
 
 MIN_CONTRADICTING_IMAGES = 2
 """Number of rejected images whose depth must contradict a registered image before that image is
@@ -113,6 +114,40 @@ class RegistrationHistory:
         self.excluded_references[:] = False
         self._last_attempts.clear()
         self.clear_pose_rejections()
+
+    def state_dict(self) -> StateDict:
+        """Return the recorded attempts and rejections for a checkpoint."""
+        return {
+            "excluded_references": self.excluded_references,
+            "num_searches": list(self._num_searches.items()),
+            "last_attempts": [
+                {"image": image, "references": references, "pose": pose and {**vars(pose)}}
+                for image, (references, pose) in self._last_attempts.items()
+            ],
+            "contradicting": [
+                (image, sorted(new_images)) for image, new_images in self._contradicting.items()
+            ],
+            "rejected_poses": [
+                {"image": image, "pose": np.frombuffer(pose), "reason": reason.to_json()}
+                for (image, pose), reason in self._rejected_poses.items()
+            ],
+            "deregistered": sorted(self._deregistered),
+        }
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore the recorded attempts and rejections from a checkpoint."""
+        self.excluded_references = state["excluded_references"]
+        self._num_searches.update(state["num_searches"])
+        for attempt in state["last_attempts"]:
+            pose = attempt["pose"] and ScoredPose(**attempt["pose"])
+            self._last_attempts[attempt["image"]] = _Attempt(attempt["references"], pose)
+        self._contradicting.update(
+            (image, set(new_images)) for image, new_images in state["contradicting"]
+        )
+        for rejected in state["rejected_poses"]:
+            key = rejected["image"], rejected["pose"].tobytes()
+            self._rejected_poses[key] = reason_from_json(ImageReason, rejected["reason"])
+        self._deregistered.update(state["deregistered"])
 
 
 def _pose_key(image: int, pose: ScoredPose) -> tuple[int, bytes]:

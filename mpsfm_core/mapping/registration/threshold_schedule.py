@@ -5,6 +5,7 @@ from __future__ import annotations
 from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
+from mpsfm_core.mapping.state import StateDict
 
 RELAXATION_FACTOR = 1.2
 """Factor between the thresholds of two steps of the schedule. [reference]"""
@@ -66,6 +67,14 @@ class ThresholdSchedule:
     def reset(self) -> None:
         """Reset all thresholds to their initial values."""
         self._num_relaxations = 0
+
+    def state_dict(self) -> StateDict:
+        """Return the present step of the schedule for a checkpoint."""
+        return {"num_relaxations": self._num_relaxations}
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore the present step of the schedule from a checkpoint."""
+        self._num_relaxations = state["num_relaxations"]
 
     @property
     def _factor(self) -> float:

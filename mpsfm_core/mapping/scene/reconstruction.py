@@ -8,9 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, Float64, Int64, PinholeCamera, Pose
-from mpsfm_core.data.decisions import Reason
+from mpsfm_core.data.decisions import CameraReason, Reason, reason_from_json
+from mpsfm_core.mapping.state import StateDict, reasons_from_json, reasons_to_json
 
 _NO_ROWS = np.zeros(0, np.int64)
+_REASON_FIELDS = ("image_reasons", "pair_reasons")
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +43,19 @@ class RegisteredImage:
     estimated."""
     focal_reason: Reason | None = None
     """Reason (``CameraReason``) why the focal length is not refined, or None if it is refined."""
+
+    def state_dict(self) -> StateDict:
+        """Return the image for a checkpoint."""
+        parts = {"camera": {**vars(self.camera)}, "depth": {**vars(self.depth)}}
+        reason = self.focal_reason and self.focal_reason.to_json()
+        return {**vars(self), **parts, "focal_reason": reason}
+
+    @classmethod
+    def from_state_dict(cls, state: StateDict) -> RegisteredImage:
+        """Restore an image from a checkpoint."""
+        parts = {"camera": PinholeCamera(**state["camera"]), "depth": DepthPrior(**state["depth"])}
+        reason = state["focal_reason"] and reason_from_json(CameraReason, state["focal_reason"])
+        return cls(**{**state, **parts, "focal_reason": reason})
 
 
 @dataclass(frozen=True)
@@ -90,6 +105,18 @@ class Reconstruction:
         """Images whose registration was verified, without tentatively registered images."""
         return tuple(image for image in self.images if image.confirmed)
 
+    def state_dict(self) -> StateDict:
+        """Return the reconstruction for a checkpoint."""
+        images = [image.state_dict() for image in self.images]
+        return {**vars(self), "images": images, "metric": self.metric and {**vars(self.metric)}}
+
+    @classmethod
+    def from_state_dict(cls, state: StateDict) -> Reconstruction:
+        """Restore a reconstruction from a checkpoint."""
+        images = tuple(RegisteredImage.from_state_dict(image) for image in state["images"])
+        metric = state["metric"] and MetricScale(**state["metric"])
+        return cls(**{**state, "images": images, "metric": metric})
+
 
 @dataclass(frozen=True)
 class MappingReport:
@@ -105,6 +132,17 @@ class MappingReport:
     """Number of calls of each mapper step, summed over all mapper runs."""
     runs: int = 1
     """Number of mapper runs with different seeds."""
+
+    def state_dict(self) -> StateDict:
+        """Return the report for a checkpoint."""
+        reasons = {name: reasons_to_json(getattr(self, name)) for name in _REASON_FIELDS}
+        return {**vars(self), **reasons}
+
+    @classmethod
+    def from_state_dict(cls, state: StateDict) -> MappingReport:
+        """Restore a report from a checkpoint."""
+        reasons = {name: reasons_from_json(state[name]) for name in _REASON_FIELDS}
+        return cls(**{**state, **reasons})
 
 
 @dataclass(frozen=True, eq=False)

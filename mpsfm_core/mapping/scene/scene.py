@@ -15,6 +15,7 @@ from mpsfm_core.mapping.scene.graph import CorrespondenceGraph
 from mpsfm_core.mapping.scene.kernels import compute_max_triangulation_angles
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.mapping.scene.tracks import Tracks
+from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.optimize.depth_integration import RefinedDepth
 
 
@@ -332,6 +333,22 @@ class Scene:
                     depth_map.set_refined(refined)
                 if active:
                     depth_map.set_scale(scale)
+
+    def state_dict(self) -> StateDict:
+        """Return the state of the scene for a checkpoint."""
+        maps = [
+            {"scale": m.scale, "active": m.active, "refined": m.refined and {**vars(m.refined)}}
+            for m in self.maps
+        ]
+        return {**self.snapshot()._asdict(), "maps": maps}
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore the state of the scene from a checkpoint of the same mapping problem."""
+        maps = [
+            (m["scale"], m["active"], m["refined"] and RefinedDepth(**m["refined"]))
+            for m in state["maps"]
+        ]
+        self.restore(Snapshot(**{**state, "maps": maps}))
 
 
 def _depth_groups(problem: MappingProblem) -> Int64:

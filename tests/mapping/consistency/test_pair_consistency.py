@@ -10,8 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mpsfm_core.data import Bool, Float64, MappingProblem, PinholeCamera, VerifiedPair
-from mpsfm_core.mapping.consistency.pair_consistency import PairConsistency, PairConsistencyCheck
+from mpsfm_core.data import Float64, MappingProblem, PinholeCamera, VerifiedPair
+from mpsfm_core.mapping.consistency.pair_consistency import (
+    PairConsistency,
+    PairConsistencyCheck,
+    reweight_pairs,
+)
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.refinement import Refiner
@@ -73,7 +77,8 @@ def reweighted_problem(
         (0, 2): PairConsistency(turn @ pairs[2].rotation @ pairs[0].rotation, share),
         (1, 2): PairConsistency(pairs[2].rotation, 1.0),
     }
-    return problem, check.reweight_pairs(problem, np.ones(3, dtype=np.bool_))
+    weights = check.compute_pair_weights(problem, np.ones(3, dtype=np.bool_))
+    return problem, reweight_pairs(problem, weights)
 
 
 def test_pair_that_depth_and_consistent_pairs_contradict_is_removed() -> None:
@@ -103,22 +108,17 @@ def test_only_pairs_of_candidate_images_are_checked() -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
     check = checker(problem, FixedResults)
     check.results = {(1, 2): PairConsistency(np.eye(3), 0.5)}
-    reweighted = check.reweight_pairs(problem, np.array([False, True, True]))
-    assert reweighted.pairs[:2] == problem.pairs[:2]
-    np.testing.assert_allclose(reweighted.pairs[2].scores, 0.5 * problem.pairs[2].scores)
+    weights = check.compute_pair_weights(problem, np.array([False, True, True]))
+    assert weights.tolist() == [1.0, 1.0, 0.5]
 
 
-def test_globally_initialized_images_need_no_pair_check(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(
-        self: PairConsistencyCheck, problem: MappingProblem, reweighted: Bool
-    ) -> MappingProblem:
-        raise AssertionError("must not be called")
-
+def test_globally_initialized_images_need_no_pair_check() -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(4, 10.0))
-    monkeypatch.setattr(PairConsistencyCheck, "reweight_pairs", refuse)
-    (model,) = reconstruct(problem).reconstructions
-    assert len(model.images) == 4
+    result = reconstruct(problem)
+    assert len(result.reconstructions[0].images) == 4
+    assert "pair check" not in result.report.counts
     pair_alone = MapperOptions.model_validate(
         {"initialization": {"global_initialization": False}, "consistency": {"check_pairs": False}}
     )
-    assert reconstruct(problem, pair_alone).reconstructions
+    result = reconstruct(problem, pair_alone)
+    assert result.reconstructions and "pair check" not in result.report.counts

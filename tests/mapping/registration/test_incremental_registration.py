@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mpsfm_core.data import Bool, PinholeCamera
+from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.component import Component
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
-from mpsfm_core.mapping.model_maintenance import ModelMaintenance
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.registration.incremental_registration import IncrementalRegistration
 from mpsfm_core.mapping.registration.pose_estimation import select_distinct_poses
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
@@ -193,46 +191,18 @@ def test_image_contradicted_by_drift_is_registered_after_global_refinement(
         assert reason.code is ImageReason.CONTRADICTS_IMAGE
 
 
-class LimitedRegistration(IncrementalRegistration):
-    """Registers at most ``limit`` images in addition to the initial pair."""
-
-    limit = 0
-
-    def register_next_image(self, candidates: Bool, *, wide: bool = False) -> bool:
-        self.limit -= 1
-        return self.limit >= 0 and super().register_next_image(candidates, wide=wide)
-
-
-class FinalRejection(ModelMaintenance):
-    """Deregisters all but ``kept`` images at the end, if there are more than four."""
-
-    kept = 9
-
-    def check_all_images(self, limit: float, when: str) -> None:
-        images = self.scene.registered_images()
-        if len(images) > 4:
-            self.deregister(images[self.kept :].tolist(), "contradicted at the end")
-
-
-class Limited(Component):
-    maintenance_type, registration_type = FinalRejection, LimitedRegistration
-
-
-@pytest.mark.parametrize(
-    ("second_limit", "kept", "sizes"), [(9, 9, [6]), (9, 5, [5]), (9, 4, [4, 2]), (2, 9, [4, 2])]
-)
-def test_larger_component_takes_images_of_smaller_one(
-    second_limit: int, kept: int, sizes: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize(("is_connected", "sizes"), [(True, [6]), (False, [4, 2])])
+def test_larger_component_takes_images_of_smaller_one(is_connected: bool, sizes: list[int]) -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(6, 14.0))
+    if not is_connected:
+        pairs = tuple(p for p in problem.pairs if (p.image_a < 4) == (p.image_b < 4))
+        problem = replace(problem, pairs=pairs)
     options = MapperOptions.model_validate({"initialization": {"global_initialization": False}})
     mapper = Mapper(problem, options, NullMappingEvents())
-    mapper.component_type = Limited
-    monkeypatch.setattr(FinalRejection, "kept", kept)
-    monkeypatch.setattr(LimitedRegistration, "limit", 2)
+    mapper.unregistered[4:] = False
     mapper.reconstruct_component()
     assert [len(model.images) for model in mapper.models] == [4]
-    monkeypatch.setattr(LimitedRegistration, "limit", second_limit)
+    mapper.unregistered[4:] = True
     mapper.reconstruct_component()
     assert [len(model.images) for model in mapper.models] == sizes
     images = [image.index for model in mapper.models for image in model.images]
