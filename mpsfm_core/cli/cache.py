@@ -18,6 +18,7 @@ _DAY_S = 86_400
 PARTS = {
     "extraction": "results of providers, computed again if missing",
     "mapping": "checkpoints of interrupted runs",
+    "run": "results of providers without version, kept during a run",
     "weights": "downloaded networks",
 }
 """Description of each subfolder of the cache."""

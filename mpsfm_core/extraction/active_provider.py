@@ -67,11 +67,16 @@ class ActiveProvider:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Names, versions, options, seed and file hashes of the provider and its wrappers."""
+        """Names, code, versions, options, seed and file hashes of the provider and wrappers."""
         with self._lock:
             if self._identity is None:
                 self._identity = self._identify()
             return self._identity
+
+    @property
+    def is_reusable(self) -> bool:
+        """True if later runs may reuse results, because the code of the provider is known."""
+        return all(block["code"] is not None for block in self.identity["providers"])
 
     @property
     def instance(self) -> Any:
@@ -147,6 +152,7 @@ class ActiveProvider:
                     "kind": kind,
                     "name": backend.use,
                     "version": self._registry.version(kind, backend.use),
+                    "code": self._registry.code_keys(kind, backend.use),
                     "options": values,
                     "files": self._hashes(kind, backend.use, values),
                 }

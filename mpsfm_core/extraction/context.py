@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import logging
+import shutil
+import weakref
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from tempfile import mkdtemp
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -77,7 +82,9 @@ class ExtractionContext:
             local: If true, the stage runs on this machine even if a remote executor is configured.
         """
         workers = min((p.workers for p in providers), default=worker_count(self.config.runtime))
-        is_cached = providers and not any(provider.can("uncached") for provider in providers)
+        is_cached = providers and all(
+            provider.is_reusable and not provider.can("uncached") for provider in providers
+        )
         ahead = (
             self.run_remotely(stage, items)
             if self.run_remotely and is_cached and not local
@@ -111,7 +118,8 @@ class ExtractionContext:
         """
         key = self.key(provider, inputs)
         uncached = provider.can("uncached")
-        cached = None if uncached else self.cache.load(provider.kind, key, cls)
+        cache = self.cache if uncached or provider.is_reusable else self._run_cache
+        cached = None if uncached else cache.load(provider.kind, key, cls)
         if cached is not None:
             provider.count_cached(key)
             return cached
@@ -128,8 +136,17 @@ class ExtractionContext:
             self._record_failure(images, error)
             return cast(Result, EMPTY_RESULTS[cls]())
         if not uncached:
-            self.cache.store(provider.kind, key, value)
+            cache.store(provider.kind, key, value)
         return value
+
+    @cached_property
+    def _run_cache(self) -> Cache:
+        """Cache that is deleted with the context, for providers whose code is unknown."""
+        parent = self.cache.folder.parent / RUNS
+        parent.mkdir(parents=True, exist_ok=True)
+        folder = mkdtemp(dir=parent)
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        return Cache(Path(folder))
 
     def _check_known_failure(self, key: str) -> None:
         """Raise ProviderRunError if another worker of this run failed on the same result."""

@@ -41,6 +41,7 @@ from mpsfm_core.providers.environments.environment import all_environments
 from mpsfm_core.providers.environments.remote_provider import EnvironmentHooks, remote_providers
 from mpsfm_core.providers.first_party import requirement_for
 from mpsfm_core.providers.provider_config import ProviderConfig
+from mpsfm_core.providers.source_hash import hash_requirement, hash_source
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from mpsfm_core.providers.validation import validate_filtered_pairs
 
@@ -98,6 +99,8 @@ class _Entry:
     """Reason why the provider is unavailable, or an empty string."""
     hint: str = ""
     """Advice for the user on how to make the provider available."""
+    is_versioned: bool = True
+    """False if the provider is defined in this process, without a version of its code."""
 
     @property
     def label(self) -> str:
@@ -154,7 +157,7 @@ class Registry:
         *,
         name: str | None = None,
         distribution: str = "this process",
-        version: str = "0",
+        version: str | None = None,
     ) -> None:
         """Register a plugin that is defined in this process, without an installed package.
 
@@ -162,32 +165,37 @@ class Registry:
             plugin: Plugin module, or object with methods that are marked by ``@hookimpl``.
             name: Name of the plugin, by default the name of the module or class ``plugin``.
             distribution: Name of the pip package that ``mpsfm plugins list`` shows.
-            version: Version of the pip package that ``mpsfm plugins list`` shows.
+            version: Version of the plugin's code, as in :meth:`add`.
 
         Raises:
             ProviderError: The plugin fails to load or is already registered.
         """
         name = name or str(getattr(plugin, "__name__", type(plugin).__name__))
         try:
-            loaded = inspect_plugin(plugin, name, distribution, version)
+            loaded = inspect_plugin(plugin, name, distribution, version or "0")
         except Exception as error:
             raise ProviderError(f"plugin {name!r}: {type(error).__name__}: {error}") from error
         if self._manager.is_registered(plugin) or self._manager.has_plugin(_label(loaded)):
             raise ProviderError(f"plugin {name!r} is registered already")
-        self._add(loaded)
+        self._add(loaded, is_versioned=version is not None)
 
     def add(
-        self, *specs: ProviderSpec, distribution: str = "this process", version: str = "0"
+        self, *specs: ProviderSpec, distribution: str = "this process", version: str | None = None
     ) -> None:
         """Register provider specifications without a plugin; their factory may be a callable.
 
         Args:
             specs: Specifications of the providers to register.
             distribution: Name of the pip package that ``mpsfm plugins list`` shows.
-            version: Version of the pip package that ``mpsfm plugins list`` shows.
+            version: Version of the code of the providers, which changes with the code. Without a
+                version, later runs do not reuse results of callable factories from the cache.
         """
         for spec in specs:
-            self._entries.append(_Entry(spec, distribution, version, *find_spec_fault(spec)))
+            fault = find_spec_fault(spec)
+            is_versioned = version is not None
+            self._entries.append(
+                _Entry(spec, distribution, version or "0", *fault, is_versioned=is_versioned)
+            )
 
     def status(self) -> tuple[ProviderStatus, ...]:
         """List all providers by kind and name, then plugins without usable providers."""
@@ -223,6 +231,28 @@ class Registry:
         """Return the pip package and version of a provider, such as ``mpsfm-onnx 0.1.0``."""
         entry = self._entry(kind, name)
         return f"{entry.distribution} {entry.version}"
+
+    def code_keys(self, kind: Kind, name: str) -> dict[str, str] | None:
+        """Return hashes of a provider's code and versions of its required packages.
+
+        Returns:
+            Hash or version by module, or None if the code cannot be identified. The code of a
+            callable factory in this process has no identity unless it is registered with a version.
+        """
+        entry = self._entry(kind, name)
+        factory = entry.spec.factory
+        if hasattr(factory, "code_keys"):  # a provider of another Python environment
+            keys: dict[str, str] | None = factory.code_keys()
+            return keys
+        found: dict[str, str | None] = {}
+        if isinstance(factory, str):
+            module = factory.partition(":")[0]
+            found[module] = hash_source(module)
+        elif not entry.is_versioned:
+            return None
+        found |= {module: hash_requirement(module) for module in entry.spec.requires}
+        known = {module: key for module, key in found.items() if key is not None}
+        return known if len(known) == len(found) else None
 
     def validate_options(
         self,
@@ -399,7 +429,7 @@ class Registry:
         if remotes:
             self._manager.register(EnvironmentHooks(remotes), "environments")
 
-    def _add(self, plugin: LoadedPlugin) -> None:
+    def _add(self, plugin: LoadedPlugin, *, is_versioned: bool = True) -> None:
         origin = (plugin.distribution, plugin.version)
         status = ProviderStatus("plugin", plugin.name, *origin, capabilities=plugin.hooks)
         fault = plugin.fault
@@ -409,7 +439,10 @@ class Registry:
             self._manager.register(plugin.module, _label(plugin))
             for spec in plugin.specs:
                 if isinstance(spec, ProviderSpec):
-                    self._entries.append(_Entry(spec, *origin, *find_spec_fault(spec)))
+                    fault_of_spec = find_spec_fault(spec)
+                    self._entries.append(
+                        _Entry(spec, *origin, *fault_of_spec, is_versioned=is_versioned)
+                    )
                 else:
                     fault = f"lists a {type(spec).__name__} among its providers"
         if fault:

@@ -12,7 +12,9 @@ import logging
 import os
 from collections.abc import Callable
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
+from types import FunctionType
 from typing import Any, TypeVar
 
 import numba
@@ -42,7 +44,9 @@ def kernel(**options: Any) -> Callable[[F], F]:
         _choose_cache_folder()
         _discard_unreadable_indices()
         try:
-            return _compiled(function, cache=True, **options)
+            compiled = _compiled(function, cache=True, **options)
+            _add_dependencies(compiled)
+            return compiled
         except RuntimeError:  # numba found no writable cache folder
             _warn_without_cache()
             return _compiled(function, **options)
@@ -60,6 +64,39 @@ def helper(**options: Any) -> Callable[[F], F]:
 def _compiled(function: F, **options: Any) -> F:
     compiled: F = njit(**_ALWAYS, **options)(function)
     return compiled
+
+
+def _add_dependencies(compiled: Any) -> None:
+    """Make a cached kernel depend on the constants and functions of other modules that it uses.
+
+    By default, numba compiles a kernel again only if the file of the kernel itself changes.
+    """
+    file = compiled._cache._cache_file
+    file._source_stamp = (file._source_stamp, describe_globals(compiled.py_func))
+
+
+def describe_globals(function: Callable[..., Any]) -> list[str]:
+    """Describe values of constants and code of functions that a function uses from its module.
+
+    Functions are followed recursively into other modules of the package.
+    """
+    described: dict[str, str] = {}
+    pending = [function]
+    while pending:
+        current = pending.pop()
+        for name in current.__code__.co_names:
+            value = current.__globals__.get(name)
+            value = getattr(value, "py_func", value)
+            key = f"{current.__module__}.{name}"
+            if isinstance(value, FunctionType) and key not in described:
+                if value.__module__.partition(".")[0] == __package__.partition(".")[0]:
+                    code = value.__code__
+                    content = (code.co_code, code.co_names, code.co_varnames, code.co_consts)
+                    described[key] = sha256(repr(content).encode()).hexdigest()
+                    pending.append(value)
+            elif isinstance(value, (int, float, str, tuple)):
+                described[key] = repr(value)
+    return [f"{key} = {text}" for key, text in sorted(described.items())]
 
 
 @cache

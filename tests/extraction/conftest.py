@@ -145,6 +145,7 @@ class World:
             spec("matcher", "dense-depth", TrueDenseDepth, "dense", "pair-depth"),
             spec("retrieval", "truth", TrueRetrieval),
             spec("mask", "left", LeftMask),
+            version="1",
         )
 
 

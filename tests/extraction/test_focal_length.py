@@ -27,7 +27,7 @@ def estimated(world):
             return ESTIMATES[view.name]
 
     able = frozenset({"estimates-focal"})
-    world.registry.add(ProviderSpec("depth", "sees", Sees, capabilities=able))
+    world.registry.add(ProviderSpec("depth", "sees", Sees, capabilities=able), version="1")
 
     def run(provider="sees", intrinsics=None):
         images = load_images(world.root / "images", intrinsics)

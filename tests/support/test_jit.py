@@ -7,6 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from mpsfm_core.optimize import resection
+from mpsfm_core.support import jit
+
 MODULE = """
 from typing import NamedTuple
 import numpy as np
@@ -37,3 +42,15 @@ def test_kernel_whose_cached_type_was_renamed_is_compiled_again(tmp_path: Path) 
             check=False,
         )
         assert run.stdout.strip() == "3.0", run.stderr
+
+
+def test_kernel_depends_on_constants_and_functions_that_it_uses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Numba compares only the file of a kernel, not the files that the kernel imports from."""
+    function = resection.linearize_pose.py_func  # type: ignore[attr-defined]
+    before = jit.describe_globals(function)
+    assert before == jit.describe_globals(function)
+    monkeypatch.setattr(resection, "MIN_DEPTH", 2.0)
+    changed = set(jit.describe_globals(function)) - set(before)
+    assert changed == {"mpsfm_core.optimize.resection.MIN_DEPTH = 2.0"}

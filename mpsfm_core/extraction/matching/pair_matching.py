@@ -38,6 +38,7 @@ from mpsfm_core.extraction.matching.verification import CALIBRATED, TwoViewGeome
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.providers import validation
+from mpsfm_core.providers.source_hash import hash_module
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,6 +163,7 @@ class PairVerifier:
             std_px,
             seed,
             pycolmap.__version__,
+            hash_module(verify_matches.__module__),
         ]
         key = content_key(parts, digest(xy_a), digest(xy_b))
         found = self._context.cache.load("two-view", key, TwoViewGeometry)

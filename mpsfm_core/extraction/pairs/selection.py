@@ -20,6 +20,7 @@ from mpsfm_core.extraction.pairs import pairing as pairs
 from mpsfm_core.extraction.pairs import similarity as pair_similarity
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.providers import validation
+from mpsfm_core.providers.source_hash import hash_module
 
 
 class PairSelection:
@@ -134,7 +135,7 @@ class PairSelection:
     def _match_scores(self, table: FeatureTable) -> Float64:
         context, count = self._context, len(self._context.images)
         key = content_key(
-            pair_similarity.NUM_DESCRIPTORS, [table.key(index) for index in range(count)]
+            hash_module(pair_similarity.__name__), [table.key(index) for index in range(count)]
         )
         cached: Float64 | None = context.cache.load("pair-similarity", key, np.ndarray)
         if cached is not None:

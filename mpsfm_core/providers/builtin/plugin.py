@@ -33,6 +33,7 @@ def _matching() -> list[ProviderSpec]:
             factory="mpsfm_core.providers.builtin.sift:Sift",
             options=SiftOptions,
             summary="RootSIFT of COLMAP on the CPU",
+            requires=("pycolmap",),
             code_license=_LICENSE,
             tags=("sift",),
         ),

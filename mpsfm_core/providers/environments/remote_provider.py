@@ -189,6 +189,11 @@ class _Factory:
         values = {} if options is None else options.model_dump()
         return RemoteProvider(self.location, values, context)
 
+    def code_keys(self) -> dict[str, str] | None:
+        """Return hashes of the provider's code, see :meth:`Registry.code_keys`."""
+        keys: dict[str, str] | None = self.location.ask("code_keys")
+        return keys
+
 
 @dataclass(frozen=True)
 class _Weights:

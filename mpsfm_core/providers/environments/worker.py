@@ -77,6 +77,8 @@ class ProviderServer:
             return None
         if action == "setup":
             return _setup(registry, kind, name, request["folder"])
+        if action == "code_keys":
+            return registry.code_keys(kind, name)
         values = request["values"]
         if action == "options":
             options = registry.validate_options(kind, name, values, ())
