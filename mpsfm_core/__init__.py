@@ -10,36 +10,85 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from mpsfm_core.api import load_config, reconstruct
 from mpsfm_core.data import (
     DenseMatches,
     DepthPrior,
     Features,
+    MappingProblem,
     MultiViewPrior,
     NormalPrior,
     PairDepth,
     PairMatches,
     PinholeCamera,
     SparseMatches,
+    VerifiedPair,
     View,
 )
-from mpsfm_core.data.errors import InputError, MpsfmError
+from mpsfm_core.data.errors import Cancelled, InputError, MpsfmError
 from mpsfm_core.data.options import Options
 from mpsfm_core.providers import ProviderContext, ProviderSpec, WeightsFile, hookimpl
+from mpsfm_core.providers.provider_config import ProviderConfig
 
 if TYPE_CHECKING:
-    from mpsfm_core.config import Config
-    from mpsfm_core.pipeline.run import ReconstructionResult
+    from mpsfm_core.api import (
+        build_mesh,
+        densify,
+        evaluate,
+        extract_features,
+        from_colmap,
+        fuse,
+        load_images,
+        match_images,
+        predict_priors,
+        run_mapper,
+        to_colmap,
+    )
+    from mpsfm_core.config import Config, load_config
+    from mpsfm_core.extraction.match_graph import MatchGraph, Priors
+    from mpsfm_core.extraction.problem_builder import build_problem
+    from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
+    from mpsfm_core.pipeline.run import ReconstructionResult, reconstruct
     from mpsfm_core.providers.registry import Registry
+    from mpsfm_core.results.exports.formats import export
 
     __version__: str
 
+_LAZY_MODULES = {
+    "mpsfm_core.api": (
+        "build_mesh",
+        "densify",
+        "evaluate",
+        "extract_features",
+        "from_colmap",
+        "fuse",
+        "load_images",
+        "match_images",
+        "predict_priors",
+        "run_mapper",
+        "to_colmap",
+    ),
+    "mpsfm_core.config": ("Config", "load_config"),
+    "mpsfm_core.extraction.match_graph": ("MatchGraph", "Priors"),
+    "mpsfm_core.extraction.problem_builder": ("build_problem",),
+    "mpsfm_core.mapping.scene.reconstruction": ("MappingResult", "Reconstruction"),
+    "mpsfm_core.pipeline.run": ("ReconstructionResult", "reconstruct"),
+    "mpsfm_core.providers.registry": ("Registry",),
+    "mpsfm_core.results.exports.formats": ("export",),
+}
+"""Exported names by the module that defines them, which is imported when a name is first used."""
+
+_LAZY_NAMES = {name: module for module, names in _LAZY_MODULES.items() for name in names}
+
 __all__ = [
+    "Cancelled",
     "Config",
     "DenseMatches",
     "DepthPrior",
     "Features",
     "InputError",
+    "MappingProblem",
+    "MappingResult",
+    "MatchGraph",
     "MpsfmError",
     "MultiViewPrior",
     "NormalPrior",
@@ -47,33 +96,43 @@ __all__ = [
     "PairDepth",
     "PairMatches",
     "PinholeCamera",
+    "Priors",
+    "ProviderConfig",
     "ProviderContext",
     "ProviderSpec",
+    "Reconstruction",
     "ReconstructionResult",
     "Registry",
     "SparseMatches",
+    "VerifiedPair",
     "View",
     "WeightsFile",
     "__version__",
+    "build_mesh",
+    "build_problem",
+    "densify",
+    "evaluate",
+    "export",
+    "extract_features",
+    "from_colmap",
+    "fuse",
     "hookimpl",
     "load_config",
+    "load_images",
+    "match_images",
+    "predict_priors",
     "reconstruct",
+    "run_mapper",
+    "to_colmap",
 ]
-
-_LAZY_MODULES = {
-    "Config": "mpsfm_core.config",
-    "ReconstructionResult": "mpsfm_core.pipeline.run",
-    "Registry": "mpsfm_core.providers.registry",
-}
-"""Module of each exported name that is imported only when the name is first used."""
 
 
 def __getattr__(name: str) -> Any:
     """Import an exported name at first use, or read the version of the installed package."""
     if name == "__version__":
         value: Any = importlib.import_module("mpsfm_core.providers.registry").core_version()
-    elif name in _LAZY_MODULES:
-        value = getattr(importlib.import_module(_LAZY_MODULES[name]), name)
+    elif name in _LAZY_NAMES:
+        value = getattr(importlib.import_module(_LAZY_NAMES[name]), name)
     else:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     globals()[name] = value

@@ -1,100 +1,506 @@
-"""Public functions of the package ``mpsfm_core``, which re-exports them.
+"""Stages of a reconstruction as functions, which ``mpsfm_core`` exports.
 
-Each function imports its dependencies when called, because the descriptor module of a plugin
-imports ``mpsfm_core``, and listing plugins must not load slow modules such as the mapper.
+:func:`mpsfm_core.reconstruct` runs the same stages in a row::
+
+    images = load_images("photos/")
+    features = extract_features(images)
+    matches = match_images(images, features)
+    priors = predict_priors(images, matches=matches)
+    problem = build_problem(images, matches, depth=priors.depth, normals=priors.normals)
+    result = run_mapper(problem)
+    model = to_colmap(result.reconstructions[0], problem, images)
+
+Every stage accepts arrays and objects of the caller instead of the results of earlier stages. A
+provider argument is the name of an installed provider, a configuration block, or an object with the
+method of its kind. The package ``mpsfm_core`` imports this module when a stage is first used.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
-if TYPE_CHECKING:
-    from mpsfm_core.config import Config
-    from mpsfm_core.pipeline.run import ReconstructionResult
-    from mpsfm_core.providers.registry import Registry
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from mpsfm_core.config import Config
+from mpsfm_core.config.provider_arguments import Provider, configure
+from mpsfm_core.data import DepthPrior, Features, MappingProblem, Pose, View
+from mpsfm_core.data.errors import InputError, did_you_mean
+from mpsfm_core.data.events import EventCallback
+from mpsfm_core.data.options import parse_settings
+from mpsfm_core.dense.densify import densify as densify_reconstruction
+from mpsfm_core.dense.fusion import FusedPointCloud, fuse_depth_maps
+from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
+from mpsfm_core.dense.options import DenseOptions, MeshOptions
+from mpsfm_core.evaluation import CONVENTIONS, read_poses, reconstruction_poses
+from mpsfm_core.evaluation import evaluate as evaluate_poses
+from mpsfm_core.extraction import runner
+from mpsfm_core.extraction.context import ExtractionContext
+from mpsfm_core.extraction.features import FeatureSet, FeatureSource, FeatureTable, GivenFeatures
+from mpsfm_core.extraction.match_graph import MatchGraph, NamePair, Priors
+from mpsfm_core.geometry.pycolmap_conversion import pose_from
+from mpsfm_core.inputs import images as image_inputs
+from mpsfm_core.inputs.images import ImageSet
+from mpsfm_core.inputs.video import extract_frames, is_video
+from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
+from mpsfm_core.pipeline.provider_resolution import resolve_providers
+from mpsfm_core.pipeline.stages import Stages
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.results.colmap_model import build_pinhole_model, reconstruction_from_model
+from mpsfm_core.results.options import ResultOptions
+from mpsfm_core.results.original_images import OriginalImages
+from mpsfm_core.results.writer import ComponentResult
+from mpsfm_core.support.threads import limit_threads
+
+PathLike = str | Path
 
 
-def load_config(
-    name_or_path: str | Path, overrides: Sequence[str] = (), registry: Registry | None = None
-) -> Config:
-    """Read, merge and check a configuration.
-
-    Args:
-        name_or_path: Name of a shipped configuration, or a YAML file.
-        overrides: Settings such as ``"runtime.workers=2"``, which replace those of the file.
-        registry: Providers that the configuration may name, by default all installed ones.
-
-    Returns:
-        The configuration, with the default value of every setting that the file omits.
-
-    Raises:
-        ConfigError: a setting is wrong. The error message has file and line of the wrong setting
-            and the nearest valid key.
-    """
-    from mpsfm_core.config import load_config
-
-    return load_config(name_or_path, overrides, registry)
-
-
-def reconstruct(
-    images: str | Path,
-    output: str | Path | None = None,
-    config: str | Path | Config = "default",
+def load_images(
+    images: PathLike | Mapping[str, NDArray[Any]],
     *,
-    intrinsics: str | Path | None = None,
-    image_list: str | Path | None = None,
-    poses: str | Path | None = None,
+    cameras: Mapping[str, Any] | Any | None = None,
+    intrinsics: PathLike | None = None,
+    image_list: PathLike | None = None,
+    output: PathLike | None = None,
+    config: PathLike | Config = "default",
     overrides: Sequence[str] = (),
     registry: Registry | None = None,
-    fresh: bool = False,
-    database: str | Path | None = None,
-    hloc: tuple[str | Path, str | Path] | None = None,
-) -> ReconstructionResult:
-    """Reconstruct a folder of photos, or a video.
+    on_event: EventCallback | None = None,
+) -> ImageSet:
+    """Load images and their cameras from a folder, a video, or arrays.
 
     Args:
-        images: Folder of photos, including subfolders; or a video, whose keyframes are selected
-            by ``inputs.video`` and written into ``frames/`` of the output.
-        output: Result folder, used by one run at a time, or None to write nothing.
-        config: Name of a shipped configuration, a YAML file, or a loaded configuration.
-        intrinsics: Camera intrinsics as ``intrinsics.yaml``, a COLMAP model or ``transforms.json``.
-            If missing, focal lengths are taken from ``poses``, else from EXIF, else estimated by
-            the depth provider, else set to a default.
+        images: Folder of photos, a video, or (H, W, 3) uint8 RGB pixels by image name.
+        cameras: Camera of all arrays, or of each array by name, as
+            :class:`~mpsfm_core.PinholeCamera` or ``pycolmap.Camera``. Without cameras, a guessed
+            focal length is refined.
+        intrinsics: Cameras of the photos as ``intrinsics.yaml``, a COLMAP model or
+            ``transforms.json``, by default from EXIF.
         image_list: Text file with one image name per line, by default all images of the folder.
-        poses: COLMAP model or ``transforms.json`` with poses of some or all images;
-            ``mapping.known_poses`` chooses whether known poses are fixed or refined.
-        overrides: Settings such as ``"runtime.workers=2"``; not allowed with a loaded
-            configuration.
-        registry: Providers that the configuration may name, by default all installed ones.
-        fresh: If true, ignore the checkpoint of an interrupted run and start mapping again.
-        database: COLMAP database whose keypoints and matches replace features and matchers. The
-            matches of the database are verified again. The cameras of the database are ignored
-            unless ``intrinsics`` names the database too.
-        hloc: Features file and matches file of hloc, as an alternative to ``database``.
+        output: Folder into which the keyframes of a video are written.
+        config: Configuration whose block ``inputs`` is used.
+        overrides: Settings such as ``"inputs.max_image_size=1600"``.
+        registry: Installed providers.
+        on_event: Function that receives the progress.
 
     Returns:
-        COLMAP models of the original photos, arrays of the mapper, and the summary.
+        Images, which are decoded and undistorted when they are used.
 
     Raises:
-        InputError: images, intrinsics, poses, configuration, weights or output are wrong. Missing
-            providers are found before any image is decoded.
-        ReconstructionError: no reconstruction was possible; the reasons are in ``summary.json``.
-        MpsfmError: a provider failed or violated the provider contract, or the disk is full.
-    """
-    from mpsfm_core.pipeline.run import reconstruct
+        InputError: images or cameras cannot be read, or a video has no ``output``.
 
-    return reconstruct(
-        images,
-        output,
-        config,
-        intrinsics=intrinsics,
-        image_list=image_list,
-        poses=poses,
-        overrides=overrides,
-        registry=registry,
-        fresh=fresh,
-        database=database,
-        hloc=hloc,
-    )
+    Example:
+        >>> images = mpsfm.load_images("photos/")
+        >>> images = mpsfm.load_images({"a": rgb_a, "b": rgb_b}, cameras=camera)
+    """
+    config, registry = configure(config, registry, overrides)
+    if isinstance(images, Mapping):
+        if intrinsics is not None or image_list is not None:
+            raise TypeError("arrays have cameras, not intrinsics or image_list")
+        return image_inputs.images_from_arrays(images, cameras, config.inputs)
+    if cameras is not None:
+        raise TypeError("cameras belong to arrays; give intrinsics for a folder or a video")
+    folder, stages = Path(images), Stages(registry, on_event)
+    if is_video(folder):
+        if output is None:
+            raise InputError(f"{folder}: the frames of a video need an output folder")
+        with stages.stage("video"):
+            progress = partial(stages.stage_progress, "video")
+            folder = extract_frames(folder, Path(output), config.inputs.video, progress)
+    cameras_file = None if intrinsics is None else Path(intrinsics)
+    names_file = None if image_list is None else Path(image_list)
+    with stages.stage("inputs"):
+        return image_inputs.load_images(folder, cameras_file, names_file, config.inputs)
+
+
+def extract_features(
+    images: ImageSet,
+    features: Provider | None = None,
+    *,
+    masks: Sequence[Provider] | None = None,
+    config: PathLike | Config = "default",
+    overrides: Sequence[str] = (),
+    registry: Registry | None = None,
+    on_event: EventCallback | None = None,
+) -> FeatureSet:
+    """Detect and describe local features of all images.
+
+    Args:
+        images: Result of :func:`load_images`.
+        features: Provider of features, by default that of the configuration.
+        masks: Mask providers; features in masked areas are removed.
+        config: Configuration with providers and options.
+        overrides: Settings such as ``"features.options.max_keypoints=2048"``.
+        registry: Installed providers.
+        on_event: Function that receives the progress.
+
+    Returns:
+        Keypoints, descriptors, scores and scales by image name.
+
+    Raises:
+        InputError: the provider or its weights are missing.
+        ProviderRunError: the provider failed on an image.
+
+    Example:
+        >>> features = mpsfm.extract_features(images, "sift")
+        >>> features["view_0.jpg"].descriptors.shape
+        (4096, 128)
+    """
+    config, registry = configure(config, registry, overrides, masks=masks, features=features)
+    if config.features is None:
+        raise InputError("features: the configuration has no features provider; name one")
+    with _extraction(images, config, registry, ("features", "masks"), on_event) as context:
+        assert context.config.features is not None
+        table = FeatureTable(context, context.config.features)
+        table.extract()
+    return FeatureSet(images.names, table, context.config.features)
+
+
+def match_images(
+    images: ImageSet,
+    features: FeatureSet | Mapping[str, Features] | None = None,
+    matcher: Provider | None = None,
+    *,
+    pairs: Sequence[NamePair] | None = None,
+    retrieval: Provider | None = None,
+    masks: Sequence[Provider] | None = None,
+    config: PathLike | Config = "default",
+    overrides: Sequence[str] = (),
+    registry: Registry | None = None,
+    on_event: EventCallback | None = None,
+) -> MatchGraph:
+    """Match image pairs, and verify the matches.
+
+    Args:
+        images: Result of :func:`load_images`.
+        features: Result of :func:`extract_features`, or own features by image name. None extracts
+            the features of the configuration.
+        matcher: Matcher of features or of pixels, by default that of the configuration. The default
+            for own features is ``mutual-nearest``.
+        pairs: Pairs of image names to match, by default selected by the block ``pairs``.
+        retrieval: Provider of global image descriptors for the selection of pairs.
+        masks: Mask providers; dense matches in masked areas are removed.
+        config: Configuration with providers and options.
+        overrides: Settings such as ``"pairs.mode=sequential"``.
+        registry: Installed providers.
+        on_event: Function that receives the progress.
+
+    Returns:
+        Matches with scores, verified pairs with relative poses, and reasons of dropped pairs.
+
+    Raises:
+        InputError: a provider is missing, or matcher and features are incompatible.
+        ProviderRunError: a provider failed on an image or pair.
+
+    Example:
+        >>> matches = mpsfm.match_images(images, features, "mutual-nearest")
+        >>> len(matches.verified["view_0.jpg", "view_1.jpg"])
+        208
+    """
+    provider = features.provider if isinstance(features, FeatureSet) else None
+    if features is not None and matcher is None and provider is None:
+        matcher = "mutual-nearest"
+    config, registry = configure(config, registry, overrides, masks=masks, retrieval=retrieval)
+    if features is not None:
+        known = provider is not None and provider.use in registry.names("features")
+        matcher = matcher if known or matcher is not None else "mutual-nearest"
+        update = {"features": provider if known else None, "fast_pass": None}
+        config = config.model_copy(update=update)
+    config, registry = configure(config, registry, matcher=matcher)
+    chosen = None if pairs is None else _rows_of_pairs(images, pairs)
+    blocks = ("features", "matcher", "dense_matcher", "retrieval", "masks")
+    with _extraction(images, config, registry, blocks, on_event) as context:
+        source: FeatureSource | None
+        if features is None:
+            source = runner.feature_table(context)
+        elif isinstance(features, FeatureSet):
+            source = features.source
+        else:
+            source = GivenFeatures(images.names, features)
+        return runner.match_images(context, source, pairs=chosen)
+
+
+def predict_priors(
+    images: ImageSet,
+    depth: Provider | None = None,
+    normals: Provider | None = None,
+    *,
+    multiview: Provider | None = None,
+    matches: MatchGraph | None = None,
+    masks: Sequence[Provider] | None = None,
+    config: PathLike | Config = "default",
+    overrides: Sequence[str] = (),
+    registry: Registry | None = None,
+    on_event: EventCallback | None = None,
+) -> Priors:
+    """Predict depth and normals of all images, with calibrated variances.
+
+    Args:
+        images: Result of :func:`load_images`.
+        depth: Depth provider, by default that of the configuration.
+        normals: Normals provider, by default that of the configuration. A depth provider without
+            normals is combined with normals of planes fitted to the depth.
+        multiview: Multi-view network, for ``depth="multiview"``.
+        matches: Match graph, from which a multi-view network gets its groups of images.
+        masks: Mask providers; priors in masked areas are invalid.
+        config: Configuration with providers and options.
+        overrides: Settings such as ``"extraction.integration_size=300"``.
+        registry: Installed providers.
+        on_event: Function that receives the progress.
+
+    Returns:
+        Depth and normals with variance by image name, on the grid of the mapper.
+
+    Raises:
+        InputError: a provider or its weights are missing.
+        ProviderRunError: a provider failed on an image.
+
+    Example:
+        >>> priors = mpsfm.predict_priors(images, depth=MyDepth())
+        >>> priors.depth["view_0.jpg"].variance.shape
+        (290, 387)
+    """
+    providers = {"depth": depth, "normals": normals, "multiview": multiview}
+    config, registry = configure(config, registry, overrides, masks=masks, **providers)
+    blocks = ("depth", "normals", "multiview", "masks")
+    with _extraction(images, config, registry, blocks, on_event) as context:
+        return runner.predict_priors(context, matches)
+
+
+def run_mapper(
+    problem: MappingProblem,
+    options: MapperOptions | Mapping[str, Any] | None = None,
+    *,
+    on_event: EventCallback | None = None,
+) -> MappingResult:
+    """Reconstruct poses, points and refined depth maps.
+
+    Args:
+        problem: Result of :func:`build_problem`.
+        options: Options of the mapper, or settings such as ``{"known_poses": "fixed"}``.
+        on_event: Function that receives the progress, and may raise
+            :class:`~mpsfm_core.Cancelled`.
+
+    Returns:
+        Reconstructions of the connected components, the largest first, and the reason of each image
+        that is not registered.
+
+    Raises:
+        SettingsError: an option is unknown or out of range.
+
+    Example:
+        >>> result = mpsfm.run_mapper(problem, {"known_poses": "fixed"})
+        >>> largest = result.reconstructions[0]
+        >>> largest.poses["a"], largest.images[0].depth.variance
+    """
+    if isinstance(options, Mapping):
+        options = parse_settings(MapperOptions, options, ())
+    stages = Stages(Registry(), on_event)
+    with stages.stage("mapping"):
+        return mapper.reconstruct(problem, options, stages)
+
+
+def to_colmap(
+    reconstruction: Reconstruction, problem: MappingProblem, images: ImageSet | None = None
+) -> pycolmap.Reconstruction:
+    """Convert a reconstruction to a COLMAP model.
+
+    Args:
+        reconstruction: Element of the result of :func:`run_mapper`.
+        problem: Mapping problem, which has the keypoints.
+        images: Images of the problem. With images, the model has their original cameras and colored
+            points; without, pinhole cameras and black points.
+
+    Example:
+        >>> mpsfm.to_colmap(result.reconstructions[0], problem).write("sparse/")
+    """
+    if images is None:
+        return build_pinhole_model(reconstruction, problem)
+    return ComponentResult.of(reconstruction, OriginalImages(images, problem)).model
+
+
+def from_colmap(
+    model: pycolmap.Reconstruction,
+    images: ImageSet | None = None,
+    depth: Mapping[str, DepthPrior] | None = None,
+) -> Reconstruction:
+    """Convert a COLMAP model to a reconstruction, for :func:`densify` and :func:`build_mesh`.
+
+    Args:
+        model: COLMAP model with poses and points.
+        images: Images of the model, which are needed for cameras with lens distortion.
+        depth: Depth maps by image name in units of the model. The default is a constant depth whose
+            std covers the depths of the image's points.
+
+    Raises:
+        InputError: an image has lens distortion and no image set, or neither points nor depth.
+
+    Example:
+        >>> reconstruction = mpsfm.from_colmap(pycolmap.Reconstruction("sparse/0"), images)
+        >>> dense = mpsfm.densify(reconstruction, images)
+    """
+    cameras = {} if images is None else {image.name: image.pinhole for image in images}
+    return reconstruction_from_model(model, cameras, depth or {})
+
+
+def densify(
+    reconstruction: Reconstruction,
+    images: ImageSet,
+    options: DenseOptions | Mapping[str, Any] | None = None,
+    *,
+    on_event: EventCallback | None = None,
+) -> Reconstruction:
+    """Refine the depth maps of a reconstruction by multi-view stereo.
+
+    Args:
+        reconstruction: Posed images with depth maps.
+        images: Images of the reconstruction.
+        options: Options of multi-view stereo, or settings such as ``{"max_size": 800}``.
+        on_event: Function that receives the progress.
+
+    Returns:
+        The reconstruction with dense depth maps.
+
+    Example:
+        >>> dense = mpsfm.densify(result.reconstructions[0], images)
+        >>> cloud = mpsfm.fuse(dense, images)
+    """
+    if isinstance(options, Mapping):
+        options = parse_settings(DenseOptions, options, ())
+    stages = Stages(Registry(), on_event)
+    with stages.stage("dense"):
+        progress = partial(stages.stage_progress, "dense")
+        dense, _ = densify_reconstruction(
+            reconstruction, _ViewsByName(images), options or DenseOptions(), progress=progress
+        )
+    return dense
+
+
+def fuse(reconstruction: Reconstruction, images: ImageSet, seed: int = 0) -> FusedPointCloud:
+    """Fuse the depth maps of a reconstruction to a colored point cloud.
+
+    Args:
+        reconstruction: Posed images with depth maps.
+        images: Images of the reconstruction.
+        seed: Seed of the selection of pixels.
+
+    Example:
+        >>> mpsfm.fuse(dense, images).points.shape
+        (181534, 3)
+    """
+    return fuse_depth_maps(reconstruction, _ViewsByName(images), ResultOptions(), seed)
+
+
+def build_mesh(
+    reconstruction: Reconstruction,
+    images: ImageSet,
+    options: MeshOptions | Mapping[str, Any] | None = None,
+) -> TriangleMesh:
+    """Build a colored triangle mesh from the depth maps of a reconstruction.
+
+    Args:
+        reconstruction: Posed images with depth maps.
+        images: Images of the reconstruction.
+        options: Options of meshing, or settings such as ``{"max_triangles": 100000}``.
+
+    Raises:
+        InputError: the depth maps give no surface, or the libraries of
+            ``pip install 'mpsfm-core[mesh]'`` are missing.
+
+    Example:
+        >>> mpsfm.build_mesh(dense, images).triangles.shape
+        (120000, 3)
+    """
+    if isinstance(options, Mapping):
+        options = parse_settings(MeshOptions, options, ())
+    return mesh_depth_maps(reconstruction, _ViewsByName(images), options or MeshOptions())
+
+
+def evaluate(
+    estimated: PathLike | Reconstruction | pycolmap.Reconstruction | Mapping[str, Any],
+    truth: PathLike | Reconstruction | pycolmap.Reconstruction | Mapping[str, Any],
+    images: Sequence[str] | None = None,
+    *,
+    convention: str = "paper",
+) -> dict[str, Any]:
+    """Compare estimated poses with true poses: pose AUC and trajectory errors.
+
+    Args:
+        estimated: Model, reconstruction or result folder, or poses ``cam_from_world`` by name as
+            for :func:`build_problem`.
+        truth: True poses, in the same forms.
+        images: Names of the images to evaluate, by default all images of ``truth``.
+        convention: Convention of the pose AUC: ``paper``, ``models``, ``colmap`` or ``vggt``.
+
+    Returns:
+        Report as plain data, with the pose AUC in percent below ``auc``.
+
+    Raises:
+        InputError: a model cannot be read, an image has no true pose, or the convention is unknown.
+
+    Example:
+        >>> mpsfm.evaluate("out/", "truth/")["auc"]["5"]
+        97.1
+    """
+    if convention not in CONVENTIONS:
+        raise InputError(f"no convention {convention!r}{did_you_mean(convention, CONVENTIONS)}")
+    return evaluate_poses(_poses(estimated), _poses(truth), images, CONVENTIONS[convention])
+
+
+def _poses(
+    model: PathLike | Reconstruction | pycolmap.Reconstruction | Mapping[str, Any],
+) -> Mapping[str, Pose]:
+    if isinstance(model, Mapping):
+        return {name: pose_from(name, pose) for name, pose in model.items()}
+    if isinstance(model, Reconstruction):
+        return model.poses
+    if isinstance(model, pycolmap.Reconstruction):
+        return reconstruction_poses(model)
+    return read_poses(Path(model))
+
+
+class _ViewsByName:
+    """Function that returns the undistorted view of an image by name."""
+
+    def __init__(self, images: ImageSet) -> None:
+        self._images = images
+        self._rows = {name: row for row, name in enumerate(images.names)}
+
+    def __call__(self, name: str) -> View:
+        return self._images.view(self._rows[name])
+
+
+def _rows_of_pairs(images: ImageSet, pairs: Sequence[NamePair]) -> list[tuple[int, int]]:
+    """Return sorted pairs of image indices of pairs of image names."""
+    rows = {name: row for row, name in enumerate(images.names)}
+    for name in np.unique([name for pair in pairs for name in pair]):
+        if name not in rows:
+            raise InputError(f"pairs: {name!r} is not one of the images{did_you_mean(name, rows)}")
+    indices = {tuple(sorted((rows[a], rows[b]))) for a, b in pairs if a != b}
+    return sorted((first, second) for first, second in indices)
+
+
+@contextmanager
+def _extraction(
+    images: ImageSet,
+    config: Config,
+    registry: Registry,
+    blocks: Sequence[str],
+    on_event: EventCallback | None,
+) -> Iterator[ExtractionContext]:
+    """Choose the providers of some blocks, and run extraction inside a ``with`` block."""
+    stages = Stages(registry, on_event)
+    config = config.model_copy(update={"fast_pass": None})
+    config = resolve_providers(config, registry, stages, blocks).config
+    with limit_threads(config.runtime.workers), stages.stage("extraction"):
+        context = ExtractionContext(images, config, registry, stages)
+        with runner.extraction_environment(context):
+            context.run_masks()
+            yield context

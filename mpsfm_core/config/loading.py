@@ -38,7 +38,7 @@ from mpsfm_core.providers.uncertainty.calibration_file import CALIBRATIONS, read
 from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.yaml_text import find_line, parse_assignment, parse_yaml
 
-_REPLACE_FAST_PASS = ("features", "matcher", "dense_matcher", "multiview")
+REPLACE_FAST_PASS = ("features", "matcher", "dense_matcher", "multiview")
 """Configuration blocks whose ``use:`` drops the block ``fast_pass`` of the parent file.
 The block ``multiview`` is included because the groups of images of a multi-view network are chosen
 by their matches."""
@@ -181,7 +181,7 @@ def _merge_all(layers: Sequence[_Layer]) -> tuple[dict[str, Any], list[str]]:
     warnings = []
     for layer in layers:
         try:
-            named = [block for block in _REPLACE_FAST_PASS if layer.has((block, "use"))]
+            named = [block for block in REPLACE_FAST_PASS if layer.has((block, "use"))]
             has_fast_pass = merged.get("fast_pass") is not None
             if named:
                 merged.pop("fast_pass", None)

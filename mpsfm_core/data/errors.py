@@ -11,6 +11,7 @@ MpsfmError
   ProviderRunError
   OutputError
   ReconstructionError        exit code 3
+  Cancelled                  exit code 130
 """
 
 from __future__ import annotations
@@ -30,6 +31,16 @@ class MpsfmError(Exception):
         # Worker processes return pickled exceptions. Default pickling fails for exceptions whose
         # constructor has other parameters than `args`.
         return _restore_error, (type(self), self.args, self.__dict__)
+
+
+class Cancelled(MpsfmError):
+    """Exception that a callback ``on_event`` raises to end a run.
+
+    The same call continues from the last checkpoint.
+    """
+
+    exit_code = 130
+    """Exit code of the command line for this error class."""
 
 
 class InputError(MpsfmError):

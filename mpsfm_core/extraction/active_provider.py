@@ -14,6 +14,7 @@ from typing import Any, TypeVar, cast
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data.errors import ProviderRunError
 from mpsfm_core.providers import API_VERSION, Capability, Kind, ProviderContext, ProviderSpec
+from mpsfm_core.providers.instances import ProviderInstance
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore, file_sha256, is_remote
@@ -89,7 +90,9 @@ class ActiveProvider:
 
     @property
     def workers(self) -> int:
-        """Number of threads that run the provider in parallel; 1 on a GPU."""
+        """Number of threads that run the provider in parallel; 1 on a GPU or for one object."""
+        if isinstance(self.spec.factory, ProviderInstance):
+            return 1
         return 1 if _device(self._runtime, self.spec) == "cuda" else worker_count(self._runtime)
 
     def compute_timed(

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator, Mapping
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -16,6 +17,22 @@ from mpsfm_core.support.lru_cache import LruCache
 
 CACHED_BYTES = 512 << 20
 """Size limit of the in-memory feature cache, bytes; 8192 SIFT features take 4 MB."""
+
+
+NO_FEATURES = Features(np.empty((0, 2)), np.empty((0, 0), dtype=np.float32))
+
+
+class FeatureSource(Protocol):
+    """Features of the images of a run, by image index."""
+
+    def extract(self) -> list[Features]:
+        """Return the features of all images; the descriptors may be missing."""
+
+    def __getitem__(self, index: int) -> Features:
+        """Return the features of an image with descriptors."""
+
+    def key(self, index: int) -> str:
+        """Return a text that identifies the features of an image in cache keys."""
 
 
 class FeatureTable:
@@ -60,6 +77,49 @@ class FeatureTable:
         if mask is None:
             return features
         return _select(features, sample_nearest(mask, features.keypoints))
+
+
+class FeatureSet(Mapping[str, Features]):
+    """Features of each image by name, which are loaded from the cache when they are used.
+
+    Attributes:
+        source: Features by image index.
+        provider: Configuration of the features provider, or None for features of the caller.
+    """
+
+    def __init__(
+        self, names: list[str], source: FeatureSource, provider: ProviderConfig | None
+    ) -> None:
+        self.provider = provider
+        self._rows = {name: row for row, name in enumerate(names)}
+        self.source = source
+
+    def __getitem__(self, name: str) -> Features:
+        return self.source[self._rows[name]]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._rows)
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+
+class GivenFeatures:
+    """Features that the caller computed, as a :class:`FeatureSource`."""
+
+    def __init__(self, names: list[str], features: Mapping[str, Features]) -> None:
+        self._features = [features.get(name, NO_FEATURES) for name in names]
+
+    def extract(self) -> list[Features]:
+        """Return the features of all images."""
+        return self._features
+
+    def __getitem__(self, index: int) -> Features:
+        return self._features[index]
+
+    def key(self, index: int) -> str:
+        """Return the hash of the features of an image."""
+        return digest(self._features[index])
 
 
 def _select(features: Features, rows: Bool) -> Features:

@@ -10,6 +10,7 @@ import numpy as np
 from mpsfm_core.data import DepthPrior, MappingImage, MappingProblem
 from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.context import ExtractionContext
+from mpsfm_core.extraction.match_graph import MatchGraph
 from mpsfm_core.extraction.matching.pair_matching import CandidateMatches
 from mpsfm_core.extraction.matching.verification import TwoViewGeometry
 
@@ -17,27 +18,23 @@ from mpsfm_core.extraction.matching.verification import TwoViewGeometry
 def describe(
     context: ExtractionContext,
     problem: MappingProblem,
-    proposed: int,
-    candidates: list[CandidateMatches],
-    outcomes: list[TwoViewGeometry],
+    graph: MatchGraph,
 ) -> dict[str, Any]:
     """Describe pairs, images and providers of an extraction as plain data.
 
     Args:
         context: Context of the extraction with images, failures and providers.
         problem: Input of the mapper with images and verified pairs.
-        proposed: Number of selected pairs before plugins filter the pairs.
-        candidates: Candidate matches of all matched pairs.
-        outcomes: Two-view geometry of the candidate matches of each pair.
+        graph: Candidate matches and two-view geometries of all matched pairs.
     """
     names = context.images.names
     pairs = [
         _pair(names, matches, outcome, context.config.verification.min_inliers)
-        for matches, outcome in zip(candidates, outcomes, strict=True)
+        for matches, outcome in zip(graph.candidates, graph.geometries, strict=True)
     ]
     return {
-        "pairs_proposed": proposed,
-        "pairs_matched": len(candidates),
+        "pairs_proposed": graph.num_proposed,
+        "pairs_matched": len(graph.candidates),
         "pairs_verified": len(problem.pairs),
         "pairs": pairs,
         "failed": {names[index]: reason for index, reason in sorted(context.failures.items())},

@@ -8,7 +8,8 @@ applied to cached results, so changing their options runs no network again.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +21,13 @@ from mpsfm_core.data import Features, MappingImage, MappingProblem, SparseMatche
 from mpsfm_core.extraction.active_provider import thread_count
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.events import ExtractionEvents, NullExtractionEvents
-from mpsfm_core.extraction.features import FeatureTable
+from mpsfm_core.extraction.features import (
+    NO_FEATURES,
+    FeatureSet,
+    FeatureSource,
+    FeatureTable,
+)
+from mpsfm_core.extraction.match_graph import MatchGraph, Priors
 from mpsfm_core.extraction.matching.dense_matches import NO_POINTS
 from mpsfm_core.extraction.matching.pair_matching import (
     CandidateMatches,
@@ -31,7 +38,7 @@ from mpsfm_core.extraction.matching.pair_matching import (
     assemble_matches,
     merge_matches,
 )
-from mpsfm_core.extraction.matching.verification import TwoViewGeometry
+from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.extraction.pairs.selection import PairSelection
 from mpsfm_core.extraction.priors.multiview import GroupPriors
 from mpsfm_core.extraction.priors.prior_predictor import PriorPredictor, check_depth_source
@@ -85,11 +92,18 @@ def extract(
         OutputError: the cache cannot be written.
     """
     context = ExtractionContext(images, config, registry, events or NullExtractionEvents())
+    with extraction_environment(context):
+        return _extract(context, imported)
+
+
+@contextmanager
+def extraction_environment(context: ExtractionContext) -> Iterator[None]:
+    """Limit the threads of native libraries, and use the configured executor."""
     with (
-        threadpool_limits(thread_count(config.runtime), user_api="blas"),
+        threadpool_limits(thread_count(context.config.runtime), user_api="blas"),
         use_executor(context),
     ):
-        return _extract(context, imported)
+        yield
 
 
 def extend_matches(
@@ -114,16 +128,16 @@ def extend_matches(
         events: Receives progress.
     """
     context = ExtractionContext(images, config, registry, events or NullExtractionEvents())
-    with (
-        threadpool_limits(thread_count(config.runtime), user_api="blas"),
-        use_executor(context),
-    ):
+    with extraction_environment(context):
         context.run_masks()
-        outcome = _match(context, unconstrained, first.problem.pairs)
-        assembled = assemble_matches(outcome.candidates, outcome.geometries, outcome.located)
-        assembled = adjust_assembled(context, assembled)
-    problem = merge_matches(first.problem, assembled)
-    second = describe(context, problem, outcome.proposed, outcome.candidates, outcome.geometries)
+        graph = match_images(
+            context,
+            feature_table(context),
+            unconstrained=unconstrained,
+            verified=first.problem.pairs,
+        )
+    problem = merge_matches(first.problem, graph.assembled)
+    second = describe(context, problem, graph)
     return Extraction(problem, merge_reports(first.report, second))
 
 
@@ -148,101 +162,67 @@ def adjust_problem(
 def _extract(context: ExtractionContext, imported: ImportedMatches | None) -> Extraction:
     check_depth_source(context.config, context.registry)
     context.run_masks()
-    outcome = _match(context) if imported is None else _verify_imported(context, imported)
-    candidates = outcome.candidates
-    assembled = assemble_matches(candidates, outcome.geometries, outcome.located)
     if imported is None:
-        assembled = adjust_assembled(context, assembled)
-    groups = _predict_groups(context, assembled.pairs)
-    priors = PriorPredictor(context, outcome.matcher, candidates, groups).run()
-    problem = MappingProblem(
-        tuple(
-            MappingImage(
-                image.name,
-                image.pinhole,
-                assembled.keypoints[index],
-                *priors[index],
-                keypoint_std_px=assembled.std_px[index],
-                keypoint_std_factor=assembled.std_factor[index],
-                focal_known=image.focal_known,
-                focal_log_std=image.focal_log_std,
-                **_group_fields(context, groups, index),
-            )
-            for index, image in enumerate(context.images)
-        ),
-        assembled.pairs,
-    )
-    described = describe(context, problem, outcome.proposed, candidates, outcome.geometries)
-    if groups is not None:
-        described["groups"] = groups.described()
-    return Extraction(problem, described)
+        graph = match_images(context, feature_table(context))
+    else:
+        graph = verify_imported(context, imported)
+    priors = predict_priors(context, graph)
+    problem = assemble_problem(context.images, graph, priors)
+    return Extraction(problem, {**describe(context, problem, graph), **priors.report})
 
 
-def _predict_groups(
-    context: ExtractionContext, pairs: tuple[VerifiedPair, ...]
-) -> GroupPriors | None:
-    """Run the multi-view network, if configured, on groups of images that share matches."""
-    if context.config.multiview is None:
-        return None
-    groups = GroupPriors(context)
-    groups.run({(pair.image_a, pair.image_b): len(pair) for pair in pairs})
-    return groups
+def feature_table(context: ExtractionContext) -> FeatureTable | None:
+    """Return the features of the configured provider, or None without such a provider."""
+    features = context.config.features
+    return None if features is None else FeatureTable(context, features)
 
 
-def _group_fields(
-    context: ExtractionContext, groups: GroupPriors | None, index: int
-) -> dict[str, Any]:
-    """Return the group and the proposed pose of an image whose depth is predicted in groups."""
-    if groups is None or context.config.depth.use != FROM_MULTIVIEW:
-        return {}
-    group, pose = groups.place(index)
-    return {"depth_group": group, "proposed_pose": pose}
-
-
-@dataclass(frozen=True, eq=False)
-class MatchingOutcome:
-    """Matches of all pairs with their two-view geometries."""
-
-    located: list[Features]
-    """Features of the images, without descriptors."""
-    proposed: int
-    """Number of selected pairs before plugins filter the pairs."""
-    candidates: list[CandidateMatches]
-    geometries: list[TwoViewGeometry]
-    """Two-view geometry of the candidate matches of each pair."""
-    matcher: PairMatcher | None = None
-
-
-def _match(
+def match_images(
     context: ExtractionContext,
+    source: FeatureSource | None,
+    *,
+    pairs: list[Pair] | None = None,
     unconstrained: Collection[int] | None = None,
     verified: Sequence[VerifiedPair] = (),
-) -> MatchingOutcome:
-    """Select, match and verify pairs with the configured providers.
+) -> MatchGraph:
+    """Select, match and verify pairs with the configured matchers, and adjust the keypoints.
 
     Args:
         context: The run.
+        source: Features of the images, or None for a detector-free matcher.
+        pairs: Pairs to match, or None to select pairs as configured.
         unconstrained: Indices of images of which each pair contains at least one; if None, all
             pairs are allowed.
         verified: Pairs that an earlier pass verified, which connect components.
     """
-    features = context.config.features
-    table = None if features is None else FeatureTable(context, features)
-    located = [_NO_FEATURES] * len(context.images) if table is None else table.extract()
-    selection = PairSelection(context, table, unconstrained)
-    matcher, verifier = PairMatcher(context, table), PairVerifier(context, located)
-    candidates = matcher.match(selection.choose(), located)
+    located = [NO_FEATURES] * len(context.images) if source is None else source.extract()
+    selection = PairSelection(context, source, unconstrained)
+    matcher, verifier = PairMatcher(context, source), PairVerifier(context, located)
+    candidates = matcher.match(selection.choose() if pairs is None else pairs, located)
     geometries = verifier.verify(candidates)
     pairs_with_geometry = zip(candidates, geometries, strict=True)
     connected = [(pair.image_a, pair.image_b) for pair in verified]
     connected += [c.pair for c, geometry in pairs_with_geometry if not geometry.dropped]
-    if further_pairs := selection.choose_again(connected):
+    if pairs is None and (further_pairs := selection.choose_again(connected)):
         candidates += matcher.match(further_pairs, located)
         geometries += verifier.verify(candidates[len(geometries) :])
-    return MatchingOutcome(located, selection.proposed, candidates, geometries, matcher)
+    assembled = adjust_assembled(context, assemble_matches(candidates, geometries, located))
+    names = context.images.names
+    features = {} if source is None else FeatureSet(names, source, context.config.features)
+    proposed = selection.proposed if pairs is None else len(pairs)
+    return MatchGraph(
+        tuple(names),
+        features,
+        assembled,
+        tuple(candidates),
+        tuple(geometries),
+        context.config.verification.min_inliers,
+        proposed,
+        matcher,
+    )
 
 
-def _verify_imported(context: ExtractionContext, imported: ImportedMatches) -> MatchingOutcome:
+def verify_imported(context: ExtractionContext, imported: ImportedMatches) -> MatchGraph:
     """Verify imported matches, after removing matches in masked areas."""
     located, allowed = [], []
     for index, (xy, std_px) in enumerate(zip(imported.keypoints, imported.std_px, strict=True)):
@@ -255,7 +235,74 @@ def _verify_imported(context: ExtractionContext, imported: ImportedMatches) -> M
         sparse = SparseMatches(matches.indices[keep], matches.scores[keep])
         candidates.append(CandidateMatches(pair, sparse, NO_POINTS, 1.0))
     geometries = PairVerifier(context, located).verify(candidates)
-    return MatchingOutcome(located, len(candidates), candidates, geometries)
+    names = context.images.names
+    return MatchGraph(
+        tuple(names),
+        dict(zip(names, located, strict=True)),
+        assemble_matches(candidates, geometries, located),
+        tuple(candidates),
+        tuple(geometries),
+        context.config.verification.min_inliers,
+        len(candidates),
+    )
 
 
-_NO_FEATURES = Features(np.empty((0, 2)), np.empty((0, 0), dtype=np.float32))
+def predict_priors(context: ExtractionContext, graph: MatchGraph | None) -> Priors:
+    """Predict calibrated depth and normals of all images.
+
+    Args:
+        context: The run.
+        graph: Match graph, from which multi-view networks get groups of images. With None, a group
+            has consecutive images, and no matcher predicts depth.
+    """
+    names = context.images.names
+    groups = _predict_groups(context, () if graph is None else graph.assembled.pairs)
+    candidates = [] if graph is None else list(graph.candidates)
+    matcher = None if graph is None else graph.matcher
+    predicted = PriorPredictor(context, matcher, candidates, groups).run()
+    depth = {name: prior for name, (prior, _) in zip(names, predicted, strict=True)}
+    normals = {name: prior for name, (_, prior) in zip(names, predicted, strict=True)}
+    if groups is None:
+        return Priors(depth, normals)
+    report = {"groups": groups.described()}
+    if context.config.depth.use != FROM_MULTIVIEW:
+        return Priors(depth, normals, report=report)
+    places = {name: groups.place(index) for index, name in enumerate(names)}
+    poses = {name: pose for name, (_, pose) in places.items() if pose is not None}
+    numbers = {name: number for name, (number, _) in places.items()}
+    return Priors(depth, normals, numbers, poses, report)
+
+
+def assemble_problem(images: ImageSet, graph: MatchGraph, priors: Priors) -> MappingProblem:
+    """Combine images, match graph and priors to the input of the mapper."""
+    assembled = graph.assembled
+    return MappingProblem(
+        tuple(
+            MappingImage(
+                image.name,
+                image.pinhole,
+                assembled.keypoints[index],
+                priors.depth[image.name],
+                priors.normals[image.name],
+                keypoint_std_px=assembled.std_px[index],
+                keypoint_std_factor=assembled.std_factor[index],
+                focal_known=image.focal_known,
+                focal_log_std=image.focal_log_std,
+                depth_group=priors.groups.get(image.name),
+                proposed_pose=priors.proposed_poses.get(image.name),
+            )
+            for index, image in enumerate(images)
+        ),
+        assembled.pairs,
+    )
+
+
+def _predict_groups(
+    context: ExtractionContext, pairs: tuple[VerifiedPair, ...]
+) -> GroupPriors | None:
+    """Run the multi-view network, if configured, on groups of images that share matches."""
+    if context.config.multiview is None:
+        return None
+    groups = GroupPriors(context)
+    groups.run({(pair.image_a, pair.image_b): len(pair) for pair in pairs})
+    return groups

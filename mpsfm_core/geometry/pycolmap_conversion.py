@@ -1,10 +1,14 @@
-"""Conversion between :class:`~mpsfm_core.data.PinholeCamera` and pycolmap's cameras."""
+"""Conversion of cameras and poses between pycolmap and MP-SfM."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import pycolmap
 
-from mpsfm_core.data import PinholeCamera
+from mpsfm_core.data import PinholeCamera, Pose
+from mpsfm_core.data.errors import InputError
 
 
 def colmap_from_pinhole(camera: PinholeCamera) -> pycolmap.Camera:
@@ -26,6 +30,27 @@ def pinhole_from_colmap(camera: pycolmap.Camera) -> PinholeCamera:
         float(camera.principal_point_x),
         float(camera.principal_point_y),
     )
+
+
+def pose_from(name: str, given: Any) -> Pose:
+    """Return rotation (3, 3) and translation (3,) of a pose.
+
+    Args:
+        name: Name of the image, for error messages.
+        given: ``pycolmap.Rigid3d``, a (3, 4) or (4, 4) matrix, or a tuple of rotation and
+            translation.
+
+    Raises:
+        InputError: the matrix has another shape.
+    """
+    if isinstance(given, tuple):
+        rotation, translation = given
+    else:
+        matrix = np.asarray(given.matrix() if isinstance(given, pycolmap.Rigid3d) else given)
+        if matrix.shape not in ((3, 4), (4, 4)):
+            raise InputError(f"pose of {name!r}: expected shape (3, 4), got {matrix.shape}")
+        rotation, translation = matrix[:3, :3], matrix[:3, 3]
+    return np.array(rotation, np.float64), np.array(translation, np.float64)
 
 
 def camera_key(camera: pycolmap.Camera) -> str:

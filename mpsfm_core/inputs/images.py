@@ -7,19 +7,21 @@ import logging
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any, Literal
 
 import cv2
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, Float64, PinholeCamera, UInt8, View
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.geometry.pycolmap_conversion import camera_key
+from mpsfm_core.geometry.pycolmap_conversion import camera_key, colmap_from_pinhole
 from mpsfm_core.inputs.gps import GpsPosition, read_gps
 from mpsfm_core.inputs.image_decoding import (
+    EXTENSIONS,
     check_decodable,
     check_size,
     decode_rgb,
@@ -44,12 +46,15 @@ from mpsfm_core.inputs.undistortion import (
     undistort_camera,
     undistort_pixels,
 )
+from mpsfm_core.support.files import write_file
 from mpsfm_core.support.lru_cache import LruCache
 from mpsfm_core.support.threads import thread_limit
 
 _log = logging.getLogger(__name__)
 
 FocalSource = Literal["intrinsics", "exif", "provider", "default"]
+
+FOCAL_FROM_USER: FocalSource = "intrinsics"
 
 FOCAL_LOG_STD: Mapping[FocalSource, float] = MappingProxyType(
     {"intrinsics": 0.01, "exif": 0.1, "provider": 0.2, "default": 0.7}
@@ -87,6 +92,8 @@ class SourceImage:
     """GPS position in EXIF, None if EXIF has no position."""
     mask: MaskFile | None = None
     """Mask file of the original image, None if the image has no mask."""
+    pixels: UInt8 | None = None
+    """(H, W, 3) uint8 RGB pixels of an image in memory, None for an image file."""
 
     def original_pixels(self, xy: Float64) -> Float64:
         """Map pixels (n, 2) of the undistorted view to pixels of the upright original image."""
@@ -158,6 +165,14 @@ class ImageSet:
         return self.images[index]
 
     @property
+    def folder(self) -> Path | None:
+        """Folder of the image files, or None for images in memory."""
+        if not self.images or self.images[0].pixels is not None:
+            return None
+        first = self.images[0]
+        return first.path.parents[len(PurePosixPath(first.name).parts) - 1]
+
+    @property
     def names(self) -> list[str]:
         """Names of the images in the order of the run."""
         return [image.name for image in self.images]
@@ -190,6 +205,23 @@ class ImageSet:
         images = [changed(image) for image in self.images]
         return ImageSet(images, self._options, self.left_out)
 
+    def written_to(self, folder: Path) -> ImageSet:
+        """Write images in memory as PNG files, and return the images as files.
+
+        Raises:
+            OSError: the files cannot be written.
+        """
+        images = []
+        for image in self.images:
+            assert image.pixels is not None
+            has_suffix = Path(image.name).suffix.lower() in EXTENSIONS
+            path = folder / (image.name if has_suffix else f"{image.name}.png")
+            data = cv2.imencode(".png", cv2.cvtColor(image.pixels, cv2.COLOR_RGB2BGR))[1].tobytes()
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_file(path, data)
+            images.append(replace(image, path=path, pixels=None))
+        return ImageSet(images, self._options, self.left_out)
+
     def mask(self, index: int) -> Bool | None:
         """Return the mask of an undistorted view; images without a mask are not decoded."""
         image = self.images[index]
@@ -214,8 +246,10 @@ class ImageSet:
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
     def _load(self, image: SourceImage) -> View:
-        data = read_bytes(image.path)
-        pixels = decode_rgb(data, read_header(data), image.path)
+        pixels = image.pixels
+        if pixels is None:
+            data = read_bytes(image.path)
+            pixels = decode_rgb(data, read_header(data), image.path)
         if (pixels.shape[1], pixels.shape[0]) != image.original_size:
             raise InputError(f"image {image.path} has changed its size during the run")
         mask = self._read_mask(image)
@@ -305,7 +339,7 @@ def load_images(
     for name, file in probed.items():
         if name in left_out:
             continue
-        focal: FocalSource = "intrinsics"
+        focal = FOCAL_FROM_USER
         if given is not None:
             camera = given.camera(name, file.size, file.header.orientation)
         elif (shared := partial and partial.usual_camera(name, *file.oriented_size)) is not None:
@@ -316,6 +350,68 @@ def load_images(
         images.append(replace(image, mask=oriented_masks.get(name)))
     _warn_of_default_focal_lengths(images, options)
     return ImageSet(images, options, left_out)
+
+
+def images_from_arrays(
+    pixels: Mapping[str, NDArray[Any]],
+    cameras: Mapping[str, Any] | Any | None = None,
+    options: InputOptions | None = None,
+) -> ImageSet:
+    """Make images of arrays in memory.
+
+    Args:
+        pixels: (H, W, 3) uint8 RGB or (H, W) uint8 gray pixels by image name.
+        cameras: Camera of all images, or of each image by name, as
+            :class:`~mpsfm_core.PinholeCamera` or ``pycolmap.Camera``. Without a camera, the focal
+            length is ``options.default_focal_ratio`` times the longer side, and refined.
+        options: see :class:`InputOptions`.
+
+    Raises:
+        InputError: fewer than two images, pixels are not uint8, or a camera is missing or has
+            another size.
+    """
+    options = options or InputOptions()
+    if len(pixels) < 2:
+        raise InputError(f"images: at least two images are needed, got {len(pixels)}")
+    guesses = _CameraGuesses(options, 0)
+    images = []
+    for name, array in pixels.items():
+        rgb = np.asarray(array)
+        rgb = np.repeat(rgb[..., None], 3, axis=2) if rgb.ndim == 2 else rgb
+        if rgb.dtype != np.uint8 or rgb.ndim != 3 or rgb.shape[2] != 3:
+            raise InputError(
+                f"image {name!r}: pixels must be uint8 (H, W, 3) or (H, W), "
+                f"got {rgb.dtype} {rgb.shape}"
+            )
+        size = rgb.shape[1], rgb.shape[0]
+        digest = hashlib.sha256(f"{size}".encode() + np.ascontiguousarray(rgb).tobytes())
+        probed = _ProbedImage(size, ImageHeader(None, 1, {}), digest.hexdigest())
+        camera, focal = _given_camera(name, size, cameras), FOCAL_FROM_USER
+        if camera is None:
+            camera, focal = guesses.camera(probed)
+        image = _source_image(name, Path(name), probed, camera, focal, options)
+        images.append(replace(image, pixels=rgb))
+    _warn_of_default_focal_lengths(images, options)
+    return ImageSet(images, options)
+
+
+def _given_camera(
+    name: str, size: tuple[int, int], cameras: Mapping[str, Any] | Any | None
+) -> pycolmap.Camera | None:
+    camera: Any = cameras
+    if isinstance(cameras, Mapping):
+        if name not in cameras:
+            raise InputError(f"cameras: no camera of image {name!r}")
+        camera = cameras[name]
+    if isinstance(camera, PinholeCamera):
+        camera = colmap_from_pinhole(camera)
+    if camera is not None and (camera.width, camera.height) != size:
+        raise InputError(
+            f"image {name!r} has {size[0]}x{size[1]} pixels, its camera "
+            f"{camera.width}x{camera.height}"
+        )
+    found: pycolmap.Camera | None = camera
+    return found
 
 
 def _exclude_masks(names: Sequence[str], folder: Path, masks: Path) -> list[str]:

@@ -13,11 +13,13 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from mpsfm_core.config import Config, load_config
+from mpsfm_core.config import Config
+from mpsfm_core.config.provider_arguments import Provider, configure
 from mpsfm_core.data import MappingProblem, Pose
 from mpsfm_core.data.decisions import Reason
 from mpsfm_core.data.errors import ConfigError, InputError, ReconstructionError
-from mpsfm_core.data.result_layout import SUMMARY
+from mpsfm_core.data.events import EventCallback
+from mpsfm_core.data.result_layout import IMAGES, SUMMARY
 from mpsfm_core.dense.densify import densify
 from mpsfm_core.extraction.active_provider import thread_count, worker_count
 from mpsfm_core.extraction.cache import cache_folder
@@ -79,40 +81,107 @@ class ReconstructionResult:
 
 
 def reconstruct(
-    images: PathLike,
+    images: PathLike | ImageSet,
     output: PathLike | None = None,
     config: PathLike | Config = "default",
     *,
     intrinsics: PathLike | None = None,
     image_list: PathLike | None = None,
     poses: PathLike | None = None,
+    features: Provider | None = None,
+    matcher: Provider | None = None,
+    retrieval: Provider | None = None,
+    multiview: Provider | None = None,
+    depth: Provider | None = None,
+    normals: Provider | None = None,
+    masks: Sequence[Provider] | None = None,
+    database: PathLike | None = None,
+    hloc: tuple[PathLike, PathLike] | None = None,
     overrides: Sequence[str] = (),
     registry: Registry | None = None,
     fresh: bool = False,
-    database: PathLike | None = None,
-    hloc: tuple[PathLike, PathLike] | None = None,
+    on_event: EventCallback | None = None,
 ) -> ReconstructionResult:
-    """Reconstruct a folder of photos, or a video; see :func:`mpsfm_core.api.reconstruct`."""
-    registry = registry or Registry.discover()
-    if not isinstance(config, Config):
-        config = load_config(config, overrides, registry)
-    elif overrides:
-        raise TypeError(
-            "overrides require the name or file of a configuration, not a loaded configuration"
-        )
+    """Reconstruct photos or a video.
+
+    The stages of a reconstruction are also separate functions, such as
+    :func:`mpsfm_core.extract_features` and :func:`mpsfm_core.run_mapper`.
+
+    Args:
+        images: Folder of photos, including subfolders; or a video, whose keyframes are selected
+            by ``inputs.video`` and written into ``frames/`` of the output; or the result of
+            :func:`mpsfm_core.load_images`.
+        output: Result folder, used by one run at a time, or None to write nothing.
+        config: Name of a shipped configuration, a YAML file, or a loaded configuration.
+        intrinsics: Camera intrinsics as ``intrinsics.yaml``, a COLMAP model or ``transforms.json``.
+            If missing, focal lengths are taken from ``poses``, else from EXIF, else estimated by
+            the depth provider, else set to a default.
+        image_list: Text file with one image name per line, by default all images of the folder.
+        poses: COLMAP model or ``transforms.json`` with poses of some or all images;
+            ``mapping.known_poses`` chooses whether known poses are fixed or refined.
+        features: Provider of features instead of the configured one. Each provider argument is a
+            name, a configuration block, or an object with the method of its kind. An object keeps
+            no results for later runs.
+        matcher: Matcher of features or of pixels, which replaces all configured matchers. The
+            default for features of the caller is ``mutual-nearest``.
+        retrieval: Provider of global image descriptors.
+        multiview: Multi-view network, used by ``depth="multiview"``.
+        depth: Provider of depth priors.
+        normals: Provider of normal priors.
+        masks: Mask providers, instead of those of the configuration.
+        database: COLMAP database whose keypoints and matches replace features and matchers. The
+            matches of the database are verified again. The cameras of the database are ignored
+            unless ``intrinsics`` names the database too.
+        hloc: Features file and matches file of hloc, as an alternative to ``database``.
+        overrides: Settings such as ``"runtime.workers=2"``; not allowed with a loaded
+            configuration.
+        registry: Providers that the configuration may name, by default all installed ones.
+        fresh: If true, ignore the checkpoint of an interrupted run and start mapping again.
+        on_event: Function that receives the progress, see :mod:`mpsfm_core.data.events`. To cancel
+            the run, the function raises :class:`~mpsfm_core.Cancelled`.
+
+    Returns:
+        COLMAP models of the original photos, arrays of the mapper, and the summary.
+
+    Raises:
+        InputError: images, intrinsics, poses, configuration, weights or output are wrong. Missing
+            providers are found before any image is decoded.
+        ReconstructionError: no reconstruction was possible; the reasons are in ``summary.json``.
+        MpsfmError: a provider failed or violated the provider contract, or the disk is full.
+
+    Example:
+        >>> import mpsfm_core as mpsfm
+        >>> result = mpsfm.reconstruct("photos/", "out/", depth="compact")
+        >>> result.model.num_reg_images()
+        8
+    """
+    config, registry = configure(
+        config,
+        registry,
+        overrides,
+        masks=masks,
+        features=features,
+        matcher=matcher,
+        retrieval=retrieval,
+        multiview=multiview,
+        depth=depth,
+        normals=normals,
+    )
     if database is not None and hloc is not None:
         raise TypeError("give either database or hloc, not both")
     matches = (database,) if database is not None else hloc or ()
     if matches:
         config = _without_matching(config)
+    if isinstance(images, ImageSet) and (intrinsics is not None or image_list is not None):
+        raise TypeError("intrinsics and image_list belong to load_images, which made the images")
     source = _Source(
-        Path(images),
+        images if isinstance(images, ImageSet) else Path(images),
         _path(intrinsics),
         _path(image_list),
         _path(poses),
         tuple(Path(file) for file in matches),
     )
-    run = _Run(source, config, registry, _path(output), fresh)
+    run = _Run(source, config, registry, _path(output), fresh, on_event)
     with run.environment():
         return run.execute()
 
@@ -121,13 +190,26 @@ def reconstruct(
 class _Source:
     """Input files of a run."""
 
-    images: Path
-    """Folder of photos, or a video."""
+    images: Path | ImageSet
+    """Folder of photos, a video, or loaded images."""
     intrinsics: Path | None
     image_list: Path | None
     poses: Path | None
     matches: tuple[Path, ...]
     """COLMAP database, or features and matches files of hloc; empty to run the matchers."""
+
+    @property
+    def video(self) -> Path | None:
+        """Path of the video, or None if the images are no video."""
+        images = self.images
+        return images if isinstance(images, Path) and is_video(images) else None
+
+    @property
+    def folder(self) -> Path | None:
+        """Folder of the photos, or None for a video or images in memory."""
+        if isinstance(self.images, ImageSet):
+            return self.images.folder
+        return self.images if self.video is None else None
 
 
 class _Run:
@@ -140,14 +222,15 @@ class _Run:
         registry: Registry,
         output: Path | None,
         fresh: bool,
+        on_event: EventCallback | None = None,
     ) -> None:
         self._source = source
         self._registry = registry
         self._output = output
         self._fresh = fresh
-        self._stages = Stages(registry)
+        self._stages = Stages(registry, on_event)
         self._resolution = ProviderResolution(config, ())
-        self._image_folder = source.images
+        self._image_folder = source.folder
         self._imported: ImportedMatches | None = None
         self._known_poses: dict[str, Pose] = {}
         self._georeference_report: dict[str, object] | None = None
@@ -167,11 +250,12 @@ class _Run:
         with ExitStack() as stack:
             stack.enter_context(limit_threads(self._config.runtime.workers))
             if self._output is not None:
-                check_output_folder(self._output, self._source.images)
+                if isinstance(self._source.images, Path):
+                    check_output_folder(self._output, self._source.images)
                 stack.enter_context(lock_output_folder(self._output))
-            elif is_video(self._source.images):
+            elif self._source.video is not None:
                 raise InputError(
-                    f"{self._source.images}: the frames of a video need an output folder"
+                    f"{self._source.video}: the frames of a video need an output folder"
                 )
             stack.enter_context(self._children.watching())
             stack.callback(self._stop_compilation)
@@ -201,7 +285,7 @@ class _Run:
 
     def _resolve_providers(self) -> None:
         """Choose providers and download their weights before any image is decoded."""
-        if not is_video(self._source.images):
+        if isinstance(self._source.images, Path) and self._source.video is None:
             # A missing image folder raises an error before any weights are downloaded.
             find_images(self._source.images)
         with self._stages.stage("providers"):
@@ -224,8 +308,8 @@ class _Run:
 
     def _extract_video_frames(self) -> None:
         """Write keyframes of a video to the output folder, and use the keyframes as images."""
-        video = self._source.images
-        if not is_video(video):
+        video = self._source.video
+        if video is None:
             return
         assert self._output is not None
         with self._stages.stage("video"):
@@ -238,14 +322,21 @@ class _Run:
         """Read image headers, intrinsics, poses and imported matches; check memory and disk."""
         source = self._source
         with self._stages.stage("inputs"):
-            images = load_images(
-                self._image_folder,
-                source.intrinsics,
-                source.image_list,
-                self._config.inputs,
-                model=source.poses,
-                without=self._output,
-            )
+            if isinstance(source.images, ImageSet):
+                images = source.images
+                if self._image_folder is None and self._output is not None:
+                    self._image_folder = self._output / IMAGES
+                    images = images.written_to(self._image_folder)
+            else:
+                assert self._image_folder is not None
+                images = load_images(
+                    self._image_folder,
+                    source.intrinsics,
+                    source.image_list,
+                    self._config.inputs,
+                    model=source.poses,
+                    without=self._output,
+                )
             self._check_resources(images)
             if source.poses is not None:
                 self._known_poses = _read_known_poses(source.poses, images, self._image_folder)
@@ -436,7 +527,7 @@ class _Run:
         usage = extraction.report["providers"]
         return {
             **summarize_run(status, self._resolution, self._stages, usage),
-            "photos": str(self._image_folder.resolve()),
+            "photos": None if self._image_folder is None else str(self._image_folder.resolve()),
             "matches_from": None if self._imported is None else self._imported.source,
             **summarize_results(images, extraction, mapping, models),
             "georeference": self._georeference_report,
@@ -541,7 +632,7 @@ def _read_matches(files: tuple[Path, ...], images: ImageSet) -> ImportedMatches 
     return matches_from_hloc(files[0], files[1], images)
 
 
-def _read_known_poses(model: Path, images: ImageSet, images_folder: Path) -> dict[str, Pose]:
+def _read_known_poses(model: Path, images: ImageSet, images_folder: Path | None) -> dict[str, Pose]:
     """Read the poses of a model, keyed by the matching image names of the run."""
     poses = read_poses(model, images_folder)
     matched = match_names(images.names, poses)

@@ -11,6 +11,17 @@ from pathlib import Path
 
 from mpsfm_core.data import SceneState
 from mpsfm_core.data.decisions import Reason
+from mpsfm_core.data.events import (
+    Event,
+    EventCallback,
+    ImageRegistered,
+    ImageRejected,
+    Notice,
+    SceneChanged,
+    StageFinished,
+    StageProgress,
+    StageStarted,
+)
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.report.reasons import explain
 
@@ -34,10 +45,11 @@ class StageRecord:
 
 
 class Stages:
-    """Receives progress events of a run, and forwards them to the hooks of plugins."""
+    """Receives progress events of a run, and forwards them to a callback and to plugins."""
 
-    def __init__(self, registry: Registry) -> None:
+    def __init__(self, registry: Registry, on_event: EventCallback | None = None) -> None:
         self._registry = registry
+        self._on_event = on_event or _ignore
         self._finished: dict[str, StageRecord] = {}
         self._running: dict[str, float] = {}
         self.warnings: list[str] = []
@@ -79,6 +91,7 @@ class Stages:
 
     def notice(self, text: str) -> None:
         """Show a message of one line to the user."""
+        self._on_event(Notice(text))
         self._registry.call_hook("mpsfm_notice", text=text)
 
     def warn(self, text: str) -> None:
@@ -87,31 +100,41 @@ class Stages:
         self.notice(f"warning: {text}")
 
     def stage_started(self, stage: str, total: int | None) -> None:
-        """Forward the start of a stage with ``total`` steps (None if unknown) to plugins."""
+        """Forward the start of a stage with ``total`` steps (None if unknown)."""
+        self._on_event(StageStarted(stage, total))
         self._registry.call_hook("mpsfm_stage_started", stage=stage, total=total)
 
     def stage_progress(self, stage: str, done: int, total: int) -> None:
-        """Forward the number of finished steps of a stage to plugins."""
+        """Forward the number of finished steps of a stage to callback and plugins."""
+        self._on_event(StageProgress(stage, done, total))
         self._registry.call_hook("mpsfm_stage_progress", stage=stage, done=done, total=total)
 
     def stage_finished(self, stage: str, seconds: float) -> None:
-        """Forward the end of a stage to plugins."""
+        """Forward the end of a stage to callback and plugins."""
+        self._on_event(StageFinished(stage, seconds))
         self._registry.call_hook("mpsfm_stage_finished", stage=stage, seconds=seconds)
 
     def image_registered(self, name: str, registered: int, total: int) -> None:
-        """Forward the registration of an image to plugins."""
+        """Forward the registration of an image to callback and plugins."""
+        self._on_event(ImageRegistered(name, registered, total))
         self._registry.call_hook(
             "mpsfm_image_registered", name=name, registered=registered, total=total
         )
 
     def scene_changed(self, scene: Callable[[], SceneState]) -> None:
-        """Forward a change of poses or points to plugins."""
+        """Forward a change of poses or points to callback and plugins."""
+        self._on_event(SceneChanged(scene))
         self._registry.call_hook("mpsfm_scene_changed", scene=scene)
 
     def image_rejected(self, name: str, reason: Reason) -> None:
-        """Forward the rejection of an image, with the reason, to plugins."""
+        """Forward the rejection of an image, with the reason, to callback and plugins."""
         text = explain(reason).text
+        self._on_event(ImageRejected(name, reason, text))
         self._registry.call_hook("mpsfm_image_rejected", name=name, reason=reason, text=text)
+
+
+def _ignore(event: Event) -> None:
+    """Ignore an event of a run without callback."""
 
 
 def _reset_peak_memory() -> None:

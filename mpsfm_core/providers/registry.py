@@ -10,8 +10,10 @@ import importlib
 import logging
 import os
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from importlib import metadata
+from itertools import count
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -196,6 +198,21 @@ class Registry:
             self._entries.append(
                 _Entry(spec, distribution, version or "0", *fault, is_versioned=is_versioned)
             )
+
+    def extended(self, spec: ProviderSpec) -> Registry:
+        """Return a registry that also has a provider of the calling program.
+
+        The name of the provider gets a number if it is taken.
+
+        Args:
+            spec: Specification of the provider.
+        """
+        names = {entry.spec.name for entry in self._entries if entry.spec.kind == spec.kind}
+        free = (f"{spec.name}-{number}" if number > 1 else spec.name for number in count(1))
+        extended = copy(self)
+        extended._entries = list(self._entries)
+        extended.add(replace(spec, name=next(name for name in free if name not in names)))
+        return extended
 
     def status(self) -> tuple[ProviderStatus, ...]:
         """List all providers by kind and name, then plugins without usable providers."""

@@ -104,6 +104,6 @@ def _source_files(root: Path) -> Iterator[Path]:
         yield root
         return
     for path in sorted(root.rglob("*")):
-        if path.is_file() and "__pycache__" not in path.parts:
-            if path.stat().st_size <= _MAX_FILE_BYTES:
-                yield path
+        is_source = path.is_file() and "__pycache__" not in path.parts
+        if is_source and path.stat().st_size <= _MAX_FILE_BYTES:
+            yield path

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Float64, UInt8, View
-from mpsfm_core.geometry import sample_nearest
-from mpsfm_core.geometry.pycolmap_conversion import camera_key
+from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera, UInt8, View
+from mpsfm_core.data.errors import InputError
+from mpsfm_core.dense.depth_range import depth_prior_from_points
+from mpsfm_core.geometry import sample_nearest, transform
+from mpsfm_core.geometry.pycolmap_conversion import (
+    camera_key,
+    colmap_from_pinhole,
+    pinhole_from_colmap,
+)
 from mpsfm_core.inputs.colmap_files import check_binary_model
-from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+from mpsfm_core.inputs.undistortion import is_pinhole
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 MIN_TRACK_LENGTH = 2
 """Minimum track length of exported points; points lifted from one depth map are not exported."""
@@ -65,6 +72,72 @@ def build_model(
             model.add_point3D(reconstruction.points[row], pycolmap.Track(elements), colors[row])
     model.update_point_3d_errors()
     return model
+
+
+def build_pinhole_model(
+    reconstruction: Reconstruction, problem: MappingProblem
+) -> pycolmap.Reconstruction:
+    """Build a COLMAP model with pinhole cameras and black points, without the images."""
+    cameras = [colmap_from_pinhole(image.camera) for image in reconstruction.images]
+    keypoints = [problem.images[image.index].keypoints for image in reconstruction.images]
+    black = np.zeros((len(reconstruction.points), 3), np.uint8)
+    return build_model(reconstruction, cameras, keypoints, black)
+
+
+def reconstruction_from_model(
+    model: pycolmap.Reconstruction,
+    cameras: Mapping[str, PinholeCamera],
+    depth: Mapping[str, DepthPrior],
+) -> Reconstruction:
+    """Convert a COLMAP model to a reconstruction with depth maps.
+
+    Args:
+        model: COLMAP model with poses and points.
+        cameras: Camera of the undistorted view by image name; images that are missing here need a
+            camera without lens distortion.
+        depth: Depth map by image name; images that are missing here get a constant depth, whose std
+            covers the depths of their points.
+
+    Raises:
+        InputError: an image has lens distortion, or neither points nor depth.
+    """
+    point_ids = sorted(model.points3D)
+    rows = {number: row for row, number in enumerate(point_ids)}
+    points = np.array([model.points3D[number].xyz for number in point_ids]).reshape(-1, 3)
+    registered = [model.images[number] for number in sorted(model.reg_image_ids())]
+    images = []
+    for index, image in enumerate(registered):
+        name = str(image.name)
+        camera = cameras.get(name)
+        if camera is None and not is_pinhole(image.camera):
+            raise InputError(f"image {name!r} has lens distortion; pass the images of the model")
+        matrix = np.asarray(image.cam_from_world().matrix())
+        observed = np.array(
+            [
+                rows.get(point.point3D_id, -1) if point.has_point3D() else -1
+                for point in image.points2D
+            ],
+            dtype=np.int64,
+        )
+        seen = points[observed[observed >= 0]]
+        depths = transform(matrix[:, :3], matrix[:, 3], seen)[:, 2]
+        prior = depth.get(name) or depth_prior_from_points(depths)
+        if prior is None:
+            raise InputError(f"image {name!r} observes no points of the model; give its depth map")
+        images.append(
+            RegisteredImage(
+                index,
+                name,
+                camera or pinhole_from_colmap(image.camera),
+                matrix[:, :3].copy(),
+                matrix[:, 3].copy(),
+                observed,
+                prior,
+                1.0,
+            )
+        )
+    errors = np.array([model.points3D[number].error for number in point_ids], dtype=np.float64)
+    return Reconstruction(tuple(images), points, errors)
 
 
 def write_model(folder: Path, model: pycolmap.Reconstruction, *, text: bool = False) -> None:

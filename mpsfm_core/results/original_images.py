@@ -88,7 +88,8 @@ def export_view(images: ImageSet, index: int, path: Path) -> None:
     """
     image = images[index]
     path.parent.mkdir(parents=True, exist_ok=True)
-    if is_pinhole(image.camera) and image.pinhole.size == image.original_size:
+    is_unchanged = is_pinhole(image.camera) and image.pinhole.size == image.original_size
+    if is_unchanged and image.pixels is None:
         data = read_bytes(image.path)
         signature = _SIGNATURES.get(path.suffix.lower(), b"")
         is_upright = read_header(data).orientation == 1

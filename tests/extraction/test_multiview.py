@@ -82,7 +82,8 @@ def shown(world: World) -> list[list[str]]:
             "truth",
             lambda options, context: TrueGroup(),
             capabilities=frozenset({"proposes-poses"}),
-        )
+        ),
+        version="1",
     )
     return asked
 

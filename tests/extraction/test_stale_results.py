@@ -43,7 +43,7 @@ class Edited:
 def mpsfm_providers():
     return [ProviderSpec("depth", "edited", "edited_depth:Edited")]
 """,
-    "edited_depth-1.0.dist-info/METADATA": "Metadata-Version: 2.1\nName: edited-depth\nVersion: 1.0\n",
+    "edited_depth-1.0.dist-info/METADATA": "Name: edited-depth\nVersion: 1.0\n",
     "edited_depth-1.0.dist-info/entry_points.txt": "[mpsfm.plugins]\nedited = edited_depth\n",
 }
 

@@ -23,7 +23,7 @@ from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.empty_results import EMPTY_RESULTS
-from mpsfm_core.extraction.features import FeatureTable
+from mpsfm_core.extraction.features import FeatureSource
 from mpsfm_core.extraction.matching.dense_matches import (
     NO_POINTS,
     PointMatches,
@@ -62,7 +62,7 @@ class CandidateMatches:
 class PairMatcher:
     """Runs the configured matchers on pairs of images."""
 
-    def __init__(self, context: ExtractionContext, table: FeatureTable | None) -> None:
+    def __init__(self, context: ExtractionContext, table: FeatureSource | None) -> None:
         self._context = context
         self._table = table
         config = context.config

@@ -15,7 +15,7 @@ from mpsfm_core.data.errors import ConfigError
 from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.cache import content_key
 from mpsfm_core.extraction.context import ExtractionContext
-from mpsfm_core.extraction.features import FeatureTable
+from mpsfm_core.extraction.features import FeatureSource
 from mpsfm_core.extraction.pairs import pairing as pairs
 from mpsfm_core.extraction.pairs import similarity as pair_similarity
 from mpsfm_core.extraction.pairs.pairing import Pair
@@ -36,7 +36,7 @@ class PairSelection:
     def __init__(
         self,
         context: ExtractionContext,
-        table: FeatureTable | None,
+        table: FeatureSource | None,
         unconstrained: Collection[int] | None = None,
     ) -> None:
         self.proposed = 0
@@ -132,7 +132,7 @@ class PairSelection:
             return None
         return pair_similarity.diffuse_similarity(self._match_scores(self._table))
 
-    def _match_scores(self, table: FeatureTable) -> Float64:
+    def _match_scores(self, table: FeatureSource) -> Float64:
         context, count = self._context, len(self._context.images)
         key = content_key(
             hash_module(pair_similarity.__name__), [table.key(index) for index in range(count)]

@@ -6,12 +6,39 @@ import cv2
 import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, NormalPrior
+from mpsfm_core.extraction.options import ExtractionOptions
 from mpsfm_core.geometry import log_depth_steps, resize_map
 
 EDGE_VARIANCE = 1e6
 """Variance of normals at depth edges, rad^2. [reference]"""
 _ALL_VALID = 1 - 1e-5
 """Threshold of an interpolated mask: a pixel is valid if all contributing pixels are valid."""
+
+
+def fit_to_grid(
+    depth: DepthPrior,
+    normals: NormalPrior,
+    size: tuple[int, int],
+    mask: Bool | None,
+    options: ExtractionOptions,
+) -> tuple[DepthPrior, NormalPrior]:
+    """Resize priors to the grid of the mapper, and apply mask and depth edges.
+
+    Args:
+        depth: Depth prior with variance.
+        normals: Normal prior with variance.
+        size: (width, height) of the view in pixels.
+        mask: (H, W) mask of usable pixels of the view, or None if all are usable.
+        options: Size of the grid and threshold of depth edges.
+    """
+    grid = integration_grid(size, options.integration_size)
+    depth, normals = resize_depth(depth, grid), resize_normals(normals, grid)
+    if mask is not None:
+        allowed = resize_mask(mask, grid)
+        depth, normals = mask_depth(depth, allowed), mask_normals(normals, allowed)
+    if options.edge_ratio is not None:
+        normals = inflate_edge_variance(normals, depth, options.edge_ratio)
+    return depth, normals
 
 
 def integration_grid(size: tuple[int, int], longer_side: int) -> tuple[int, int]:

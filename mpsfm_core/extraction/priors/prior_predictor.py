@@ -92,19 +92,9 @@ class PriorPredictor:
     def _on_grid(
         self, index: int, depth: DepthPrior, normals: NormalPrior
     ) -> tuple[DepthPrior, NormalPrior]:
-        options = self._context.config.extraction
-        grid = priors.integration_grid(
-            self._context.images[index].pinhole.size, options.integration_size
-        )
-        depth, normals = priors.resize_depth(depth, grid), priors.resize_normals(normals, grid)
-        mask = self._context.mask(index)
-        if mask is not None:
-            allowed = priors.resize_mask(mask, grid)
-            depth = priors.mask_depth(depth, allowed)
-            normals = priors.mask_normals(normals, allowed)
-        if options.edge_ratio is not None:
-            normals = priors.inflate_edge_variance(normals, depth, options.edge_ratio)
-        return depth, normals
+        size = self._context.images[index].pinhole.size
+        mask, options = self._context.mask(index), self._context.config.extraction
+        return priors.fit_to_grid(depth, normals, size, mask, options)
 
 
 def _depth_calibration(config: Config, registry: Registry) -> DepthCalibration:

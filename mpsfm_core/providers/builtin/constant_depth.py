@@ -8,7 +8,7 @@ from mpsfm_core.data import DepthPrior, View
 from mpsfm_core.data.options import Options
 from mpsfm_core.providers import ProviderContext
 
-_GRID = (24, 32)
+FLAT_GRID = (24, 32)
 """Rows and columns of the constant depth map. Normals are fitted to windows of several pixels, so
 one pixel would not suffice."""
 
@@ -26,4 +26,4 @@ class ConstantDepth:
 
     def predict(self, view: View) -> DepthPrior:
         """Return a depth map with z-depth 1 at every pixel."""
-        return DepthPrior.from_arrays(np.ones(_GRID), metric=False)
+        return DepthPrior.from_arrays(np.ones(FLAT_GRID), metric=False)

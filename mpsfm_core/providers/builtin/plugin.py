@@ -16,6 +16,12 @@ from mpsfm_core.providers.builtin.options import (
 )
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
+FLAT_CALIBRATION = DepthCalibration(relative_std=0.5)
+"""Uncertainty of the plane that replaces a missing depth map. A relative std from 0.3 to 0.5 gives
+the same poses, 1.0 gives worse poses. [tuned: sample scene]"""
+FROM_DEPTH_CALIBRATION = NormalCalibration(std_scale=1.0, std_floor_deg=1.0)
+"""Uncertainty of normals that are fitted to depth maps, whose fit predicts the variance."""
+
 _LICENSE = "Apache-2.0"
 
 
@@ -70,9 +76,7 @@ def _depth() -> list[ProviderSpec]:
             summary="a plane parallel to the image: no prior at all, for photos with much overlap",
             code_license=_LICENSE,
             accuracy="none: it does not look at the photo (a network: pip install mpsfm-compact)",
-            # [tuned: sample scene] A relative_std from 0.3 to 0.5 gives the same poses, 1.0 gives
-            # worse poses.
-            calibration=DepthCalibration(relative_std=0.5),
+            calibration=FLAT_CALIBRATION,
         ),
         ProviderSpec(
             kind="depth",
@@ -120,7 +124,7 @@ def _normals() -> list[ProviderSpec]:
             summary="normals of planes fitted to the depth prior",
             code_license=_LICENSE,
             contract="mpsfm_core.testing.builtin_contracts:from_depth",
-            calibration=NormalCalibration(std_scale=1.0, std_floor_deg=1.0),
+            calibration=FROM_DEPTH_CALIBRATION,
         ),
     ]
 

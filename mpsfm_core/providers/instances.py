@@ -1,0 +1,70 @@
+"""Providers that a caller passes as Python objects instead of names."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any, cast
+
+from mpsfm_core.data.errors import ProviderError
+from mpsfm_core.data.options import Options
+from mpsfm_core.providers.protocols import (
+    CAPABILITY_METHODS,
+    PROTOCOLS,
+    Capability,
+    Kind,
+    ProviderContext,
+    ProviderSpec,
+)
+
+
+@dataclass(frozen=True, eq=False)
+class ProviderInstance:
+    """Factory that always returns the same provider object, which one thread at a time uses."""
+
+    provider: object
+
+    def __call__(self, options: Options | None, context: ProviderContext) -> object:
+        """Return the provider object."""
+        return self.provider
+
+
+def spec_of_instance(kind: Kind, provider: Any) -> ProviderSpec:
+    """Describe a provider object, so that a registry can list it.
+
+    The attributes ``capabilities``, ``calibration`` and ``tags`` of the object are the fields of
+    its :class:`~mpsfm_core.ProviderSpec`. A matcher without ``capabilities`` matches features.
+
+    Args:
+        kind: Kind of the provider, such as ``depth``.
+        provider: Object with the method of the protocol of its kind.
+
+    Returns:
+        Specification, whose name is derived from the class of the object.
+
+    Raises:
+        ProviderError: The object is a class or lacks the method of its kind.
+    """
+    methods = [name for name in vars(PROTOCOLS[kind]) if not name.startswith("_")]
+    if isinstance(provider, type):
+        raise ProviderError(f"{kind}: {provider.__name__} is a class; pass {provider.__name__}()")
+    for method in methods:
+        if not callable(getattr(provider, method, None)):
+            raise ProviderError(
+                f"{kind}: {type(provider).__name__} has no method {method}(); pass the name of a "
+                f"provider, a configuration block, or an object with this method"
+            )
+    capabilities = set(getattr(provider, "capabilities", ("sparse",) if kind == "matcher" else ()))
+    for capability, method in CAPABILITY_METHODS.items():
+        if kind == "depth" and callable(getattr(provider, method, None)):
+            capabilities.add(capability)
+    words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", type(provider).__name__).lower()
+    return ProviderSpec(
+        kind=kind,
+        name=re.sub(r"[^a-z0-9]+", "-", words).strip("-") or kind,
+        factory=ProviderInstance(provider),
+        capabilities=frozenset(cast("set[Capability]", capabilities)),
+        calibration=getattr(provider, "calibration", None),
+        tags=tuple(getattr(provider, "tags", ())),
+        summary="object of the calling program",
+    )
