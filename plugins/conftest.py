@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,17 +10,6 @@ import pytest
 
 from mpsfm_core import ProviderContext
 from mpsfm_core.providers.weights import WeightStore
-
-_DEFAULT = Path(__file__).resolve().parents[2] / "shared"
-
-
-@pytest.fixture(scope="session")
-def shared_data() -> Path:
-    """Return the folder of real scenes and models, ``$MPSFM_SHARED`` or ``../shared``."""
-    folder = Path(os.environ.get("MPSFM_SHARED", _DEFAULT))
-    if not folder.is_dir():
-        pytest.skip("no shared scenes and models here (set MPSFM_SHARED)")
-    return folder
 
 
 @pytest.fixture(scope="session")

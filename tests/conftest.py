@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import sys
 import textwrap
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import hypothesis
 import pycolmap
@@ -14,17 +12,6 @@ import pytest
 
 hypothesis.settings.register_profile("repeatable", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("repeatable")
-
-_DEFAULT = Path(__file__).resolve().parents[2] / "shared"
-
-
-@pytest.fixture(scope="session")
-def shared_data() -> Path:
-    """Folder with real scenes and models (``data/``, ``models/``): $MPSFM_SHARED or ../shared."""
-    folder = Path(os.environ.get("MPSFM_SHARED", _DEFAULT))
-    if not folder.is_dir():
-        pytest.skip("no shared scenes and models here (set MPSFM_SHARED)")
-    return folder
 
 
 @pytest.fixture
