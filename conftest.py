@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import locale
 import os
 import shutil
 import sys
@@ -28,7 +27,7 @@ _SHARED_DATA = Path(__file__).resolve().parents[1] / "shared"
 
 
 def _replace_environment(home: Path) -> None:
-    """Replace environment variables, umask, locale and time zone of this process.
+    """Replace environment variables, umask and time zone of this process.
 
     Processes that tests start inherit the environment.
     """
@@ -37,7 +36,6 @@ def _replace_environment(home: Path) -> None:
             del os.environ[name]
     os.environ |= {"HOME": str(home), "LANG": "C.UTF-8", "TZ": "UTC", "MPLBACKEND": "agg"}
     os.umask(0o022)
-    locale.setlocale(locale.LC_ALL, "C")
     if hasattr(time, "tzset"):
         time.tzset()
 

@@ -146,7 +146,7 @@ def _print_failure(summary: Mapping[str, Any], output: Path) -> None:
 
 def _print_outcome(result: ReconstructionResult, output: Path) -> None:
     """Print quality, weakly registered and missing photos, and files of a successful run."""
-    from mpsfm_core.report.findings import findings, weakest
+    from mpsfm_core.report.findings import describe_scale, findings, weakest
     from mpsfm_core.report.verdict import judge
 
     images, best = result.summary["images"], result.summary["reconstructions"][0]
@@ -155,7 +155,7 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
         f"{len(images['registered'])} of {images['total']} images, {best['points']} points, mean "
         f"reprojection error {best['mean_reprojection_error_px'] or 0:.2f} px",
     )
-    _row("scale", _unit(best["metric_scale"]))
+    _row("scale", ", ".join(describe_scale(result.summary)))
     if place := result.summary["georeference"]:
         _row("place", _place(place))
     if refined := _refined_focal_lengths(images["details"].values()):
@@ -187,16 +187,6 @@ def _row(label: str, text: str) -> None:
     """Print a line of the summary with a colored label."""
     colors = {"good": "green", **dict.fromkeys(_YELLOW, "yellow")}
     typer.echo(typer.style(f"{label:<9}", fg=colors.get(label), bold=True) + text)
-
-
-def _unit(metric: dict[str, Any] | None) -> str:
-    """Describe the unit of the reconstruction from the summary's ``metric_scale``."""
-    if metric is None:
-        return "unit unknown: no depth is metric"
-    source = f"by {metric['num_images']} {metric['by']}, spread {metric['spread']:.0%}"
-    if metric["trusted"]:
-        return f"in meters, {source}"
-    return f"not in meters: one unit is about {metric['metres_per_unit']:.3g} m {source}"
 
 
 def _place(georeference: Mapping[str, Any]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -22,6 +22,8 @@ _ORDER: tuple[Level, ...] = ("bad", "warning", "note")
 _MAX_FOCAL_CHANGE = 0.1
 """Minimum relative change of a refined focal length that is reported to the user."""
 
+_FILES = "files"
+"""Name of the depth provider that reads depth maps from files."""
 _NETWORKLESS = {"flat", "from-depth"}
 """Names of the depth providers that use no neural network."""
 
@@ -183,6 +185,25 @@ def _providers(summary: Mapping[str, Any]) -> Iterator[Finding]:
             )
 
 
+def describe_scale(summary: Mapping[str, Any]) -> tuple[str, str]:
+    """Describe the unit of the first reconstruction, and where its scale comes from.
+
+    Agreeing depth maps of a network do not prove the scale, because the network may not know the
+    kind of scene. The description therefore names the source of the scale.
+    """
+    metric = summary["reconstructions"][0]["metric_scale"]
+    if metric is None:
+        return "unknown", "no depth is metric"
+    source = f"{metric['num_images']} {metric['by']}, spread {metric['spread']:.0%}"
+    if not metric["trusted"]:
+        return "uncertain", f"one unit is about {metric['metres_per_unit']:.3g} m by {source}"
+    if metric["by"] != "depth maps":
+        return "meters", f"by {source}"
+    (depth,) = [entry["name"] for entry in summary["providers"] if entry["block"] == "depth"]
+    origin = "given by the depth files" if depth == _FILES else f"predicted by {depth}"
+    return "meters", f"as {origin}: {source}"
+
+
 def _scale(summary: Mapping[str, Any]) -> Iterator[Finding]:
     """Yield a finding if the metric scale is unknown or uncertain."""
     for reconstruction in summary["reconstructions"][:1]:
@@ -218,7 +239,7 @@ def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
         if image["focal_length_from"] == "default" and is_focal_refined(image)
     ]
     if guessed:
-        changes = [after / before for before, after in (refined[name] for name in guessed)]
+        changes = [refined[name][1] / refined[name][0] - 1 for name in guessed]
         std_ratios = [
             details[name]["focal_length_std_px"] / refined[name][1]
             for name in guessed
@@ -229,7 +250,7 @@ def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
             "note",
             f"The focal length of {_count(len(guessed), 'photo')} was estimated from the photos",
             "EXIF and --intrinsics give none. Bundle adjustment changed the initial guess by "
-            f"{min(changes) - 1:+.0%} to {max(changes) - 1:+.0%}.{std}",
+            f"{_range(changes)}.{std}",
             "Give it with --intrinsics if you know it.",
             tuple(guessed),
         )
@@ -240,15 +261,22 @@ def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
         if after and abs(after / before - 1) > _MAX_FOCAL_CHANGE
     ]
     if far:
-        before, after = refined[far[0]]
+        changes = [refined[name][1] / refined[name][0] - 1 for name in far]
+        sources = sorted({details[name]["focal_length_from"] for name in far})
         yield Finding(
             "note",
-            "The focal length changed much",
-            f"From {before:.0f} ({details[far[0]]['focal_length_from']}) to {after:.0f} px. The "
-            "photos may be cropped or zoomed.",
+            f"The focal length of {_count(len(far), 'photo')} changed much",
+            f"Bundle adjustment changed the values from {' and '.join(sources)} by "
+            f"{_range(changes)}. The photos may be cropped or zoomed.",
             "If you know the true one, give it with --intrinsics.",
             tuple(far),
         )
+
+
+def _range(changes: Sequence[float]) -> str:
+    """Return smallest and largest relative change as text, one value if they are equal."""
+    ends = dict.fromkeys(f"{change:+.0%}" for change in (min(changes), max(changes)))
+    return " to ".join(ends)
 
 
 def _weak(summary: Mapping[str, Any]) -> Iterator[Finding]:

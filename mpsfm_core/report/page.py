@@ -19,7 +19,7 @@ from mpsfm_core.data import Float64
 from mpsfm_core.data.errors import InputError, MpsfmError
 from mpsfm_core.data.result_layout import REPORT
 from mpsfm_core.report import pictures
-from mpsfm_core.report.findings import findings, partner_counts
+from mpsfm_core.report.findings import describe_scale, findings, partner_counts
 from mpsfm_core.report.points import PointSet, dense_points, sparse_points
 from mpsfm_core.report.reasons import explain_image, explain_pair
 from mpsfm_core.report.result_folder import MatchLines, PriorMaps, RefinedMap, ResultFolder
@@ -119,6 +119,7 @@ def _payload(result: ResultFolder) -> dict[str, Any]:
         },
         "up": _estimate_up(refined_maps),
         "reconstructions": summary["reconstructions"],
+        "scale": describe_scale(summary) if summary["reconstructions"] else None,
         "providers": summary["providers"],
         "stages": {name: stage["seconds"] for name, stage in summary["stages"].items()},
         "steps": {name: step["seconds"] for name, step in summary["mapping_steps"].items()},

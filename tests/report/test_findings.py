@@ -20,7 +20,7 @@ from mpsfm_core.data.decisions import (
     reason_from_json,
 )
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.report.findings import findings
+from mpsfm_core.report.findings import describe_scale, findings
 from mpsfm_core.report.reasons import explain
 from mpsfm_core.report.verdict import judge
 
@@ -144,15 +144,41 @@ def test_a_photo_that_hangs_on_another_is_told() -> None:
 
 def test_refined_focal_lengths_are_reported_once() -> None:
     report = summary()
-    for name, origin in (("a", "default"), ("b", "exif")):
+    for name, origin, focal in (("a", "default", 400), ("b", "exif", 400), ("c", "exif", 800)):
         report["images"]["details"][name] |= {
             "focal_length_from": origin,
-            "refined_focal_length_px": 400.0,
+            "refined_focal_length_px": float(focal),
         }
     guess, change = findings(report)
-    assert (guess.images, change.images) == (("a",), ("b",))
-    assert "-20%" in guess.text
-    assert change.text.startswith("From 500 (exif) to 400 px.")
+    assert (guess.images, change.images) == (("a",), ("b", "c"))
+    assert "initial guess by -20%." in guess.text
+    assert change.title == "The focal length of 2 photos changed much"
+    assert "values from exif by -20% to +60%" in change.text
+
+
+@pytest.mark.parametrize(
+    ("metric", "depth", "expected"),
+    [
+        (None, "compact", ("unknown", "no depth is metric")),
+        ({}, "compact", ("meters", "as predicted by compact: 5 depth maps, spread 6%")),
+        ({}, "files", ("meters", "as given by the depth files: 5 depth maps, spread 6%")),
+        ({"by": "GPS positions"}, "compact", ("meters", "by 5 GPS positions, spread 6%")),
+        (
+            {"trusted": False, "metres_per_unit": 0.25},
+            "compact",
+            ("uncertain", "one unit is about 0.25 m by 5 depth maps, spread 6%"),
+        ),
+    ],
+)
+def test_scale_names_its_source(
+    metric: dict[str, Any] | None, depth: str, expected: tuple[str, str]
+) -> None:
+    report = summary()
+    known = {"trusted": True, "spread": 0.06, "num_images": 5, "by": "depth maps"}
+    scale = None if metric is None else known | metric
+    report["reconstructions"][0]["metric_scale"] = scale
+    report["providers"][0]["name"] = depth
+    assert describe_scale(report) == expected
 
 
 def test_findings_of_a_refined_guess_give_its_std() -> None:

@@ -25,7 +25,7 @@ def output(photo_scene, mpsfm, tmp_path_factory: pytest.TempPathFactory) -> Path
     ended = mpsfm(*photo_scene.arguments, "--output", folder)
     assert ended.code == 0, ended.err
     assert "5 of 5 images" in ended.out
-    assert "in meters, by 5 depth maps, spread " in ended.out
+    assert "meters, as given by the depth files: 5 depth maps, spread " in ended.out
     return folder
 
 

@@ -53,8 +53,8 @@
       tiles.push(
         ["Points", number(best.points), `seen by ${number(best.mean_track_length, 1)} photos each`],
         ["Reprojection error", best.mean_reprojection_error_px === null ? "–" : `${number(best.mean_reprojection_error_px, 2)} px`, "mean"],
-        ["Depth uncertainty", percent(best.median_relative_depth_std, 1), "median std, as declared"],
-        ["Scale", scaleWord(best.metric_scale), scaleDetail(best.metric_scale)],
+        ["Refined depth std", percent(best.median_relative_depth_std, 1), "median, relative to depth"],
+        ["Scale", ...data.scale],
       );
     }
     tiles.push(["Time", time(total), data.memory_mb ? `${number(data.memory_mb / 1024, 1)} GB memory at most` : null]);
@@ -74,10 +74,6 @@
       );
     }
   }
-
-  const scaleWord = (metric) => (metric === null ? "unknown" : metric.trusted ? "metres" : "uncertain");
-  const scaleDetail = (metric) =>
-    metric === null ? "no depth in metres" : `by ${number(metric.num_images)} ${metric.by}, spread ${percent(metric.spread)}`;
 
   // ---------------------------------------------------------------- one photo
   const MAPS = [["photo", "Photo"], ["prior", "Prior"], ["refined", "Refined"], ["std", "Std"], ["normals", "Normals"]];
@@ -124,7 +120,7 @@
     }
     const facts = [
       ["Keypoints", number(photo.keypoints)], ["Points", number(photo.points)],
-      ["Error", photo.error === null ? "–" : `${number(photo.error, 2)} px`], ["Depth std", percent(photo.depth_std, 1)],
+      ["Error", photo.error === null ? "–" : `${number(photo.error, 2)} px`], ["Prior depth std", percent(photo.depth_std, 1)],
       ["Focal length", `${number(photo.refined_focal ?? photo.focal)} px`], ["from", photo.refined_focal ? `${photo.focal_from}, refined` : photo.focal_from],
     ];
     know.append(el("dl", { class: "small" }, ...facts.map(([k, v]) => el("div", {}, el("dt", {}, k), el("dd", {}, v)))));
@@ -227,7 +223,7 @@
     ["Keypoints", (p) => p.keypoints, (p) => number(p.keypoints)],
     ["Points", (p) => p.points, (p) => number(p.points)],
     ["Error px", (p) => p.error, (p) => number(p.error, 2)],
-    ["Depth std", (p) => p.depth_std, (p) => percent(p.depth_std, 1)],
+    ["Prior depth std", (p) => p.depth_std, (p) => percent(p.depth_std, 1)],
     ["Valid depth", (p) => p.valid_depth, (p) => percent(p.valid_depth)],
     ["Focal px", (p) => p.refined_focal ?? p.focal, (p) => number(p.refined_focal ?? p.focal)],
   ];
