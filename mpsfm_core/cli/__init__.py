@@ -27,6 +27,7 @@ from mpsfm_core.cli import (
     env,
     evaluate,
     export,
+    import_capture,
     mesh,
     models,
     plugins,
@@ -63,6 +64,7 @@ def build_app() -> typer.Typer:
     )
     app.command("reconstruct")(reconstruct.reconstruct)
     app.command("demo")(demo.demo)
+    app.command("import")(import_capture.import_capture)
     app.command("dense")(dense.dense)
     app.command("mesh")(mesh.mesh)
     app.command("export")(export.export)

@@ -1,4 +1,4 @@
-"""Read GPS positions from EXIF data and convert them to east, north, up."""
+"""Read and write GPS positions in EXIF data, and convert them to east, north, up."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from mpsfm_core.inputs.image_header import exif_block, tiff_entries
 _GPS_IFD = 0x8825
 _LATITUDE_REF, _LATITUDE, _LONGITUDE_REF, _LONGITUDE = 1, 2, 3, 4
 _ALTITUDE_REF, _ALTITUDE, _ERROR_M = 5, 6, 31
+_EXIF_IFD, _FOCAL_35MM = 0x8769, 0xA405
+_BYTE, _ASCII, _SHORT, _LONG, _RATIONAL = 1, 2, 3, 4, 5
+_ENTRY_BYTES = 12
 DEFAULT_STD_M = 5.0
 """Default horizontal standard deviation of GPS in meters, for a phone [GPS.gov, 4.9 m]."""
 
@@ -59,6 +62,66 @@ def read_gps(data: bytes) -> GpsPosition | None:
     if altitude is not None and not -1000 < altitude < 100_000:
         altitude = None
     return GpsPosition(latitude, longitude, altitude, std_m)
+
+
+def insert_exif(
+    jpeg: bytes, position: GpsPosition | None, focal_35mm_mm: float | None = None
+) -> bytes:
+    """Return a JPEG file with EXIF data inserted.
+
+    Args:
+        jpeg: bytes of a JPEG file without EXIF data.
+        position: GPS position.
+        focal_35mm_mm: 35 mm equivalent focal length in mm.
+    """
+    if position is None and focal_35mm_mm is None:
+        return jpeg
+    block = struct.pack("<2sHI", b"II", 42, 8)
+    num_entries = (position is not None) + (focal_35mm_mm is not None)
+    start = len(block) + 2 + _ENTRY_BYTES * num_entries + 4
+    main, directories = [], b""
+    if focal_35mm_mm is not None:
+        main.append((_EXIF_IFD, _LONG, 1, struct.pack("<I", start)))
+        focal = struct.pack("<H", round(focal_35mm_mm))
+        directories = _directory([(_FOCAL_35MM, _SHORT, 1, focal)], start)
+    if position is not None:
+        main.append((_GPS_IFD, _LONG, 1, struct.pack("<I", start + len(directories))))
+        directories += _directory(_gps_entries(position), start + len(directories))
+    content = b"Exif\x00\x00" + block + _directory(main, len(block)) + directories
+    return jpeg[:2] + b"\xff\xe1" + struct.pack(">H", len(content) + 2) + content + jpeg[2:]
+
+
+def _gps_entries(position: GpsPosition) -> list[tuple[int, int, int, bytes]]:
+    """Return tag, type, count and value of the EXIF entries of a GPS position."""
+
+    def degrees(angle: float) -> bytes:
+        return struct.pack("<6I", round(abs(angle) * 1e7), 10_000_000, 0, 1, 0, 1)
+
+    entries = [
+        (_LATITUDE_REF, _ASCII, 2, b"S" if position.latitude < 0 else b"N"),
+        (_LATITUDE, _RATIONAL, 3, degrees(position.latitude)),
+        (_LONGITUDE_REF, _ASCII, 2, b"W" if position.longitude < 0 else b"E"),
+        (_LONGITUDE, _RATIONAL, 3, degrees(position.longitude)),
+    ]
+    if position.altitude is not None:
+        millimeters = struct.pack("<2I", round(abs(position.altitude) * 1000), 1000)
+        entries.append((_ALTITUDE_REF, _BYTE, 1, b"\x01" if position.altitude < 0 else b"\x00"))
+        entries.append((_ALTITUDE, _RATIONAL, 1, millimeters))
+    return entries
+
+
+def _directory(entries: list[tuple[int, int, int, bytes]], offset: int) -> bytes:
+    """Return a TIFF directory that starts at a byte offset of its EXIF block."""
+    values_start = offset + 2 + _ENTRY_BYTES * len(entries) + 4
+    directory, values = struct.pack("<H", len(entries)), b""
+    for tag, kind, count, value in entries:
+        if len(value) > 4:
+            place = struct.pack("<I", values_start + len(values))
+            values += value
+        else:
+            place = value.ljust(4, b"\x00")
+        directory += struct.pack("<HHI", tag, kind, count) + place
+    return directory + struct.pack("<I", 0) + values
 
 
 def convert_to_enu(positions: Sequence[GpsPosition], origin: GpsPosition) -> Float64:

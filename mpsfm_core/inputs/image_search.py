@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 
 from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.data.result_layout import SUMMARY
+from mpsfm_core.inputs.captures.convert import find_format
 from mpsfm_core.inputs.image_decoding import EXTENSIONS
 from mpsfm_core.inputs.text_files import read_text_file
 from mpsfm_core.inputs.video import EXTENSIONS as VIDEO_EXTENSIONS
@@ -38,8 +39,13 @@ def find_images(folder: Path, without: Path | None = None) -> list[str]:
         Image names relative to the folder, in natural order.
 
     Raises:
-        InputError: the path does not exist or is not a folder.
+        InputError: the path does not exist, is not a folder, or is a capture with sensor depth.
     """
+    if (capture := find_format(folder)) is not None:
+        raise InputError(
+            f"{folder} is a capture of {capture.name}; convert it first: "
+            f"mpsfm import '{folder}' --output DIR"
+        )
     if not folder.is_dir():
         if folder.exists():
             raise InputError(

@@ -17,6 +17,7 @@ import numpy as np
 from mpsfm_core.data import Float32, UInt8
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.options import VideoOptions
+from mpsfm_core.inputs.telemetry import read_telemetry
 from mpsfm_core.providers.weights import file_sha256
 from mpsfm_core.support.files import replace_entries
 from mpsfm_core.support.format_versions import VERSION, check_version
@@ -64,8 +65,9 @@ def extract_frames(
 ) -> Path:
     """Select frames of a video and write them as JPEG files into ``output/frames``.
 
-    The name of a JPEG file contains the frame number. Existing frames of the same video and options
-    are reused.
+    The name of a JPEG file contains the frame number, and its EXIF has the GPS position if a drone
+    or action camera recorded positions (see :func:`read_telemetry`). Existing frames of the same
+    video and options are reused.
 
     Args:
         video: video file.
@@ -81,18 +83,25 @@ def extract_frames(
     """
     folder = output / FRAMES
     origin: dict[str, Any] = {"sha256": _digest(video), "options": options.model_dump(mode="json")}
+    telemetry = read_telemetry(video)
+    if telemetry.points:
+        origin["telemetry"] = telemetry.digest
     if _read_list(folder / _LIST) == origin:
         return folder
     origin[VERSION] = FORMAT
     chosen = choose_frames(video, options, progress)
     with replace_entries(output, (FRAMES,)) as fresh:
         (fresh / FRAMES).mkdir()
-        for number, frame in _frames(video, frozenset(chosen)):
+        for number, frame in read_frames(video, frozenset(chosen)):
             path = fresh / FRAMES / f"frame_{number:06d}.jpg"
-            encoded = cv2.imencode(path.suffix, frame, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1]
-            path.write_bytes(encoded.tobytes())
+            path.write_bytes(telemetry.add_exif(encode_frame(frame), number))
         (fresh / FRAMES / _LIST).write_text(json.dumps(origin), encoding="utf-8")
     return folder
+
+
+def encode_frame(frame: UInt8) -> bytes:
+    """Encode a BGR image as JPEG."""
+    return cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
 
 
 def choose_frames(
@@ -111,7 +120,7 @@ def choose_frames(
     announced = _read_frame_count(video)
     chooser = _Chooser(options)
     decoded = 0
-    for number, frame in _frames(video):
+    for number, frame in read_frames(video):
         decoded = number + 1
         chooser.process(_Frame(number, _gray(frame, _TRACKED_SIDE), _sharpness(frame)))
         if progress is not None:
@@ -234,7 +243,7 @@ def _sharpness(frame: UInt8) -> float:
     return float(cv2.Laplacian(_gray(frame, _SHARPNESS_SIDE), cv2.CV_32F).var())
 
 
-def _frames(video: Path, wanted: frozenset[int] | None = None) -> Iterator[tuple[int, UInt8]]:
+def read_frames(video: Path, wanted: frozenset[int] | None = None) -> Iterator[tuple[int, UInt8]]:
     """Yield number and upright BGR image of all frames, or of the frames ``wanted``."""
     with _opened(video) as capture:
         number = 0
