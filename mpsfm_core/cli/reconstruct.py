@@ -168,10 +168,10 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
             _row("warning", f"{finding.title}: {finding.text}")
     for name, reason in images["unconfirmed"].items():
         _row("guessed", f"not confirmed: {name}: {explain_image(reason).text}")
-    for name, reason in images["left_out"].items():
-        _row("missing", f"left out: {name}: {reason}")
-    for name, reason in images["failed"].items():
-        _row("missing", f"a provider failed: {name}: {reason}")
+    for name, fault in images["left_out"].items():
+        _row("missing", f"left out: {name}: {fault}")
+    for name, fault in images["failed"].items():
+        _row("missing", f"a provider failed: {name}: {fault}")
     for name, reason in images["unregistered"].items():
         _row("missing", f"not registered: {name}: {explain_image(reason).text}")
     if (output / "report.html").is_file():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
 
 from mpsfm_core.data import (
     DepthPrior,
@@ -99,5 +98,3 @@ class Priors:
     scale."""
     proposed_poses: Mapping[str, Pose] = field(default_factory=dict)
     """Pose ``cam_from_group`` that a multi-view network predicts, by image name."""
-    report: Mapping[str, Any] = field(default_factory=dict)
-    """Plain data for ``summary.json``."""

@@ -1,13 +1,13 @@
-"""Extraction section of ``summary.json``: pairs, images and providers, as plain data."""
+"""Report of an extraction: outcomes of pairs, statistics of images and usage of providers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from typing import TypedDict
 
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, MappingImage, MappingProblem
+from mpsfm_core.data.decisions import Value
 from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.match_graph import MatchGraph
@@ -15,12 +15,69 @@ from mpsfm_core.extraction.matching.pair_matching import CandidateMatches
 from mpsfm_core.extraction.matching.verification import TwoViewGeometry
 
 
+class PairReport(TypedDict, total=False):
+    """Outcome of the geometric verification of an image pair."""
+
+    images: list[str]
+    """Names of both images."""
+    matches: int
+    """Number of candidate matches."""
+    inliers: int
+    """Number of inliers of the two-view geometry, for verified pairs."""
+    geometry: str
+    """COLMAP's configuration of the two-view geometry, for verified pairs."""
+    dropped: dict[str, Value]
+    """Reason (``PairReason``) why the pair was dropped, for all other pairs."""
+
+
+class ImageReport(TypedDict):
+    """Statistics of the features and priors of an image."""
+
+    keypoints: int
+    adjusted_keypoints: int
+    valid_depth: float
+    """Share of the pixels with a valid depth prior."""
+    median_relative_depth_std: float | None
+    """Median of the standard deviation of depth relative to depth."""
+    valid_normals: float
+    """Share of the pixels with a valid normal prior."""
+
+
+class ProviderReport(TypedDict):
+    """Usage of a provider."""
+
+    kind: str
+    name: str
+    computed: int
+    """Number of computed results."""
+    from_cache: int
+    """Number of results that were read from the cache."""
+    seconds: float
+    """Time of all calls of the provider in seconds."""
+
+
+class ExtractionReport(TypedDict):
+    """Report of an extraction."""
+
+    pairs_proposed: int
+    """Number of selected pairs before plugins filter the pairs."""
+    pairs_matched: int
+    pairs_verified: int
+    pairs: list[PairReport]
+    """All matched pairs."""
+    failed: dict[str, str]
+    """Errors of providers, by image name."""
+    images: dict[str, ImageReport]
+    """Statistics of each image, by image name."""
+    providers: list[ProviderReport]
+
+
 def describe(
     context: ExtractionContext,
     problem: MappingProblem,
     graph: MatchGraph,
-) -> dict[str, Any]:
-    """Describe pairs, images and providers of an extraction as plain data.
+) -> ExtractionReport:
+    """Describe pairs, images and providers of an extraction.
 
     Args:
         context: Context of the extraction with images, failures and providers.
@@ -43,7 +100,7 @@ def describe(
     }
 
 
-def merge_reports(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, Any]:
+def merge_reports(first: ExtractionReport, second: ExtractionReport) -> ExtractionReport:
     """Merge the reports of the first and second extraction pass."""
     pairs = {tuple(pair["images"]): pair for pair in first["pairs"]}
     for pair in second["pairs"]:
@@ -51,7 +108,6 @@ def merge_reports(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[s
         pairs[images] = _merge_pair(pairs.get(images, pair), pair)
     used = {(provider["kind"], provider["name"]) for provider in second["providers"]}
     return {
-        **first,
         "pairs_proposed": first["pairs_proposed"] + second["pairs_proposed"],
         "pairs_matched": first["pairs_matched"] + second["pairs_matched"],
         "pairs_verified": second["pairs_verified"],
@@ -65,28 +121,29 @@ def merge_reports(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[s
     }
 
 
-def _merge_pair(first: dict[str, Any], second: dict[str, Any]) -> dict[str, Any]:
+def _merge_pair(first: PairReport, second: PairReport) -> PairReport:
     """Merge two reports of an image pair; a verified result replaces a dropped one."""
     if first is second or "dropped" in first:
         return second
     if "dropped" in second:
         return first
     best = max(first, second, key=lambda pair: pair["inliers"])
-    return {**best, **{key: first[key] + second[key] for key in ("matches", "inliers")}}
+    num_inliers = first["inliers"] + second["inliers"]
+    return {**best, "matches": first["matches"] + second["matches"], "inliers": num_inliers}
 
 
 def _pair(
     names: list[str], matches: CandidateMatches, outcome: TwoViewGeometry, min_matches: int
-) -> dict[str, Any]:
+) -> PairReport:
     a, b = matches.pair
-    described: dict[str, Any] = {"images": [names[a], names[b]], "matches": len(matches)}
+    described: PairReport = {"images": [names[a], names[b]], "matches": len(matches)}
     if outcome.dropped:
         reason = outcome.drop_reason(len(matches), min_matches)
         return {**described, "dropped": reason.to_json()}
     return {**described, "inliers": len(outcome.inliers), "geometry": outcome.configuration}
 
 
-def _image(image: MappingImage) -> dict[str, Any]:
+def _image(image: MappingImage) -> ImageReport:
     return {
         "keypoints": len(image.keypoints),
         "adjusted_keypoints": _num_adjusted(image),
@@ -108,7 +165,7 @@ def _relative_std(depth: DepthPrior) -> float | None:
     return round(float(np.median(std / depth.depth[depth.valid])), 5)
 
 
-def _provider(provider: ActiveProvider) -> dict[str, Any]:
+def _provider(provider: ActiveProvider) -> ProviderReport:
     return {
         "kind": provider.kind,
         "name": provider.spec.name,

@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -43,7 +42,7 @@ from mpsfm_core.extraction.pairs.selection import PairSelection
 from mpsfm_core.extraction.priors.multiview import GroupPriors
 from mpsfm_core.extraction.priors.prior_predictor import PriorPredictor, check_depth_source
 from mpsfm_core.extraction.remote_execution import use_executor
-from mpsfm_core.extraction.report import describe, merge_reports
+from mpsfm_core.extraction.report import ExtractionReport, describe, merge_reports
 from mpsfm_core.geometry import sample_nearest
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.matches import ImportedMatches
@@ -57,8 +56,8 @@ class Extraction:
 
     problem: MappingProblem
     """Input of the mapper, with the images in the order of the image set."""
-    report: dict[str, Any]
-    """Plain data for ``summary.json``: matched and dropped pairs, and the usage of providers."""
+    report: ExtractionReport
+    """Outcomes of pairs, statistics of images and usage of providers, for ``summary.json``."""
 
 
 def extract(
@@ -168,7 +167,7 @@ def _extract(context: ExtractionContext, imported: ImportedMatches | None) -> Ex
         graph = verify_imported(context, imported)
     priors = predict_priors(context, graph)
     problem = assemble_problem(context.images, graph, priors)
-    return Extraction(problem, {**describe(context, problem, graph), **priors.report})
+    return Extraction(problem, describe(context, problem, graph))
 
 
 def feature_table(context: ExtractionContext) -> FeatureTable | None:
@@ -262,15 +261,12 @@ def predict_priors(context: ExtractionContext, graph: MatchGraph | None) -> Prio
     predicted = PriorPredictor(context, matcher, candidates, groups).run()
     depth = {name: prior for name, (prior, _) in zip(names, predicted, strict=True)}
     normals = {name: prior for name, (_, prior) in zip(names, predicted, strict=True)}
-    if groups is None:
+    if groups is None or context.config.depth.use != FROM_MULTIVIEW:
         return Priors(depth, normals)
-    report = {"groups": groups.described()}
-    if context.config.depth.use != FROM_MULTIVIEW:
-        return Priors(depth, normals, report=report)
     places = {name: groups.place(index) for index, name in enumerate(names)}
     poses = {name: pose for name, (_, pose) in places.items() if pose is not None}
     numbers = {name: number for name, (number, _) in places.items()}
-    return Priors(depth, normals, numbers, poses, report)
+    return Priors(depth, normals, numbers, poses)
 
 
 def assemble_problem(images: ImageSet, graph: MatchGraph, priors: Priors) -> MappingProblem:

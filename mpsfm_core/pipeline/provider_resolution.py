@@ -8,7 +8,7 @@ is tried.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,12 +17,14 @@ from mpsfm_core.config import BLOCKS, Config, check_provider_config, combination
 from mpsfm_core.data.decisions import ChoiceReason, ProviderReason, Reason
 from mpsfm_core.data.errors import ConfigError, InputError, WeightsError
 from mpsfm_core.data.options import Options, SettingPath, SettingsError, dotted
+from mpsfm_core.extraction.report import ProviderReport
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers import Kind, ProviderSpec, WeightsFile
 from mpsfm_core.providers.provider_config import SAME_NETWORK, ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore, is_remote
 from mpsfm_core.report.reasons import explain
+from mpsfm_core.results.summary import ProviderSummary
 
 _MEGABYTE = 1_000_000
 
@@ -66,6 +68,33 @@ class ProviderResolution:
     choices: tuple[ProviderChoice, ...]
     """Chosen provider of each configuration block, in the order of
     :meth:`Config.provider_configs`."""
+
+    def describe(self, usage: Sequence[ProviderReport]) -> list[ProviderSummary]:
+        """Describe choice, licenses and usage of the provider of each block."""
+        reports = {(report["kind"], report["name"]): report for report in usage}
+        described: list[ProviderSummary] = []
+        blocks = zip(self.choices, self.config.provider_configs(), strict=True)
+        for choice, (_, kind, provider_config) in blocks:
+            spec = choice.provider
+            unused = ProviderReport(
+                kind=kind, name=spec.name, computed=0, from_cache=0, seconds=0.0
+            )
+            described.append(
+                {
+                    "block": choice.block,
+                    **reports.get((kind, spec.name), unused),
+                    "from": choice.origin,
+                    "chosen": choice.reason.value,
+                    "passed_over": {
+                        name: why.to_json() for name, why in choice.passed_over.items()
+                    },
+                    "code_license": spec.code_license,
+                    "weights_license": spec.weights_license,
+                    "accuracy": spec.accuracy,
+                    "wrappers": [wrapper.use for wrapper in provider_config.wrap],
+                }
+            )
+        return described
 
 
 def resolve_providers(

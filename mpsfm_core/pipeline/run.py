@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -41,11 +41,6 @@ from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstructio
 from mpsfm_core.pipeline import precompile, resources
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, MappingCheckpoints
 from mpsfm_core.pipeline.provider_resolution import ProviderResolution, resolve_providers
-from mpsfm_core.pipeline.run_summary import (
-    summarize_resources,
-    summarize_results,
-    summarize_run,
-)
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.provider_config import FROM_MATCHER
 from mpsfm_core.providers.registry import Registry
@@ -53,6 +48,15 @@ from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.report.page import write_report
 from mpsfm_core.results.georeference import georeference
 from mpsfm_core.results.original_images import OriginalImages
+from mpsfm_core.results.summary import FORMAT as SUMMARY_FORMAT
+from mpsfm_core.results.summary import (
+    RunSummary,
+    describe_images,
+    describe_mapping_steps,
+    describe_pairs,
+    describe_reconstructions,
+    describe_versions,
+)
 from mpsfm_core.results.writer import ComponentResult, update_summary, write_failure, write_results
 from mpsfm_core.support.disk_arrays import DiskArrays
 from mpsfm_core.support.files import lock_output_folder
@@ -74,7 +78,7 @@ class ReconstructionResult:
     """COLMAP models of all components except the largest, sorted by size."""
     mapping: MappingResult
     """Poses, points and refined depth maps as arrays."""
-    summary: dict[str, Any]
+    summary: RunSummary
     """Content of ``summary.json``."""
     output: Path | None
     """Result folder, or None for a run without output folder."""
@@ -456,21 +460,19 @@ class _Run:
         originals: OriginalImages,
     ) -> ReconstructionResult:
         """Convert reconstructions to COLMAP models, and write result folder and summary."""
-        summary: dict[str, Any] = {}
         config = self._config
         with self._stages.stage("results"):
             components = [ComponentResult.of(part, originals) for part in mapping.reconstructions]
             models = tuple(component.model for component in components)
 
-            def summarize() -> dict[str, Any]:
-                summary.update(self._summarize("success", images, extraction, mapping, models))
-                return summary
-
+            summarize = partial(self._summarize, "success", images, extraction, mapping, models)
             if self._output is None:
-                summarize()
+                summary = summarize()
             else:
-                seed = config.runtime.seed
-                write_results(self._output, components, originals, config.results, summarize, seed)
+                seed, options = config.runtime.seed, config.results
+                summary = write_results(
+                    self._output, components, originals, options, summarize, seed
+                )
         return ReconstructionResult(models[0], models[1:], mapping, summary, self._output)
 
     def _fail(
@@ -506,13 +508,11 @@ class _Run:
                 _log.warning("report.html cannot be written, all other results are: %s", error)
                 _log.debug("the report", exc_info=True)
 
-    def _complete_summary(self, summary: dict[str, Any]) -> None:
+    def _complete_summary(self, summary: RunSummary) -> None:
         """Add measured memory and disk space of the whole run to ``summary.json``."""
         if self._output is None:
             return
-        summary["resources"] = summarize_resources(
-            self._estimate, self._stages, self._children, self._output
-        )
+        summary["resources"] = self._describe_resources(self._output)
         with suppress(OSError):  # summary.json of the results stage stays valid
             update_summary(self._output, summary)
 
@@ -523,17 +523,40 @@ class _Run:
         extraction: Extraction,
         mapping: MappingResult,
         models: Sequence[pycolmap.Reconstruction],
-    ) -> dict[str, Any]:
-        usage = extraction.report["providers"]
+    ) -> RunSummary:
+        """Collect the facts of all stages for ``summary.json``."""
+        config, stages = self._config, self._stages
         return {
-            **summarize_run(status, self._resolution, self._stages, usage),
+            "format_version": SUMMARY_FORMAT,
+            "status": status,
+            "warnings": list(stages.warnings),
+            "stages": {
+                name: {"seconds": record.seconds, "peak_memory_mb": record.peak_memory_mb}
+                for name, record in stages.report().items()
+            },
+            "providers": self._resolution.describe(extraction.report["providers"]),
+            "config": config.model_dump(mode="json"),
+            "versions": describe_versions(),
             "photos": None if self._image_folder is None else str(self._image_folder.resolve()),
             "matches_from": None if self._imported is None else self._imported.source,
-            **summarize_results(images, extraction, mapping, models),
+            "images": describe_images(images, extraction.report, mapping),
+            "pairs": describe_pairs(extraction.report, mapping, extraction.problem),
+            "reconstructions": describe_reconstructions(mapping, models, extraction.problem),
+            "mapping_runs": mapping.report.runs,
+            "mapping_steps": describe_mapping_steps(mapping),
             "georeference": self._georeference_report,
             "dense": self._dense_reports,
-            "resources": summarize_resources(self._estimate, self._stages, self._children),
+            "resources": self._describe_resources(),
         }
+
+    def _describe_resources(self, output: Path | None = None) -> dict[str, Any]:
+        """Describe estimated and measured memory and disk space; memory is the peak so far."""
+        peaks = [record.peak_memory_mb or 0.0 for record in self._stages.report().values()]
+        measured = {
+            "memory_mb": round(max(peaks, default=0.0) + self._children.peak_mb),
+            "output_mb": None if output is None else round(resources.measure_folder_mb(output)),
+        }
+        return {"predicted": asdict(self._estimate), "measured": measured}
 
     def _check_resources(self, images: ImageSet) -> None:
         """Report estimated memory and disk space; use fewer workers if memory is short.

@@ -1,31 +1,141 @@
-"""Content of ``summary.json``: images, pairs and reconstructions as plain data."""
+"""Content of ``summary.json``.
+
+:class:`RunSummary` declares all keys. The pipeline fills in the choice of providers, times,
+resources and configuration, and this module describes images, pairs and reconstructions.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import platform
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import pycolmap
 
 from mpsfm_core.data import MappingProblem
-from mpsfm_core.data.decisions import ImageReason
+from mpsfm_core.data.decisions import ImageReason, Value
 from mpsfm_core.data.errors import InputError
+from mpsfm_core.extraction.report import ExtractionReport
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.mapping.scene.reconstruction import (
     MappingResult,
-    MetricScale,
     Reconstruction,
     RegisteredImage,
 )
+from mpsfm_core.providers.registry import core_version
 from mpsfm_core.results.evidence import count_explained_matches, describe_evidence
 from mpsfm_core.support.format_versions import check_version
 
 FORMAT = 1
 """Format version of ``summary.json`` and of the files in ``views/``."""
+
+
+class ImagesSummary(TypedDict):
+    """Status and statistics of the images of a run."""
+
+    total: int
+    registered: list[str]
+    unconfirmed: dict[str, dict[str, Value]]
+    """Reason why each tentatively registered image is not verified, by image name."""
+    unregistered: dict[str, dict[str, Value]]
+    """Reason why each unregistered image is not registered, by image name."""
+    left_out: dict[str, str]
+    """Reason why a file is not used as an image, by file name."""
+    failed: dict[str, str]
+    """Errors of providers, by image name."""
+    details: dict[str, dict[str, Any]]
+    """Focal length and :class:`~mpsfm_core.extraction.report.ImageReport`, by
+    image name."""
+
+
+class PairsSummary(TypedDict):
+    """Numbers of image pairs, and the outcome of each pair."""
+
+    proposed: int
+    matched: int
+    verified: int
+    all: list[dict[str, Any]]
+    """:class:`~mpsfm_core.extraction.report.PairReport` of each pair, with the number ``explained``
+    of inliers whose keypoints share a 3D point of the first model, and the reason ``cannot_start``
+    why the pair cannot initialize a component."""
+
+
+class ReconstructionSummary(TypedDict):
+    """Size, errors and evidence of one reconstruction."""
+
+    images: int
+    points: int
+    observations: int
+    mean_track_length: float
+    mean_reprojection_error_px: float | None
+    """Mean over the 3D points in pixels of the original images."""
+    median_relative_depth_std: float | None
+    metric_scale: dict[str, Any] | None
+    """:class:`~mpsfm_core.mapping.scene.reconstruction.MetricScale` of the reconstruction."""
+    evidence: dict[str, Any]
+    """Result of :func:`~mpsfm_core.results.evidence.describe_evidence`."""
+
+
+ProviderSummary = TypedDict(
+    "ProviderSummary",
+    {
+        "block": str,  # of the configuration
+        "kind": str,
+        "name": str,
+        "computed": int,
+        "from_cache": int,
+        "seconds": float,
+        "from": str,  # Python distribution and version
+        "chosen": str,
+        "passed_over": dict[str, dict[str, Value]],
+        "code_license": str,
+        "weights_license": str,
+        "accuracy": str,
+        "wrappers": list[str],
+    },
+)
+
+
+class StageSummary(TypedDict):
+    """Run time and peak memory of a stage."""
+
+    seconds: float
+    peak_memory_mb: float | None
+
+
+class RunSummary(TypedDict):
+    """Content of ``summary.json``."""
+
+    format_version: int
+    status: str
+    """``success`` or ``failed``."""
+    warnings: list[str]
+    stages: dict[str, StageSummary]
+    providers: list[ProviderSummary]
+    config: dict[str, Any]
+    versions: dict[str, str]
+    photos: str | None
+    """Absolute path of the folder of photos, or None for photos in memory."""
+    matches_from: str | None
+    """File of imported matches."""
+    images: ImagesSummary
+    pairs: PairsSummary
+    reconstructions: list[ReconstructionSummary]
+    """All components, the model in ``sparse`` first."""
+    mapping_runs: int
+    """Number of mapper runs with different seeds."""
+    mapping_steps: dict[str, dict[str, Any]]
+    """Seconds and number of calls of each step of the mapper."""
+    georeference: dict[str, Any] | None
+    """Alignment of the first reconstruction with GPS positions, or the reason ``why_not``."""
+    dense: list[dict[str, Any]] | None
+    """Stereo depth of each reconstruction."""
+    resources: dict[str, Any]
+    """Memory and disk space, ``predicted`` and ``measured``."""
 
 
 def read_summary(path: Path) -> dict[str, Any]:
@@ -48,9 +158,27 @@ def read_summary(path: Path) -> dict[str, Any]:
     return summary
 
 
+def describe_versions() -> dict[str, str]:
+    """Return the versions of MP-SfM, pycolmap and Python."""
+    return {
+        "mpsfm-core": core_version(),
+        "pycolmap": pycolmap.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def describe_mapping_steps(mapping: MappingResult) -> dict[str, dict[str, Any]]:
+    """Describe run time and number of calls of each step of the mapper."""
+    report = mapping.report
+    return {
+        name: {"seconds": seconds, "calls": report.counts.get(name)}
+        for name, seconds in report.seconds.items()
+    }
+
+
 def describe_images(
-    images: ImageSet, extraction: Mapping[str, Any], mapping: MappingResult
-) -> dict[str, Any]:
+    images: ImageSet, extraction: ExtractionReport, mapping: MappingResult
+) -> ImagesSummary:
     """Describe status and statistics of all images, with reasons for unregistered images.
 
     Args:
@@ -79,7 +207,7 @@ def describe_images(
         "unconfirmed": {name: reason for name, reason in reasons.items() if name in placed},
         "unregistered": {name: reason for name, reason in reasons.items() if name not in placed},
         "left_out": images.left_out,
-        "failed": extraction.get("failed", {}),
+        "failed": extraction["failed"],
         "details": {
             image.name: {
                 **_focal_length(image, registered.get(image.name)),
@@ -109,8 +237,8 @@ def _focal_length(image: SourceImage, registered: RegisteredImage | None) -> dic
 
 
 def describe_pairs(
-    extraction: Mapping[str, Any], mapping: MappingResult, problem: MappingProblem
-) -> dict[str, Any]:
+    extraction: ExtractionReport, mapping: MappingResult, problem: MappingProblem
+) -> PairsSummary:
     """Describe matches and inliers of all image pairs, and why pairs were dropped.
 
     The entry ``explained`` counts the inliers of a pair whose keypoints share a 3D point of the
@@ -125,7 +253,7 @@ def describe_pairs(
     models = mapping.reconstructions[:1]
     explained = count_explained_matches(models[0], problem) if models else {}
     for pair in extraction["pairs"]:
-        entry = dict(pair)
+        entry: dict[str, Any] = {**pair}
         names = tuple(pair["images"])
         if names in explained:
             entry["explained"] = explained[names]
@@ -142,7 +270,7 @@ def describe_pairs(
 
 def describe_reconstructions(
     mapping: MappingResult, models: Sequence[pycolmap.Reconstruction], problem: MappingProblem
-) -> list[dict[str, Any]]:
+) -> list[ReconstructionSummary]:
     """Describe size and errors of each reconstruction, the model in ``sparse`` first.
 
     The entry ``mean_reprojection_error_px`` is the mean over the 3D points in pixels of the
@@ -154,12 +282,14 @@ def describe_reconstructions(
         problem: mapping problem, the input of the mapper.
     """
     return [
-        {**_describe(reconstruction, model), "evidence": describe_evidence(reconstruction, problem)}
+        _describe(reconstruction, model, problem)
         for reconstruction, model in zip(mapping.reconstructions, models, strict=True)
     ]
 
 
-def _describe(reconstruction: Reconstruction, model: pycolmap.Reconstruction) -> dict[str, Any]:
+def _describe(
+    reconstruction: Reconstruction, model: pycolmap.Reconstruction, problem: MappingProblem
+) -> ReconstructionSummary:
     relative_std = [
         np.sqrt(image.depth.variance[image.depth.valid]) / image.depth.depth[image.depth.valid]
         for image in reconstruction.images
@@ -172,7 +302,8 @@ def _describe(reconstruction: Reconstruction, model: pycolmap.Reconstruction) ->
         "mean_track_length": model.compute_mean_track_length() if model.num_points3D() else 0.0,
         "mean_reprojection_error_px": _mean_error(model),
         "median_relative_depth_std": _median(relative_std),
-        "metric_scale": _metric(reconstruction.metric),
+        "metric_scale": None if reconstruction.metric is None else asdict(reconstruction.metric),
+        "evidence": describe_evidence(reconstruction, problem),
     }
 
 
@@ -183,7 +314,3 @@ def _mean_error(model: pycolmap.Reconstruction) -> float | None:
 def _median(values: Sequence[np.ndarray[Any, Any]]) -> float | None:
     pooled = np.concatenate(values) if values else np.zeros(0)
     return float(np.median(pooled)) if len(pooled) else None
-
-
-def _metric(metric: MetricScale | None) -> dict[str, Any] | None:
-    return None if metric is None else asdict(metric)

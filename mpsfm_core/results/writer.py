@@ -25,7 +25,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import pycolmap
 
@@ -57,6 +57,8 @@ from mpsfm_core.results.views import write_views
 from mpsfm_core.support.files import replace_entries, write_file
 
 _log = logging.getLogger(__name__)
+
+Summary = TypeVar("Summary", bound=Mapping[str, Any])
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +95,9 @@ def write_results(
     components: Sequence[ComponentResult],
     photos: OriginalImages,
     options: ResultOptions,
-    summarize: Callable[[], Mapping[str, Any]],
+    summarize: Callable[[], Summary],
     seed: int = 0,
-) -> None:
+) -> Summary:
     """Write the results of a successful run.
 
     Args:
@@ -106,6 +108,9 @@ def write_results(
         summarize: function that returns the content of ``summary.json``, called after all other
             files are written.
         seed: random seed of the selection of pixels for ``dense.ply``.
+
+    Returns:
+        The content of ``summary.json``.
 
     Raises:
         OSError: as :func:`mpsfm_core.support.files.replace_entries`.
@@ -129,7 +134,9 @@ def write_results(
             _write_nerfstudio(folder / TRANSFORMS, output, largest, photos)
         if options.report:
             write_views(folder / VIEWS, photos.problem, photos.view)
-        _write_json(folder / SUMMARY, summarize())
+        summary = summarize()
+        _write_json(folder / SUMMARY, summary)
+    return summary
 
 
 def _write_text_model(folder: Path, model: pycolmap.Reconstruction) -> None:

@@ -110,14 +110,12 @@ def test_extract_with_multiview_sets_depth_groups_and_poses(
     assert np.median(first.depth.depth) == pytest.approx(2 * np.median(rendered), rel=0.02)
 
 
-def test_multiview_second_run_uses_cache_and_reports_groups(
-    world: World, shown: list[list[str]]
-) -> None:
+def test_multiview_second_run_uses_cache(world: World, shown: list[list[str]]) -> None:
     world.extract(**MULTIVIEW)
     shown.clear()
-    report = world.extract(**MULTIVIEW).report
+    problem = world.extract(**MULTIVIEW).problem
     assert not shown
-    assert [sorted(group) for group in report["groups"]] == [sorted(world.names)]
+    assert {image.depth_group for image in problem.images} == {0}
 
 
 def test_depth_of_other_provider_has_no_group(world: World, shown: list[list[str]]) -> None:

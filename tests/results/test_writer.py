@@ -192,7 +192,7 @@ def test_a_refined_focal_length_reaches_the_photos_camera(solved, tmp_path: Path
     np.testing.assert_allclose(camera.params, [154, 155.1, 80.5, 59])
     mapping = MappingResult((reconstruction,), solved.result.report)
     nothing: dict[str, dict[str, object]] = {name: {} for name in images.names}
-    details = describe_images(images, {"images": nothing}, mapping)["details"]
+    details = describe_images(images, {"images": nothing, "failed": {}}, mapping)["details"]
     assert details["images/0.png"] == {
         "focal_length_from": "default",
         "focal_length_px": pytest.approx(140.5),
@@ -271,7 +271,7 @@ def test_the_summary_tells_which_images_nothing_confirms(solved, tmp_path: Path)
             "images/3.png": ImageReason.NO_POSE.because(),
         }
     )
-    extraction = {"images": {name: {} for name in images.names}}
+    extraction = {"images": {name: {} for name in images.names}, "failed": {}}
     described = describe_images(images, extraction, MappingResult((best, other), report))
     assert described["registered"] == ["images/0.png"]
     assert described["unconfirmed"] == {
@@ -304,6 +304,7 @@ def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path)
         "pairs_proposed": 6,
         "pairs_matched": 1,
         "pairs_verified": 1,
+        "failed": {},
     }
     described = describe_images(images, extraction, mapping)
     assert described["total"] == 4

@@ -108,11 +108,6 @@ class GroupPriors:
             return number, None
         return number, (poses[row, :, :3].copy(), poses[row, :, 3].copy())
 
-    def described(self) -> list[list[str]]:
-        """Return the image names of each multi-view group, for the report."""
-        names = self._context.images.names
-        return [[names[image] for image in group] for group, _ in self.groups]
-
     def _predict_poses(self, group: Group) -> Float64 | None:
         """Predict the poses of an image group; depth maps stay in the disk cache."""
         return self.predict(group).poses
