@@ -37,6 +37,13 @@ def reconstruct(
             "default: --poses, then EXIF.",
         ),
     ] = None,
+    camera_per: Annotated[
+        str | None,
+        typer.Option(
+            metavar="image|folder|set",
+            help="Photos of a folder or the set share a camera, or none; default: by EXIF.",
+        ),
+    ] = None,
     image_list: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Use only these photos, one name per line.")
     ] = None,
@@ -77,6 +84,9 @@ def reconstruct(
     """
     if database is not None and hloc is not None:
         raise typer.BadParameter("use --database or --hloc for matches, not both")
+    settings = config_overrides(overrides, offline)
+    if camera_per is not None:
+        settings.append(f"inputs.camera_per={camera_per}")
     run(
         images,
         output,
@@ -87,7 +97,7 @@ def reconstruct(
         poses=poses,
         database=database,
         hloc=hloc,
-        overrides=config_overrides(overrides, offline),
+        overrides=settings,
         fresh=fresh,
         viewer=viewer,
     )

@@ -41,9 +41,10 @@ class MappingImage:
     keypoint_std_factor: Float64 | None = None
     """(n,) float64 > 0, std of each adjusted keypoint relative to ``keypoint_std_px`` (None: 1)."""
     focal_known: bool = True
-    """False if the focal length is a guess for bundle adjustment to refine.
-
-    Images with equal intrinsics share a guessed focal length."""
+    """False if the focal length is a guess for bundle adjustment to refine."""
+    camera_id: int = 0
+    """Number of the physical camera. Images with equal number and intrinsics share a guessed focal
+    length."""
     focal_log_std: float = 0.7
     """Prior std of the logarithm of a guessed focal length."""
     focal_guess_px: float | None = None
@@ -70,6 +71,11 @@ class MappingImage:
             raise DataError("normals", "normal prior has no variance; calibrate the prior")
         if self.depth.shape != self.normals.shape:
             raise DataError("normals", "normal map must have the size of the depth map")
+
+    @property
+    def shared_camera(self) -> tuple[int, PinholeCamera]:
+        """Number and intrinsics, which are equal for images that share a guessed focal length."""
+        return self.camera_id, self.camera
 
     @property
     def focal_prior_px(self) -> float:

@@ -239,6 +239,7 @@ class _Builder:
             keypoint_std_px=self._std_px[name],
             keypoint_std_factor=None if factor is None or len(factor) != len(keypoints) else factor,
             focal_known=source is None or source.focal_known,
+            camera_id=0 if source is None else source.camera.camera_id,
             focal_log_std=0.7 if source is None else source.focal_log_std,
             known_pose=None if name not in poses else pose_from(name, poses[name]),
         )

@@ -283,6 +283,7 @@ def assemble_problem(images: ImageSet, graph: MatchGraph, priors: Priors) -> Map
                 keypoint_std_px=assembled.std_px[index],
                 keypoint_std_factor=assembled.std_factor[index],
                 focal_known=image.focal_known,
+                camera_id=image.camera.camera_id,
                 focal_log_std=image.focal_log_std,
                 depth_group=priors.groups.get(image.name),
                 proposed_pose=priors.proposed_poses.get(image.name),

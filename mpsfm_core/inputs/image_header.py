@@ -28,6 +28,8 @@ _MAX_ASPECT_DIFFERENCE = 0.02
 
 _TIFF_WIDTH, _TIFF_HEIGHT = 0x0100, 0x0101
 _ORIENTATION, _EXIF_IFD = 0x0112, 0x8769
+_CAMERA_TAGS = {0x010F: "make", 0x0110: "model", 0xA431: "serial number", 0xA434: "lens"}
+_ASCII = 2
 _FOCAL_MM, _FOCAL_35MM = 0x920A, 0xA405
 _PIXELS_X, _PIXELS_Y = 0xA002, 0xA003
 _PLANE_RESOLUTION, _PLANE_UNIT = 0xA20E, 0xA210
@@ -45,6 +47,13 @@ class ImageHeader:
     """Values of the numeric EXIF tags by tag number."""
     projection: str | None = None
     """Projection of a panorama such as ``equirectangular``, None for other images."""
+    camera: str = ""
+    """Make, model, serial number and lens in EXIF, empty without make and model."""
+
+    @property
+    def recorded_size(self) -> tuple[float, float]:
+        """(width, height) in EXIF, 0 if absent; editors often keep it when they crop or resize."""
+        return self.tags.get(_PIXELS_X, 0.0), self.tags.get(_PIXELS_Y, 0.0)
 
     def focal_px(self, width: int, height: int) -> float | None:
         """Return the focal length in pixels from EXIF, for an image of a given size.
@@ -56,7 +65,7 @@ class ImageHeader:
         Returns:
             Focal length in pixels, None if EXIF has none or the image was cropped.
         """
-        recorded = self.tags.get(_PIXELS_X, 0.0), self.tags.get(_PIXELS_Y, 0.0)
+        recorded = self.recorded_size
         if min(recorded) > 0:
             ratio = (max(recorded) / min(recorded)) / (max(width, height) / min(width, height))
             if abs(math.log(ratio)) > _MAX_ASPECT_DIFFERENCE:
@@ -166,7 +175,8 @@ def read_header(data: bytes) -> ImageHeader:
     if block is data or is_heif(data) or is_avif(data) or not 1 <= orientation <= 8:
         # Decoders apply the orientation of TIFF, HEIF and AVIF themselves.
         orientation = 1
-    return ImageHeader(size, orientation, tags, _projection(data))
+    camera = _read_camera(block) if block else ""
+    return ImageHeader(size, orientation, tags, _projection(data), camera)
 
 
 def exif_block(data: bytes) -> bytes | None:
@@ -234,6 +244,20 @@ def _read_tags(block: bytes) -> dict[int, float]:
     if _EXIF_IFD in tags:
         tags |= _read_directory(block, order, int(tags[_EXIF_IFD]))
     return tags
+
+
+def _read_camera(block: bytes) -> str:
+    """Return make, model, serial number and lens of EXIF, empty without make and model."""
+    offset = int(_read_tags(block).get(_EXIF_IFD, 0))
+    texts = {}
+    for directory in (None, offset) if offset else (None,):
+        for tag, kind, number, place in tiff_entries(block, directory):
+            if tag in _CAMERA_TAGS and kind == _ASCII:
+                text = block[place : place + number].split(b"\0")[0].strip()
+                texts[_CAMERA_TAGS[tag]] = text.decode("latin-1")
+    if not (texts.get("make") or texts.get("model")):
+        return ""
+    return ", ".join(f"{name} {text}" for name, text in sorted(texts.items()) if text)
 
 
 def tiff_entries(block: bytes, offset: int | None = None) -> Iterator[tuple[int, int, int, int]]:

@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Bool, Float64, PinholeCamera, UInt8, View
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.geometry.pycolmap_conversion import camera_key, colmap_from_pinhole
+from mpsfm_core.inputs.camera_sharing import FocalSource, guess_cameras
 from mpsfm_core.inputs.gps import GpsPosition, read_gps
 from mpsfm_core.inputs.image_decoding import (
     EXTENSIONS,
@@ -51,8 +52,6 @@ from mpsfm_core.support.lru_cache import LruCache
 from mpsfm_core.support.threads import thread_limit
 
 _log = logging.getLogger(__name__)
-
-FocalSource = Literal["intrinsics", "exif", "provider", "default"]
 
 FOCAL_FROM_USER: FocalSource = "intrinsics"
 
@@ -334,19 +333,12 @@ def load_images(
     )
     left_out |= mask_faults
     _report_left_out(left_out, len(names), options)
-    guesses = _CameraGuesses(options, partial.max_id if partial else 0)
+    usable = {name: file for name, file in probed.items() if name not in left_out}
+    known = _known_cameras(usable, given, partial)
+    cameras = _add_guessed_cameras(known, usable, options, partial.max_id if partial else 0)
     images = []
-    for name, file in probed.items():
-        if name in left_out:
-            continue
-        focal = FOCAL_FROM_USER
-        if given is not None:
-            camera = given.camera(name, file.size, file.header.orientation)
-        elif (shared := partial and partial.usual_camera(name, *file.oriented_size)) is not None:
-            camera = shared
-        else:
-            camera, focal = guesses.camera(file)
-        image = _source_image(name, folder / name, file, camera, focal, options)
+    for name, file in usable.items():
+        image = _source_image(name, folder / name, file, *cameras[name], options)
         images.append(replace(image, mask=oriented_masks.get(name)))
     _warn_of_default_focal_lengths(images, options)
     return ImageSet(images, options, left_out)
@@ -373,8 +365,7 @@ def images_from_arrays(
     options = options or InputOptions()
     if len(pixels) < 2:
         raise InputError(f"images: at least two images are needed, got {len(pixels)}")
-    guesses = _CameraGuesses(options, 0)
-    images = []
+    probed, arrays, known = {}, {}, {}
     for name, array in pixels.items():
         rgb = np.asarray(array)
         rgb = np.repeat(rgb[..., None], 3, axis=2) if rgb.ndim == 2 else rgb
@@ -385,12 +376,14 @@ def images_from_arrays(
             )
         size = rgb.shape[1], rgb.shape[0]
         digest = hashlib.sha256(f"{size}".encode() + np.ascontiguousarray(rgb).tobytes())
-        probed = _ProbedImage(size, ImageHeader(None, 1, {}), digest.hexdigest())
-        camera, focal = _given_camera(name, size, cameras), FOCAL_FROM_USER
-        if camera is None:
-            camera, focal = guesses.camera(probed)
-        image = _source_image(name, Path(name), probed, camera, focal, options)
-        images.append(replace(image, pixels=rgb))
+        probed[name] = _ProbedImage(size, ImageHeader(None, 1, {}), digest.hexdigest())
+        arrays[name] = rgb
+        if (camera := _given_camera(name, size, cameras)) is not None:
+            known[name] = camera
+    images = []
+    for name, (camera, focal) in _add_guessed_cameras(known, probed, options).items():
+        image = _source_image(name, Path(name), probed[name], camera, focal, options)
+        images.append(replace(image, pixels=arrays[name]))
     _warn_of_default_focal_lengths(images, options)
     return ImageSet(images, options)
 
@@ -443,22 +436,45 @@ class _ProbedImage:
         return self.size, self.header.orientation
 
 
-class _CameraGuesses:
-    """Factory of cameras from EXIF or default focal lengths; equal cameras share an id."""
+def _known_cameras(
+    files: Mapping[str, _ProbedImage], given: Intrinsics | None, partial: Intrinsics | None
+) -> dict[str, pycolmap.Camera]:
+    """Return the camera of each image in ``given``, or of some images in ``partial``."""
+    known: dict[str, pycolmap.Camera] = {}
+    for name, file in files.items():
+        if given is not None:
+            known[name] = given.camera(name, file.size, file.header.orientation)
+        elif (shared := partial and partial.usual_camera(name, *file.oriented_size)) is not None:
+            known[name] = shared
+    return known
 
-    def __init__(self, options: InputOptions, max_id: int) -> None:
-        self._options = options
-        self._max_id = max_id
-        self._ids: dict[tuple[tuple[int, int], float], int] = {}
 
-    def camera(self, file: _ProbedImage) -> tuple[pycolmap.Camera, FocalSource]:
-        """Return a SIMPLE_PINHOLE camera of an image and the source of its focal length."""
-        source: FocalSource = "exif"
-        focal = file.header.focal_px(*file.size)
-        if focal is None:
-            source, focal = "default", self._options.default_focal_ratio * max(file.size)
-        number = self._ids.setdefault((file.size, focal), self._max_id + len(self._ids) + 1)
-        return _simple_camera(file.size, focal, number), source
+def _add_guessed_cameras(
+    known: Mapping[str, pycolmap.Camera],
+    files: Mapping[str, _ProbedImage],
+    options: InputOptions,
+    max_id: int = 0,
+) -> dict[str, tuple[pycolmap.Camera, FocalSource]]:
+    """Return camera and source of the focal length of each image, with guesses where unknown.
+
+    Args:
+        known: Known cameras by image name.
+        files: Headers and sizes by image name.
+        options: Options of camera sharing.
+        max_id: Largest id of the known cameras.
+    """
+    guesses = guess_cameras(
+        {name: file.header for name, file in files.items() if name not in known},
+        {name: file.size for name, file in files.items()},
+        options,
+    )
+    cameras: dict[str, tuple[pycolmap.Camera, FocalSource]] = {
+        name: (camera, FOCAL_FROM_USER) for name, camera in known.items()
+    }
+    for name, guess in guesses.items():
+        camera = _simple_camera(files[name].size, guess.focal_px, max_id + guess.number)
+        cameras[name] = camera, guess.source
+    return cameras
 
 
 def _source_image(

@@ -45,6 +45,12 @@ class InputOptions(Options):
     """Orientation of masks whose size fits the image before and after EXIF rotation, either
     ``stored`` (before) or ``upright`` (after). The value ``auto`` follows the masks whose size
     decides, else uses ``stored`` [COLMAP, which ignores EXIF orientation]."""
+    camera_per: Literal["auto", "image", "folder", "set"] = "auto"
+    """Which images without given intrinsics share a camera [COLMAP single_camera,
+    single_camera_per_folder, single_camera_per_image]. The values are ``image`` (none), ``folder``
+    and ``set`` (all images of one size in a folder or in the set), and ``auto`` (images of the same
+    size whose EXIF names the same camera, lens and focal length, and images of the same folder and
+    size without EXIF). The mapper gives images with another focal length their own camera."""
     default_focal_ratio: float = expert(1.2, gt=0)
     """Ratio of focal length to longer image side for images without a known focal length [COLMAP
     default_focal_length_factor]."""

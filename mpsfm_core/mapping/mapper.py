@@ -19,7 +19,8 @@ The steps of :func:`reconstruct`, compared with COLMAP's ``IncrementalMapper``::
                 refine locally; refine globally if the model has grown
             component.reregister_images()               # misregistered images in other poses
             component.finalize()                        # global refinement, depth check of all
-        stop if enough matches are explained and no guessed focal length was far off
+        stop if enough matches are explained, no guessed focal length was far off, and no image
+            deviates from the focal length of its shared camera
     select the run that explains the most matches
     register the remaining images tentatively           # if this option is set
 """
@@ -120,7 +121,7 @@ def _apply_refined_focals(
     """Return the problem with refined focal lengths, or None if they changed little."""
     if not run.models or not options.refinement.refine_focal:
         return None
-    return apply_refined_focal_lengths(problem, run.models[0], options.seed)
+    return apply_refined_focal_lengths(problem, run.models[0], options)
 
 
 class Mapper:

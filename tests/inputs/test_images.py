@@ -168,9 +168,9 @@ def test_default_focal_length_warns_once(folder: Path, caplog: pytest.LogCapture
 
 def test_other_focal_lengths_where_they_were_the_default(folder: Path, intrinsics: Path) -> None:
     options = InputOptions(max_image_size=40)
-    found = load_images(folder, options=options).with_focals({1: 70.0, 2: 9.0})
+    found = load_images(folder, options=options).with_focals({1: 70.0, 2: 90.0})
     assert all(image.focal_source == "provider" and not image.focal_known for image in found)
-    assert [image.camera.focal_length for image in found] == [70.0] * 3
+    assert [image.camera.focal_length for image in found] == [70.0, 70.0, 90.0]
     assert found.view(0).camera.fx == found[0].pinhole.fx == 35.0
     known = load_images(folder, intrinsics)
     assert known.with_focals({1: 70.0})[0] is known[0]

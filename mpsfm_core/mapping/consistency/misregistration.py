@@ -64,6 +64,11 @@ class ContradictedCut(NamedTuple):
     num_contradicting_pairs: int
     """Number of image pairs across the cut whose matches contradict the poses."""
 
+    @property
+    def has_one_link(self) -> bool:
+        """True if one pair supports the poses and several pairs contradict them."""
+        return self.num_supporting_pairs == 1 and self.num_contradicting_pairs > 1
+
 
 def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistration]:
     """Detect groups of registered images whose matches mostly contradict their poses.
@@ -98,8 +103,7 @@ def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistrat
         add(scene.mask([image]), margin)
     for cut in find_contradicted_cuts(scene.registered, contradicting, explained):
         is_group = bool(np.count_nonzero(cut.inside) > 1)
-        has_one_link = cut.num_supporting_pairs == 1 and cut.num_contradicting_pairs > 1
-        add(cut.inside, cut.margin, splits=is_group and has_one_link)
+        add(cut.inside, cut.margin, splits=is_group and cut.has_one_link)
     for a, b in np.argwhere(np.triu(separating > compute_widest_paths(explained))):
         flow = maximum_flow(capacities, int(a), int(b))
         margin = int(separating[a, b] - flow.flow_value)
@@ -112,6 +116,11 @@ def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistrat
         if 2 * inside.sum() > scene.registered.sum():
             inside = scene.registered & ~inside
         add(inside, margin)
+    if not detected:
+        # a wrong relative pose also explains its own pair, however many matches the pair has
+        for cut in find_contradicted_cuts(scene.registered, contradicting, explained, 0.0):
+            if cut.has_one_link and np.count_nonzero(cut.inside) > 1:
+                add(cut.inside, cut.margin, splits=True)
     return sorted(detected.values(), key=lambda group: (-group.margin, group.images))
 
 
@@ -176,7 +185,10 @@ def _find_contradicted_images(
 
 
 def find_contradicted_cuts(
-    registered: Bool, contradicting: Int64, explained: Int64
+    registered: Bool,
+    contradicting: Int64,
+    explained: Int64,
+    min_significance: float = MIN_SIGNIFICANCE,
 ) -> list[ContradictedCut]:
     """Find cuts of the match graph whose matches mostly contradict the poses of the images.
 
@@ -188,6 +200,7 @@ def find_contradicted_cuts(
         registered: (n,) bool.
         contradicting: (n, n) number of unexplained matches of each contradicting image pair.
         explained: (n, n) number of matches of each image pair that observe common points.
+        min_significance: Minimum excess of contradicting matches in standard deviations.
     """
     images = np.flatnonzero(registered)
     explained = explained[np.ix_(images, images)]
@@ -205,7 +218,7 @@ def find_contradicted_cuts(
         across = np.ix_(inside, ~inside)
         margin = int(contradicting[across].sum() - explained[across].sum())
         std = np.sqrt((contradicting[across] ** 2 + explained[across] ** 2).sum())
-        if margin > MIN_SIGNIFICANCE * std:
+        if margin > min_significance * std:
             smaller_part = np.zeros_like(registered)
             smaller_part[images[inside]] = True
             num_supporting = int(np.count_nonzero(explained[across]))

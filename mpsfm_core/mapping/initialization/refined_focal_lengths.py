@@ -7,8 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import MappingProblem, VerifiedPair
+from mpsfm_core.data import MappingImage, MappingProblem, VerifiedPair
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
+from mpsfm_core.mapping.initialization.camera_splitting import (
+    find_deviating_focals,
+    split_cameras,
+)
+from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 
 MIN_FOCAL_CHANGE = 1.1
@@ -23,47 +28,61 @@ min_inlier_ratio]
 
 
 def apply_refined_focal_lengths(
-    problem: MappingProblem, model: Reconstruction, seed: int
+    problem: MappingProblem, model: Reconstruction, options: MapperOptions
 ) -> MappingProblem | None:
     """Return the problem with refined focal lengths of a model and new relative poses.
 
-    The priors on focal lengths keep their original means. Each pair of an image whose focal length
-    changes gets a new relative pose from the essential matrix of its matches.
+    If no focal length changed much, images that deviate from the focal length of their shared
+    camera get their own cameras. The priors on focal lengths keep their original means. Each pair
+    of an image whose focal length changes gets a new relative pose from the essential matrix of its
+    matches.
 
     Args:
         problem: The mapping problem that was reconstructed.
         model: Its largest component.
-        seed: Seed of RANSAC.
+        options: Options of the mapper.
 
     Returns:
         The updated mapping problem, or None if no focal length changed by ``MIN_FOCAL_CHANGE`` or
-        more.
+        more and no camera is split.
     """
+    images = _apply_shared_focals(problem, model)
+    if images == problem.images:
+        own_focals = find_deviating_focals(problem, model, options.registration, options.seed)
+        images = split_cameras(problem.images, own_focals)
+    if images == problem.images:
+        return None
+    changed = [new is not old for new, old in zip(images, problem.images, strict=True)]
+    refined = replace(problem, images=images)
+    pairs = tuple(
+        _estimate_relative_pose(refined, pair, options.seed)
+        if changed[pair.image_a] or changed[pair.image_b]
+        else pair
+        for pair in problem.pairs
+    )
+    return replace(refined, pairs=pairs)
+
+
+def _apply_shared_focals(
+    problem: MappingProblem, model: Reconstruction
+) -> tuple[MappingImage, ...]:
+    """Return the images with the refined focal lengths that changed by ``MIN_FOCAL_CHANGE``."""
     cameras = {
-        problem.images[image.index].camera: image.camera
+        problem.images[image.index].shared_camera: image.camera
         for image in model.images
         if image.focal_log_std is not None
         and image.focal_reason is None
         and abs(np.log(image.camera.fx / problem.images[image.index].camera.fx))
         >= np.log(MIN_FOCAL_CHANGE)
     }
-    if not cameras:
-        return None
-    images = tuple(
+    return tuple(
         image
-        if image.focal_known or image.camera not in cameras
-        else replace(image, camera=cameras[image.camera], focal_guess_px=image.focal_prior_px)
+        if image.focal_known or image.shared_camera not in cameras
+        else replace(
+            image, camera=cameras[image.shared_camera], focal_guess_px=image.focal_prior_px
+        )
         for image in problem.images
     )
-    changed = [new is not old for new, old in zip(images, problem.images, strict=True)]
-    refined = replace(problem, images=images)
-    pairs = tuple(
-        _estimate_relative_pose(refined, pair, seed)
-        if changed[pair.image_a] or changed[pair.image_b]
-        else pair
-        for pair in problem.pairs
-    )
-    return replace(refined, pairs=pairs)
 
 
 def _estimate_relative_pose(problem: MappingProblem, pair: VerifiedPair, seed: int) -> VerifiedPair:

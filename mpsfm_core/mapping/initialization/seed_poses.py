@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection
 from dataclasses import replace
 
-from mpsfm_core.data import MappingProblem
+from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.mapping.initialization.camera_splitting import split_cameras
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, RegisteredImage
 
 
@@ -33,17 +35,27 @@ def apply_seed_poses(
     """Return the problem with the poses of the seed images as known poses.
 
     Known poses of images without a seed pose stay unchanged. All images that share the camera of a
-    seed image take the focal length of the seed image.
+    seed image take the focal length of the seed images. Seed images with another focal length than
+    most seed images of their camera get their own camera.
     """
-    cameras = {problem.images[seed.index].camera: seed.camera for seed in seed_images}
     poses = {seed.index: (seed.rotation, seed.translation) for seed in seed_images}
+    refined: dict[tuple[int, PinholeCamera], Counter[PinholeCamera]] = {}
+    for seed in seed_images:
+        key = problem.images[seed.index].shared_camera
+        refined.setdefault(key, Counter())[seed.camera] += 1
+    cameras = {key: counts.most_common(1)[0][0] for key, counts in refined.items()}
     images = tuple(
         replace(
             image,
-            camera=cameras.get(image.camera, image.camera),
+            camera=cameras.get(image.shared_camera, image.camera),
             focal_guess_px=image.focal_prior_px,
             known_pose=poses.get(index, image.known_pose),
         )
         for index, image in enumerate(problem.images)
     )
-    return replace(problem, images=images)
+    own_focals = {
+        seed.index: seed.camera.fx
+        for seed in seed_images
+        if seed.camera != images[seed.index].camera
+    }
+    return replace(problem, images=split_cameras(images, own_focals))

@@ -125,6 +125,70 @@ def sample_focal_lengths(image: MappingImage) -> Float64:
     return np.geomspace(min_px, max_px, 1 + num_steps)
 
 
+class PoseWithFocal(NamedTuple):
+    """Absolute pose that was estimated together with the focal length."""
+
+    pose: Pose
+    """``cam_from_world``."""
+    camera: PinholeCamera
+    """Camera with the estimated focal length."""
+
+    @property
+    def focal_px(self) -> float:
+        """Estimated ``fx`` in pixels."""
+        return self.camera.fx
+
+
+def estimate_pose_with_focal(
+    camera: PinholeCamera,
+    xy: Float64,
+    points: Float64,
+    focal_lengths: Float64,
+    options: RegistrationOptions,
+    seed: int,
+) -> PoseWithFocal | None:
+    """Estimate an absolute pose and the focal length.
+
+    PnP runs with each focal length. The focal length with most inliers is refined together with its
+    pose.
+
+    Args:
+        camera: Camera of the image, whose aspect ratio and principal point are used.
+        xy: (m, 2) keypoints in pixels.
+        points: (m, 3) points in the world frame.
+        focal_lengths: (k,) ascending focal lengths ``fx`` to try, in pixels.
+        options: Registration options ``max_error_px`` and ``min_inlier_ratio``.
+        seed: Seed of RANSAC.
+
+    Returns:
+        Pose and camera, or None if PnP fails or the focal length leaves the range.
+    """
+    best: tuple[pycolmap.Camera, dict[str, Any]] | None = None
+    aspect = camera.fy / camera.fx
+    for focal_px in focal_lengths:
+        trial = colmap_from_pinhole(replace(camera, fx=focal_px, fy=focal_px * aspect))
+        result = _run_pnp_ransac(trial, xy, points, options, seed, refine=False)
+        if result and (best is None or result["num_inliers"] > best[1]["num_inliers"]):
+            best = trial, result
+    if best is None:
+        return None
+    trial, result = best
+    refined = pycolmap.refine_absolute_pose(
+        result["cam_from_world"],
+        xy,
+        points,
+        result["inlier_mask"],
+        trial,
+        pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=True),
+    )
+    min_px, max_px = focal_lengths[[0, -1]] * [1 / FOCAL_STEP, FOCAL_STEP]
+    focal_px = float(trial.params[0])  # the refinement changes the focal length of the camera
+    if refined is None or not min_px <= focal_px <= max_px:
+        return None
+    pose = _pose_from_rigid3d(refined["cam_from_world"])
+    return PoseWithFocal(pose, replace(camera, fx=focal_px, fy=focal_px * aspect))
+
+
 def _run_pnp_ransac(
     camera: pycolmap.Camera,
     xy: Float64,
@@ -225,11 +289,7 @@ class PoseHypothesisGenerator:
         return PoseHypothesis(*pose, "PnP") if pose else None
 
     def _estimate_pnp_with_focal(self) -> PoseHypothesis | None:
-        """Estimate pose and focal length by PnP on points that calibrated cameras triangulated.
-
-        PnP runs with each focal length of a logarithmic grid. The focal length with most inliers is
-        refined together with its pose.
-        """
+        """Estimate pose and focal length by PnP on points that calibrated cameras triangulated."""
         scene, options, correspondences = self.scene, self.options, self.correspondences
         is_determined = scene.has_determined_focal(correspondences.references)
         correspondences = correspondences.select(correspondences.triangulated & is_determined)
@@ -238,34 +298,17 @@ class PoseHypothesisGenerator:
             return None
         step = max(1, count // MAX_FOCAL_CORRESPONDENCES)
         correspondences = correspondences.select(np.arange(0, count, step))
-        xy, points = scene.keypoints[correspondences.keypoints], correspondences.points
-        pinhole = scene.camera(self.image)
-        focal_lengths = sample_focal_lengths(scene.problem.images[self.image])
-        best: tuple[pycolmap.Camera, dict[str, Any]] | None = None
-        for focal_px in focal_lengths:
-            camera = colmap_from_pinhole(
-                replace(pinhole, fx=focal_px, fy=focal_px * pinhole.fy / pinhole.fx)
-            )
-            result = _run_pnp_ransac(camera, xy, points, options, self.seed, refine=False)
-            if result and (best is None or result["num_inliers"] > best[1]["num_inliers"]):
-                best = camera, result
-        if best is None:
-            return None
-        camera, result = best
-        refined = pycolmap.refine_absolute_pose(
-            result["cam_from_world"],
-            xy,
-            points,
-            result["inlier_mask"],
-            camera,
-            pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=True),
+        estimate = estimate_pose_with_focal(
+            scene.camera(self.image),
+            scene.keypoints[correspondences.keypoints],
+            correspondences.points,
+            sample_focal_lengths(scene.problem.images[self.image]),
+            options,
+            self.seed,
         )
-        min_px, max_px = focal_lengths[[0, -1]] * [1 / FOCAL_STEP, FOCAL_STEP]
-        focal_px = float(camera.params[0])  # the refinement changes the focal length of the camera
-        if refined is None or not min_px <= focal_px <= max_px:
+        if estimate is None:
             return None
-        pose = _pose_from_rigid3d(refined["cam_from_world"])
-        return PoseHypothesis(*pose, "PnP with unknown focal length", focal_px)
+        return PoseHypothesis(*estimate.pose, "PnP with unknown focal length", estimate.focal_px)
 
     def _estimate_reverse_pnp(self, reference: int) -> PoseHypothesis | None:
         """Estimate the reference image's pose by PnP on points lifted from the image's depth.

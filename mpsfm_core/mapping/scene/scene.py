@@ -48,8 +48,8 @@ class Scene:
         translations: (n, 3) float64 translation of ``cam_from_world`` of each image.
         registered: (n,) bool mask of the registered images.
         intrinsics: (n, 4) float64 intrinsics fx, fy, cx, cy of each image in pixels.
-        camera_of: (n,) int64 camera index of each image. Images with the same estimated focal
-            length share a camera.
+        camera_of: (n,) int64 camera index of each image. Images with the same number and
+            estimated focal length share a camera.
         focal_outcome: (n,) int64 :class:`FocalOutcome` of the camera of each image.
         focal_log_std: (n,) float64 posterior standard deviation of the log focal length of each
             image, NaN without an estimate.
@@ -363,9 +363,10 @@ def _depth_groups(problem: MappingProblem) -> Int64:
 
 
 def _shared_cameras(problem: MappingProblem) -> Int64:
-    """Number the cameras, which images with equal estimated intrinsics share."""
+    """Number the cameras, which images with equal number and estimated intrinsics share."""
     numbers: dict[object, int] = {}
     keys = [
-        number if image.focal_known else image.camera for number, image in enumerate(problem.images)
+        number if image.focal_known else image.shared_camera
+        for number, image in enumerate(problem.images)
     ]
     return np.array([numbers.setdefault(key, len(numbers)) for key in keys], dtype=np.int64)

@@ -79,6 +79,18 @@ def test_unregistered_image_separates_two_images_that_it_matches(
     assert (detected.images, detected.margin) == ((3,), 40)
 
 
+@pytest.mark.parametrize(("num_supporting", "is_detected"), [(504, True), (560, False)])
+def test_part_on_one_pair_against_more_matches_of_others_is_split(
+    num_supporting: int, is_detected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A planar pair holds images 3 and 4 in a wrong pose, which several pairs contradict."""
+    explained = symmetric(5, {(0, 1): 900, (1, 2): 800, (3, 4): 1700, (2, 4): num_supporting})
+    contradicting = symmetric(5, {(0, 3): 77, (1, 3): 153, (2, 3): 223, (1, 4): 53})
+    detected = detect(explained + contradicting, explained, np.ones(5, np.bool_), monkeypatch)
+    found = [(d.images, d.splits) for d in detected]
+    assert found == ([((3, 4), True)] if is_detected else [])
+
+
 def test_contradicted_cut_at_the_only_supporting_pair_is_found() -> None:
     """One pair connects 3 and 4 to the others; several pairs across contradict it."""
     explained = symmetric(5, {(0, 1): 200, (1, 2): 200, (0, 2): 150, (3, 4): 300, (2, 3): 140})

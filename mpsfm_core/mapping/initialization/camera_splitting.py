@@ -1,0 +1,141 @@
+"""Detection of images that do not have the focal length of the camera that they share.
+
+Photos without EXIF may differ in zoom or crop although their sizes are equal. Such an image has
+clearly more support with a focal length of its own than with the shared focal length, in absolute
+pose estimation from points that at least two other images observe. Where focal length and distance
+are ambiguous, for example for a frontal plane, the support does not differ.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mpsfm_core.data import Float64, Int64, MappingImage, MappingProblem, PinholeCamera, Pose
+from mpsfm_core.mapping.options import RegistrationOptions
+from mpsfm_core.mapping.registration.pose_hypotheses import (
+    MAX_FOCAL_CORRESPONDENCES,
+    estimate_absolute_pose,
+    estimate_pose_with_focal,
+    sample_focal_lengths,
+)
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+
+MIN_FOCAL_RATIO = 1.05
+"""Ratio of own and shared focal length from which an image gets its own camera. [ours]"""
+MIN_SUPPORT_RATIO = 1.2
+"""Ratio of the supports with own and shared focal length from which an image gets its own camera.
+[tuned: benchmarks.verdicts]"""
+MIN_OTHER_IMAGES = 2
+"""Number of other images that must observe a point, which the image then did not triangulate."""
+
+
+def find_deviating_focals(
+    problem: MappingProblem, model: Reconstruction, options: RegistrationOptions, seed: int
+) -> dict[int, float]:
+    """Find images whose focal length differs from that of their shared camera.
+
+    Args:
+        problem: The mapping problem that was reconstructed.
+        model: Its largest component.
+        options: Options of absolute pose estimation.
+        seed: Seed of RANSAC.
+
+    Returns:
+        Focal lengths ``fx`` in pixels of the deviating images, by image index.
+    """
+    guessed = [image.shared_camera for image in problem.images if not image.focal_known]
+    num_images = Counter(guessed)
+    cameras = {problem.images[i.index].shared_camera: i.camera for i in model.images}
+    correspondences = _collect_correspondences(problem, model)
+    focals = {}
+    for index, (keypoints, points) in correspondences.items():
+        image = problem.images[index]
+        camera = cameras.get(image.shared_camera, image.camera)
+        if image.focal_known or num_images[image.shared_camera] < 2:
+            continue
+        if len(keypoints) < options.min_inliers:
+            continue
+        step = max(1, len(keypoints) // MAX_FOCAL_CORRESPONDENCES)
+        xy, xyz = image.keypoints[keypoints[::step]], model.points[points[::step]]
+        max_error_px = options.max_error_px
+        shared = estimate_absolute_pose(camera, xy, xyz, options, seed)
+        support = _measure_support(camera, shared[:2], xy, xyz, max_error_px) if shared else 0.0
+        if MIN_SUPPORT_RATIO * support >= len(xy):  # no pose has more support than matches
+            continue
+        own = estimate_pose_with_focal(camera, xy, xyz, sample_focal_lengths(image), options, seed)
+        if own is None or abs(np.log(own.focal_px / camera.fx)) < np.log(MIN_FOCAL_RATIO):
+            continue
+        own_support = _measure_support(own.camera, own.pose, xy, xyz, max_error_px)
+        if own_support > MIN_SUPPORT_RATIO * support:
+            focals[index] = own.focal_px
+    return focals
+
+
+def split_cameras(
+    images: Sequence[MappingImage], own_focals: Mapping[int, float]
+) -> tuple[MappingImage, ...]:
+    """Return the images, of which some get their own camera.
+
+    Args:
+        images: The images.
+        own_focals: Focal length ``fx`` in pixels by index of the images with their own camera.
+    """
+    first_id = 1 + max((image.camera_id for image in images), default=0)
+    split = list(images)
+    for number, (index, focal_px) in enumerate(own_focals.items(), first_id):
+        image = images[index]
+        aspect = image.camera.fy / image.camera.fx
+        split[index] = replace(
+            image,
+            camera_id=number,
+            camera=replace(image.camera, fx=focal_px, fy=focal_px * aspect),
+            focal_guess_px=image.focal_prior_px,
+        )
+    return tuple(split)
+
+
+def _collect_correspondences(
+    problem: MappingProblem, model: Reconstruction
+) -> dict[int, tuple[Int64, Int64]]:
+    """Return keypoints (m,) and points (m,) of each image, from matches with registered images."""
+    point_ids = {image.index: image.point_ids for image in model.images}
+    num_points = len(model.points)
+    num_observers = np.zeros(num_points, dtype=np.int64)
+    for ids in point_ids.values():
+        num_observers += np.bincount(np.unique(ids[ids >= 0]), minlength=num_points)
+    matches: dict[int, list[Int64]] = {}
+    for pair in problem.pairs:
+        for image, other, column in (
+            (pair.image_a, pair.image_b, 0),
+            (pair.image_b, pair.image_a, 1),
+        ):
+            if other not in point_ids:
+                continue
+            points = point_ids[other][pair.matches[:, 1 - column]]
+            rows = np.stack([pair.matches[:, column], points], axis=1)[points >= 0]
+            matches.setdefault(image, []).append(rows)
+    correspondences = {}
+    for image, parts in matches.items():
+        keypoints, points = np.unique(np.concatenate(parts), axis=0).T
+        ids = point_ids.get(image, np.zeros(0, dtype=np.int64))
+        is_own = np.zeros(num_points, dtype=np.int64)
+        is_own[ids[ids >= 0]] = 1
+        is_used = (num_observers - is_own)[points] >= MIN_OTHER_IMAGES
+        correspondences[image] = keypoints[is_used], points[is_used]
+    return correspondences
+
+
+def _measure_support(
+    camera: PinholeCamera, pose: Pose, xy: Float64, points: Float64, max_error_px: float
+) -> float:
+    """Return the MSAC score of a pose, the sum of ``1 - (error / max_error_px)^2`` of inliers."""
+    in_camera = points @ pose[0].T + pose[1]
+    in_front = in_camera[:, 2] > 0
+    z = np.where(in_front, in_camera[:, 2], 1.0)
+    projected = in_camera[:, :2] / z[:, None] * camera.params[:2] + camera.params[2:]
+    squared = ((projected - xy) ** 2).sum(axis=1) / max_error_px**2
+    return float(np.maximum(0.0, 1.0 - squared)[in_front].sum())
