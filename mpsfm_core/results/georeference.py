@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 
 import cv2
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Float64, Pose
+from mpsfm_core.data import Bool, Float64, Pose
 from mpsfm_core.data.decisions import GpsReason, Reason
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.inputs.gps import GpsPosition, convert_to_enu
@@ -26,6 +26,8 @@ _MIN_SPREAD_STDS = 5.0
 """Minimum spread of the GPS positions in standard deviations of GPS noise."""
 _MAX_TILT_STD_DEG = 2.0
 """Maximum std in degrees of gravity from GPS altitudes, before camera orientations are used."""
+_NO_TILT_DEG = 90.0
+"""Std in degrees of gravity without enough GPS altitudes."""
 _ALTITUDE_STD_RATIO = 2.0
 """Ratio of vertical to horizontal GPS noise [GPS.gov, 1.5 to 3]."""
 _MAX_ERROR_STDS = 3.0
@@ -60,7 +62,8 @@ def georeference(
     """Align a reconstruction with the GPS positions of its images.
 
     The similarity is estimated with RANSAC. If GPS altitudes do not determine gravity, camera
-    orientations determine gravity, and GPS positions determine heading, scale and translation.
+    orientations determine gravity, and GPS positions determine heading, scale and translation. If
+    most positions contradict gravity from camera orientations, GPS altitudes are used after all.
 
     Args:
         reconstruction: reconstruction in an arbitrary world frame and scale.
@@ -86,19 +89,18 @@ def georeference(
         return GpsReason.TOO_LITTLE_SPREAD.because(spread_m=round(spread, 2), std_m=round(std_m, 2))
     images = [by_name[name] for name in located]
     centers = np.stack([camera_center(image.rotation, image.translation) for image in images])
-    tilt = _tilt_deg(enu, std_m)
-    if tilt < _MAX_TILT_STD_DEG:
-        enu_from_world, up = _fit_similarity(centers, enu, std_m), "GPS altitudes"
-    else:
-        poses = [(image.rotation, image.translation) for image in by_name.values()]
-        enu_from_world, up = (
-            _fit_level_similarity(poses, centers, enu, std_m),
-            "gravity from how cameras are held",
-        )
-    if enu_from_world is None:
+    poses = [(image.rotation, image.translation) for image in by_name.values()]
+    best: tuple[pycolmap.Sim3d, str, Bool, Float64] | None = None
+    for enu_from_world, up in _generate_alignments(poses, centers, enu, std_m):
+        error_m = np.linalg.norm((enu_from_world * centers)[:, :2] - enu[:, :2], axis=1)
+        inliers = error_m < _MAX_ERROR_STDS * std_m
+        if best is None or inliers.sum() > best[2].sum():
+            best = enu_from_world, up, inliers, error_m
+        if 2 * inliers.sum() > len(located):
+            break
+    if best is None:
         return GpsReason.INCONSISTENT.because()
-    error_m = np.linalg.norm((enu_from_world * centers)[:, :2] - enu[:, :2], axis=1)
-    inliers = error_m < _MAX_ERROR_STDS * std_m
+    enu_from_world, up, inliers, error_m = best
     if 2 * inliers.sum() <= len(located):
         return GpsReason.FEW_INLIERS.because(
             num_inliers=int(inliers.sum()), num_positions=len(located)
@@ -110,6 +112,25 @@ def georeference(
         reconstruction, scale, enu_from_world.rotation.matrix(), enu_from_world.translation, metric
     )
     return moved, Georeference(origin, len(located), int(inliers.sum()), rms, scale, up)
+
+
+def _generate_alignments(
+    poses: list[Pose], centers: Float64, enu: Float64, std_m: float
+) -> Iterator[tuple[pycolmap.Sim3d, str]]:
+    """Yield ``enu_from_world`` and the source of gravity, the more reliable source first.
+
+    If GPS altitudes do not determine gravity well, camera orientations come first. Camera
+    orientations are misleading if all cameras look down, as in mapping flights.
+    """
+    tilt_deg = _tilt_deg(enu, std_m)
+    if tilt_deg >= _MAX_TILT_STD_DEG:
+        level = _fit_level_similarity(poses, centers, enu, std_m)
+        if level is not None:
+            yield level, "gravity from how cameras are held"
+    if tilt_deg < _NO_TILT_DEG:
+        similarity = _fit_similarity(centers, enu, std_m)
+        if similarity is not None:
+            yield similarity, "GPS altitudes"
 
 
 def _median_position(positions: list[GpsPosition]) -> GpsPosition:
@@ -125,7 +146,7 @@ def _tilt_deg(enu: Float64, std_m: float) -> float:
     """Return the std in degrees of gravity from GPS altitudes, about the axis of least spread."""
     with_altitude = enu[np.isfinite(enu).all(axis=1)]
     if len(with_altitude) < _MIN_POSITIONS:
-        return 90.0
+        return _NO_TILT_DEG
     horizontal = with_altitude[:, :2]
     width = np.linalg.svd(horizontal - horizontal.mean(axis=0), compute_uv=False)[1]
     return float(np.degrees(np.arctan2(_ALTITUDE_STD_RATIO * std_m, width)))
