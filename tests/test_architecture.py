@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import re
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -40,8 +41,8 @@ def modules() -> Iterator[tuple[str, Path]]:
             yield package_of(".".join(parts)), path
 
 
-def imported_packages(path: Path) -> Iterator[str]:
-    """Yield the packages that a module imports from, except the options of a package."""
+def imported_modules(path: Path) -> Iterator[str]:
+    """Yield the imported modules of the core (with the imported name), relative to the core."""
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         names: list[str] = []
         if isinstance(node, ast.Import):
@@ -49,9 +50,20 @@ def imported_packages(path: Path) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom) and node.module:
             names = [f"{node.module}.{alias.name}" for alias in node.names]
         for name in names:
-            package, *parts = name.split(".")
-            if package == "mpsfm_core" and parts:
-                yield "data" if parts[1:2] == ["options"] else package_of(".".join(parts))
+            package, _, module = name.partition(".")
+            if package == "mpsfm_core" and module:
+                yield module
+
+
+def imported_packages(path: Path) -> Iterator[str]:
+    """Yield the packages that a module imports from, except the options of a package."""
+    for module in imported_modules(path):
+        yield "data" if module.split(".")[1:2] == ["options"] else package_of(module)
+
+
+def part_of(package: str, module: str) -> str:
+    """Return the module or subpackage directly below a package that contains a module."""
+    return module.removeprefix(f"{package}.").partition(".")[0]
 
 
 def test_the_table_lists_every_package() -> None:
@@ -74,6 +86,21 @@ def test_a_package_imports_only_what_stands_before_it(package: str) -> None:
         if rows[imported] > rows[package]
     }
     assert not upwards
+
+
+@pytest.mark.parametrize("package", documented_packages())
+def test_modules_and_subpackages_of_a_package_import_without_cycle(package: str) -> None:
+    imports: dict[str, set[str]] = {}
+    for name, path in modules():
+        if name == package:
+            part = part_of(package, ".".join(path.relative_to(PACKAGE).with_suffix("").parts))
+            imported = {
+                part_of(package, module)
+                for module in imported_modules(path)
+                if package_of(module) == package and module != package
+            }
+            imports.setdefault(part, set()).update(imported - {part})
+    TopologicalSorter(imports).prepare()  # raises CycleError
 
 
 @pytest.mark.parametrize("package", sorted(NUMERICS))

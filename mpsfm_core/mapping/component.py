@@ -12,6 +12,7 @@ from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.consistency.misregistration import Misregistration, detect_misregistrations
 from mpsfm_core.mapping.consistency.pair_consistency import PairConsistencyCheck
 from mpsfm_core.mapping.event_log import EventLog
+from mpsfm_core.mapping.incremental_registration import IncrementalRegistration
 from mpsfm_core.mapping.initialization.global_initialization import (
     GlobalPoses,
     estimate_global_poses,
@@ -24,7 +25,6 @@ from mpsfm_core.mapping.initialization.initial_pair import (
 from mpsfm_core.mapping.model_maintenance import ModelMaintenance, ModelState
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.filtering import filter_points, find_lost_images
-from mpsfm_core.mapping.registration.incremental_registration import IncrementalRegistration
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, triangulate_image
 

@@ -19,8 +19,8 @@ from mpsfm_core.mapping.refinement.depth_noise import DepthNoise, measure_depth_
 from mpsfm_core.mapping.refinement.filtering import filter_points
 from mpsfm_core.mapping.refinement.focal_lengths import decide_focal_outcome
 from mpsfm_core.mapping.refinement.keypoint_noise import measure_loss_scale
-from mpsfm_core.mapping.registration.image_selection import find_local_bundle
 from mpsfm_core.mapping.scene.focal_outcome import MIN_FOCAL_IMAGES, FocalOutcome
+from mpsfm_core.mapping.scene.local_bundle import find_local_bundle
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, lift_low_parallax

@@ -54,27 +54,6 @@ def rank_next_images(
     return [(int(images[k]), int(registered[pair_scores[k].argmax()])) for k in order]
 
 
-def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: Float64) -> list[int]:
-    """Return an image and the registered images that share most 3D points with the image.
-
-    If fewer than ``num_neighbors`` images share points, the best matching images are added.
-    COLMAP's ``FindLocalBundle`` also ranks by shared points.
-    """
-    tracks, graph = scene.tracks, scene.graph
-    points = tracks.point_of[graph.keypoints_of(image)]
-    points = points[points >= 0]
-    is_observed = np.zeros(len(tracks.xyz), dtype=np.bool_)
-    is_observed[points] = True
-    observations = np.flatnonzero(tracks.point_of >= 0)
-    shared = is_observed[tracks.point_of[observations]]
-    counts = np.bincount(graph.image_of[observations[shared]], minlength=scene.num_images)
-    order = np.lexsort((-scores[image], -counts))
-    usable = scene.registered & ((counts > 0) | (scores[image] > 0))
-    usable[image] = False
-    neighbors = [int(k) for k in order if usable[k]]
-    return [image, *neighbors[:num_neighbors]]
-
-
 def _count_visible_points(scene: Scene) -> Int64:
     """Count the keypoints of each image (n,) that match a registered image."""
     graph = scene.graph

@@ -18,12 +18,12 @@ from mpsfm_core.mapping.refinement.refinement import Refiner
 from mpsfm_core.mapping.registration.correspondences import find_correspondences
 from mpsfm_core.mapping.registration.image_selection import (
     compute_pair_scores,
-    find_local_bundle,
     rank_next_images,
 )
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
 from mpsfm_core.mapping.scene.conversion import convert_image
+from mpsfm_core.mapping.scene.local_bundle import find_local_bundle
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import triangulate_image

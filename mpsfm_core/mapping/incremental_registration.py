@@ -14,12 +14,13 @@ from mpsfm_core.mapping.registration.correspondences import (
     PoseCorrespondences,
     find_correspondences,
 )
-from mpsfm_core.mapping.registration.image_selection import find_local_bundle, rank_next_images
+from mpsfm_core.mapping.registration.image_selection import rank_next_images
 from mpsfm_core.mapping.registration.pose_estimation import (
     AbsolutePoseEstimator,
     select_distinct_poses,
 )
 from mpsfm_core.mapping.registration.pose_support import ScoredPose, score_pose
+from mpsfm_core.mapping.scene.local_bundle import find_local_bundle
 from mpsfm_core.mapping.triangulation import triangulate_image
 
 NUM_WIDE_REFERENCES = 10
