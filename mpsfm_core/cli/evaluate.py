@@ -44,6 +44,14 @@ def evaluate(
         ),
     ] = None,
     distance: Distances = None,
+    photos: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder of the photos, to rotate models of EXIF-rotated photos; default: the "
+            "folder that the run recorded.",
+        ),
+    ] = None,
 ) -> None:
     """Print pose AUC at 1, 5 and 20 degrees, trajectory errors and registered images as JSON.
 
@@ -55,13 +63,15 @@ def evaluate(
     import json
 
     from mpsfm_core.evaluation import CONVENTIONS, evaluate, read_poses
+    from mpsfm_core.evaluation.result_folder import find_photos
 
     if convention not in CONVENTIONS:
         from mpsfm_core.data.errors import InputError, did_you_mean
 
         raise InputError(f"no convention {convention!r}{did_you_mean(convention, CONVENTIONS)}")
     names = _select_names(images, image_list)
-    poses, true_poses = read_poses(model), read_poses(truth)
+    photos = photos or find_photos(model)
+    poses, true_poses = read_poses(model, photos), read_poses(truth, photos)
     report = evaluate(poses, true_poses, names, CONVENTIONS[convention])
     if gt_depth is not None or scan is not None:
         from mpsfm_core.evaluation.result_folder import (
@@ -73,11 +83,11 @@ def evaluate(
 
         within, cloud = distance_thresholds(distance), model / "dense.ply"
         if gt_depth is not None:
-            report["depth"] = evaluate_depth(model, gt_depth)
+            report["depth"] = evaluate_depth(model, gt_depth, photos)
         if scan is not None:
             surface = read_points(scan)
         elif gt_depth is not None and cloud.is_file():
-            surface = read_true_surface(truth, gt_depth, sorted(poses), within)
+            surface = read_true_surface(truth, gt_depth, sorted(poses), within, photos)
         else:
             surface = None
         if surface is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,11 @@ class PinholeCamera:
         return PinholeCamera(width, height, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy)
 
 
+MapOrientation = Literal["auto", "stored", "upright"]
+"""Orientation of map files of photos that EXIF rotates: before (``stored``) or after EXIF rotation
+(``upright``), or ``auto`` to compare the sizes of map and photo."""
+
+
 @dataclass(frozen=True, eq=False)
 class View:
     """Undistorted image, the input of networks that predict depth, normals or features."""
@@ -75,6 +80,9 @@ class View:
     mask: Bool | None = None
     """(H, W) bool, False at pixels outside the undistorted image or masked by the user (None for
     all True)."""
+    orientation: int = 1
+    """EXIF orientation that was applied to the original image, 1 to 8. Map files of the original
+    image may be stored without this rotation."""
 
     def __post_init__(self) -> None:
         height, width = self.camera.height, self.camera.width

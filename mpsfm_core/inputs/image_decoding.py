@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Float64, UInt8
+from mpsfm_core.data.cameras import MapOrientation
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.codecs import AVIF, HEIF, RAW, find_decoder
 from mpsfm_core.inputs.image_header import (
@@ -30,6 +32,9 @@ EXTENSIONS = (
     )
 )
 """File extensions of images; the file content, not the extension, selects the decoder."""
+
+
+_Value = TypeVar("_Value", bound=np.generic)
 
 
 def read_bytes(path: Path) -> bytes:
@@ -102,7 +107,7 @@ def decode_rgb(data: bytes, header: ImageHeader, path: Path) -> UInt8:
     return orient(rgb.astype(np.uint8), header.orientation)
 
 
-def orient(image: UInt8, orientation: int) -> UInt8:
+def orient(image: NDArray[_Value], orientation: int) -> NDArray[_Value]:
     """Rotate or flip a stored image upright by its EXIF ``orientation`` (1 if already upright)."""
     if orientation >= 5:
         image = np.swapaxes(image, 0, 1)
@@ -111,6 +116,28 @@ def orient(image: UInt8, orientation: int) -> UInt8:
     if orientation in (2, 3, 6, 7):
         image = image[:, ::-1]
     return np.ascontiguousarray(image)
+
+
+def find_map_orientation(
+    map_size: tuple[int, int], size: tuple[int, int], orientation: int, convention: MapOrientation
+) -> int:
+    """Return the EXIF orientation that rotates a depth, normal or mask map upright.
+
+    Args:
+        map_size: (width, height) of the map, which covers the image in any resolution.
+        size: upright (width, height) of the image.
+        orientation: EXIF orientation of the image.
+        convention: ``stored`` or ``upright`` if known, or ``auto`` to compare the aspect ratios of
+            map and image; a map that fits both belongs to the stored image.
+
+    Returns:
+        ``orientation`` if the map belongs to the stored image, else 1.
+    """
+    if convention != "auto" or min(map_size) == 0:
+        return 1 if convention == "upright" else orientation
+    aspect, upright = (math.log(width / height) for width, height in (map_size, size))
+    stored = -upright if orientation >= 5 else upright
+    return 1 if abs(aspect - upright) < abs(aspect - stored) else orientation
 
 
 def apply_orientation_to_pixels(xy: Float64, size: tuple[int, int], orientation: int) -> Float64:

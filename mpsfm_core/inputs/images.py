@@ -255,7 +255,7 @@ class ImageSet:
         if is_pinhole(image.camera):
             pixels = _resize(pixels, image.pinhole.size)
             mask = None if mask is None else resize_mask(mask, image.pinhole.size)
-            return View(image.name, pixels, image.pinhole, mask)
+            return View(image.name, pixels, image.pinhole, mask, image.orientation)
         size = _reduced_size(image.original_size, self._options.max_image_size)
         camera = resize_camera(image.camera, size)
         undistortion = self._undistortion_maps.get(
@@ -266,7 +266,7 @@ class ImageSet:
             mask = undistortion.mask(resize_mask(mask, size))
         elif not undistortion.valid.all():
             mask = undistortion.valid
-        return View(image.name, pixels, image.pinhole, mask)
+        return View(image.name, pixels, image.pinhole, mask, image.orientation)
 
     def _read_mask(self, image: SourceImage) -> Bool | None:
         if image.mask is None:

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Literal
 
 import cv2
 import numpy as np
 
 from mpsfm_core.data import Bool
+from mpsfm_core.data.cameras import MapOrientation
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.codecs import find_decoder
 from mpsfm_core.inputs.image_decoding import (
@@ -27,8 +27,6 @@ from mpsfm_core.inputs.image_search import list_names, walk_files
 from mpsfm_core.support.threads import thread_limit
 
 _log = logging.getLogger(__name__)
-
-MaskOrientation = Literal["auto", "stored", "upright"]
 
 _PREFERRED = (".png", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 """Lossless mask formats, preferred if an image has several mask files."""
@@ -115,7 +113,7 @@ def orient_masks(
     masks: Mapping[str, Path],
     sizes: Mapping[str, tuple[int, int]],
     orientations: Mapping[str, int],
-    convention: MaskOrientation,
+    convention: MapOrientation,
     max_pixels: int,
 ) -> tuple[dict[str, MaskFile], dict[str, str]]:
     """Determine the orientation of masks, and find entirely black masks.

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 from pydantic import Field
 
+from mpsfm_core.data.cameras import MapOrientation
 from mpsfm_core.data.options import Options, expert
 
 
@@ -41,7 +41,7 @@ class InputOptions(Options):
     """Folder of masks of the original images, named ``X.jpg.png``, ``X.png``, ``X_mask.png`` or
     ``X.jpg`` for the image ``X.jpg``. Pixels that are black in the mask are ignored [COLMAP
     mask_path]."""
-    mask_orientation: Literal["auto", "stored", "upright"] = expert("auto")
+    mask_orientation: MapOrientation = expert("auto")
     """Orientation of masks whose size fits the image before and after EXIF rotation, either
     ``stored`` (before) or ``upright`` (after). The value ``auto`` follows the masks whose size
     decides, else uses ``stored`` [COLMAP, which ignores EXIF orientation]."""

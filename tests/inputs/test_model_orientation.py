@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,9 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
+from typer.testing import CliRunner
 
+from mpsfm_core.cli import build_app
 from mpsfm_core.data import Float64, PinholeCamera
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.geometry import rotation_angle_deg
@@ -18,6 +21,7 @@ from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.matches import matches_from_database
 from mpsfm_core.inputs.model_orientation import orient_camera, orientation_matrix
 from mpsfm_core.inputs.models import read_model, read_poses
+from mpsfm_core.support.npz import write_npz
 from mpsfm_core.testing.synthetic.scenes import arc_poses, project, room_scene
 
 CAMERA = PinholeCamera(160, 120, 140.0, 145.0, 83.0, 57.0)
@@ -269,3 +273,34 @@ def test_photos_of_a_stored_model_look_like_its_points(rendered, tmp_path: Path)
         seen = view[xy[:, 1].astype(int), xy[:, 0].astype(int)].astype(int)
         colors = np.array([model.points3D[p.point3D_id].color for p in image.points2D])
         assert np.median(np.abs(seen - colors)) < 20
+
+
+@pytest.mark.parametrize("flag", (3, 6))
+def test_evaluate_rotates_truth_and_depth_of_rotated_photos(
+    rendered, tmp_path: Path, flag: int
+) -> None:
+    """The result is upright, and COLMAP's model and the sensor's depth are of stored pixels."""
+    photos = write_photos(tmp_path / "photos", rendered[0], (flag,) * 4)
+    truth = upright_model(rendered)
+    result = tmp_path / "result"
+    write(truth, result / "sparse")
+    (result / "summary.json").write_text(json.dumps({"photos": str(photos)}))
+    gt = write(stored_model(truth, (flag,) * 4), tmp_path / "gt")
+    ramp = np.arange(60 * 80, dtype=np.uint16).reshape(60, 80) + 500
+    for name in NAMES:
+        arrays = {"depth": ramp / np.float32(1000), "valid": ramp > 0}
+        write_npz(result / "depth" / f"{name}.npz", **arrays)
+        stored = orient(ramp, INVERSE[flag])
+        (tmp_path / "depth").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "depth" / Path(name).with_suffix(".png")), stored)
+    arguments = ["evaluate", str(result), str(gt), "--gt-depth", str(tmp_path / "depth")]
+    done = CliRunner().invoke(build_app(), arguments)
+    assert done.exit_code == 0, done.output
+    report = json.loads(done.stdout)
+    assert report["registered"] == 4 and report["auc"]["1"] > 99
+    assert report["depth"]["median_scaled"]["abs_rel"] < 1e-3
+    (result / "summary.json").write_text("{}")
+    unknown = json.loads(CliRunner().invoke(build_app(), arguments).stdout)
+    assert unknown["auc"]["20"] < 60
+    known = CliRunner().invoke(build_app(), [*arguments, "--photos", str(photos)])
+    assert json.loads(known.stdout)["auc"] == report["auc"]

@@ -11,8 +11,13 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, DepthPrior, NormalPrior, View
 from mpsfm_core.data.errors import InputError
+from mpsfm_core.inputs.model_orientation import orientation_matrix
 from mpsfm_core.providers import ProviderContext
-from mpsfm_core.providers.builtin.map_files import check_map, find_file, read_arrays
+from mpsfm_core.providers.builtin.map_files import (
+    check_map,
+    find_file,
+    read_upright_arrays,
+)
 from mpsfm_core.providers.builtin.options import (
     DepthFileOptions,
     MaskFileOptions,
@@ -44,7 +49,7 @@ class DepthFiles:
                 the depth file nor the options declare a variance.
         """
         path = find_file(self._options, view, "depth")
-        arrays = read_arrays(path, "depth")
+        arrays, _ = read_upright_arrays(self._options, path, "depth", view)
         stored = _grayscale(path, arrays["depth"])
         check_map(path, stored, view, 1)
         depth = stored.astype(np.float64) * self._options.scale
@@ -59,7 +64,8 @@ class DepthFiles:
         stored = _optional(path, arrays, "variance", view)
         if options.variance is not None:
             path = find_file(options.variance, view, "depth variance")
-            stored = read_arrays(path, "variance")["variance"]
+            arrays, _ = read_upright_arrays(options.variance, path, "variance", view)
+            stored = arrays["variance"]
             check_map(path, stored, view, 1)
         if stored is None and options.relative_std is None and options.std_floor == 0:
             raise InputError(
@@ -99,11 +105,12 @@ class NormalFiles:
             InputError: The map file is missing, unreadable or does not cover the image.
         """
         path = find_file(self._options, view, "normals")
-        arrays = read_arrays(path, "normals")
+        arrays, orientation = read_upright_arrays(self._options, path, "normals", view)
         normals = _decoded(arrays["normals"])
         check_map(path, normals, view, 3)
         if self._options.frame == "opengl":
             normals = normals * np.array([1.0, -1.0, -1.0])
+        normals = normals @ orientation_matrix(orientation).T
         with np.errstate(invalid="ignore"):
             usable = np.linalg.norm(normals, axis=-1) > _MIN_ENCODED_LENGTH
         valid = _optional(path, arrays, "valid", view)
@@ -134,7 +141,8 @@ class MaskFiles:
             InputError: The map file is missing, unreadable or does not cover the image.
         """
         path = find_file(self._options, view, "mask")
-        values = read_arrays(path, "mask")["mask"]
+        arrays, _ = read_upright_arrays(self._options, path, "mask", view)
+        values = arrays["mask"]
         allowed = (values.any(axis=-1) if values.ndim == 3 else values != 0) != self._options.invert
         check_map(path, allowed, view, 1)
         if not allowed.any():

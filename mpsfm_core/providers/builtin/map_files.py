@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import View
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.image_decoding import check_size
+from mpsfm_core.inputs.image_decoding import check_size, find_map_orientation, orient
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.providers.builtin.options import FileOptions
 from mpsfm_core.support.npz import read_npz
@@ -62,6 +62,30 @@ def _find_ignoring_case(candidates: list[Path]) -> Path | None:
     files = {path.name.casefold(): path for path in sorted(folder.iterdir(), reverse=True)}
     names = (path.name.casefold() for path in candidates)
     return next((files[name] for name in names if name in files), None)
+
+
+def read_upright_arrays(
+    options: FileOptions, path: Path, main: str, view: View
+) -> tuple[dict[str, NDArray[Any]], int]:
+    """Read the named arrays of a map file, and rotate them upright as the view.
+
+    Args:
+        options: Orientation of the map files.
+        path: As of :func:`read_arrays`.
+        main: As of :func:`read_arrays`.
+        view: Undistorted image that the map belongs to.
+
+    Returns:
+        Arrays of the file by name, and the EXIF orientation by which the grids of the arrays were
+        rotated, 1 for upright maps. Vectors in the arrays are not rotated.
+    """
+    arrays = read_arrays(path, main)
+    height, width = (*arrays[main].shape, 0, 0)[:2]
+    orientation = find_map_orientation(
+        (width, height), view.camera.size, view.orientation, options.orientation
+    )
+    grids = {k: orient(v, orientation) if v.ndim >= 2 else v for k, v in arrays.items()}
+    return grids, orientation
 
 
 def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:

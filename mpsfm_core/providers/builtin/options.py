@@ -7,6 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from mpsfm_core.data.cameras import MapOrientation
 from mpsfm_core.data.options import Options
 
 
@@ -62,6 +63,10 @@ class FileOptions(Options):
     """Suffix that follows the image name in the file name of a map, such as ``.png`` or
     ``_depth.exr``. The image name may be written with or without its extension. Null tries the
     suffixes ``.npz``, ``.npy``, ``.exr``, ``.png``, ``.tif`` and ``.tiff``."""
+    orientation: MapOrientation = "auto"
+    """Orientation of the map files of photos that EXIF rotates, either ``stored`` (before EXIF
+    rotation) or ``upright`` (after). The value ``auto`` compares the aspect ratios, and uses
+    ``stored`` if both fit [COLMAP, which ignores EXIF orientation]."""
 
 
 class DepthFileOptions(FileOptions):

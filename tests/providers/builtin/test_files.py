@@ -10,7 +10,10 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import DepthPrior, PinholeCamera, View
+from mpsfm_core.data.cameras import MapOrientation
 from mpsfm_core.data.errors import InputError
+from mpsfm_core.inputs.image_decoding import orient
+from mpsfm_core.inputs.model_orientation import orientation_matrix
 from mpsfm_core.providers import ProviderContext
 from mpsfm_core.providers.builtin.files import DepthFiles, MaskFiles, NormalFiles
 from mpsfm_core.providers.builtin.options import (
@@ -269,3 +272,61 @@ def test_shared_depth(shared_data: Path, context: ProviderContext) -> None:
     options = DepthFileOptions(directory=folder / "gt_depth", scale=0.001, relative_std=0.02)
     prior = DepthFiles(options, context).predict(view)
     assert 0.5 < np.median(prior.depth[prior.valid]) < 6
+
+
+def rotated_view(flag: int, square: bool = False) -> tuple[View, np.ndarray, np.ndarray]:
+    """Return the upright view of a photo with an EXIF flag, and its stored depth and normals."""
+    depth, normals = DEPTH.copy(), NORMALS.copy()
+    if square:
+        depth, normals = depth[:, :30], normals[:, :30]
+    height, width = orient(depth, flag).shape
+    camera = PinholeCamera(width, height, 40.0, 40.0, width / 2, height / 2)
+    pixels = np.zeros((height, width, 3), np.uint8)
+    return View("side/a.jpg", pixels, camera, None, flag), depth, normals
+
+
+@pytest.mark.parametrize("convention", ["auto", "stored"])
+@pytest.mark.parametrize("flag", range(1, 9))
+def test_maps_of_stored_photos_are_rotated_upright(
+    folder: Path, context: ProviderContext, flag: int, convention: MapOrientation
+) -> None:
+    view, depth, normals = rotated_view(flag)
+    np.savez(folder / "side/a.npz", depth=depth, variance=depth / 100, valid=depth > 1)
+    options = DepthFileOptions(directory=folder, orientation=convention)
+    prior = DepthFiles(options, context).predict(view)
+    upright = orient(depth, flag)
+    assert (prior.valid == (upright > 1)).all()
+    np.testing.assert_array_equal(prior.depth[prior.valid], upright[prior.valid])
+    np.testing.assert_allclose(prior.variance[prior.valid], upright[prior.valid] / 100)
+    np.savez(folder / "side/a.npz", normals=normals)
+    found = NormalFiles(NormalFileOptions(directory=folder, orientation=convention), context)
+    expected = orientation_matrix(flag) @ normals[0, 0]
+    np.testing.assert_allclose(found.predict(view).normals[5, 5], expected, atol=1e-6)
+    cv2.imwrite(str(folder / "side/a.png"), (depth > 1).astype(np.uint8) * 255)
+    (folder / "side/a.npz").unlink()
+    mask = MaskFiles(MaskFileOptions(directory=folder, orientation=convention), context)
+    np.testing.assert_array_equal(mask.mask(view), upright > 1)
+
+
+@pytest.mark.parametrize(
+    ("flag", "square", "convention"),
+    [(6, False, "auto"), (8, False, "upright"), (3, False, "upright"), (6, True, "upright")],
+)
+def test_maps_of_upright_photos_stay(
+    folder: Path, context: ProviderContext, flag: int, square: bool, convention: MapOrientation
+) -> None:
+    view, depth, _ = rotated_view(flag, square)
+    np.save(folder / "side/a.npy", orient(depth, flag))
+    options = DepthFileOptions(directory=folder, relative_std=0.02, orientation=convention)
+    np.testing.assert_array_equal(
+        DepthFiles(options, context).predict(view).depth, orient(depth, flag)
+    )
+
+
+def test_maps_that_fit_both_orientations_are_stored(folder: Path, context: ProviderContext) -> None:
+    view, depth, _ = rotated_view(6, square=True)
+    np.save(folder / "side/a.npy", depth)
+    options = DepthFileOptions(directory=folder, relative_std=0.02)
+    np.testing.assert_array_equal(
+        DepthFiles(options, context).predict(view).depth, orient(depth, 6)
+    )
