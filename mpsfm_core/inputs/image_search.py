@@ -25,6 +25,8 @@ _UNREADABLE = frozenset(
 """Extensions of image formats that no decoder of this package reads."""
 _SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\x00", b"MM\x00*")
 """First bytes of image formats, to recognize image files without extension."""
+_THUMBNAIL_FOLDERS = frozenset(("@eaDir", "__MACOSX", "lost+found"))
+"""Folders that network drives and archivers create next to photos."""
 _MASK_MARK = re.compile(r"[_.-]masks?$", re.IGNORECASE)
 """Endings of file stems of masks such as ``X_mask.png`` (OpenDroneMap, Metashape)."""
 
@@ -171,7 +173,7 @@ def select_listed_images(image_list: Path, names: list[str], folder: Path) -> li
 
 
 def walk_files(folder: Path) -> Iterator[str]:
-    """Yield relative paths with forward slashes of all files below a folder, except hidden ones.
+    """Yield relative paths of all files below a folder, except hidden files and thumbnails.
 
     Symbolic links to folders are followed. A folder that several links reach is read once.
     """
@@ -183,7 +185,7 @@ def walk_files(folder: Path) -> Iterator[str]:
             continue
         visited.add((status.st_dev, status.st_ino))
         # Real folders are visited before symbolic links, so that links do not change image names.
-        visible = [name for name in folders if not name.startswith(".")]
+        visible = [n for n in folders if not n.startswith(".") and n not in _THUMBNAIL_FOLDERS]
         folders[:] = [
             name for _, name in sorted((Path(parent, n).is_symlink(), n) for n in visible)
         ]

@@ -239,7 +239,10 @@ def _yaml_entry(path: Path, key: object, value: object) -> CameraEntry:
 
 
 def _from_text(path: Path) -> tuple[CameraEntry, ...]:
-    """Read ``cameras.txt`` of COLMAP and the image names of ``images.txt`` in the same folder."""
+    """Read ``cameras.txt`` of COLMAP and the image names of ``images.txt`` in the same folder.
+
+    The query lists of hloc are read too, whose lines have an image name instead of a camera id.
+    """
     names: dict[int, list[str]] = {}
     listing = path.with_name("images.txt")
     if listing.is_file():
@@ -247,6 +250,9 @@ def _from_text(path: Path) -> tuple[CameraEntry, ...]:
             names.setdefault(camera_id, []).append(name)
     lines = (line.strip() for line in read_text_file(path).splitlines())
     cameras = [line.split() for line in lines if line and not line.startswith("#")]
+    if cameras and all(not fields[0].isdigit() for fields in cameras):
+        names = {number: [fields[0]] for number, fields in enumerate(cameras, start=1)}
+        cameras = [[str(number), *f[1:]] for number, f in enumerate(cameras, start=1)]
     entries = []
     for fields in cameras:
         where = f"{path}, camera {fields[0]}"

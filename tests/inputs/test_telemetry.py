@@ -53,6 +53,8 @@ MODELS = {
     "[latitude: {0:.6f}] [longitude: {1:.6f}] [rel_alt: 9.100 abs_alt: {2:.3f}] [ct: 5500]",
     "mavic 2": "[iso : 100] [fnum : 280] [focal_len : 240] [latitude : {0:.6f}] "
     "[longtitude : {1:.6f}] [altitude: {2:.6f}]",
+    "air 2": "[iso : 100] [fnum : 280] [focal_len : 240] [latitude: {0:.6f}] "
+    "[longitude: {1:.6f}] [altitude: {2:.6f}]",
     "mavic pro": "HOME(8.5001,47.3001) 2017.06.01 10:00:00\nGPS({1:.6f},{0:.6f},19) BAROMETER:9.1",
 }
 
@@ -143,7 +145,7 @@ def check_frames(video: Path, output: Path, tolerance: float = 1e-6) -> None:
         assert image.gps.altitude == pytest.approx(altitude, abs=0.01)
 
 
-@pytest.mark.parametrize("model", ["mini 3", "mavic 2"])
+@pytest.mark.parametrize("model", ["mini 3", "mavic 2", "air 2"])
 @pytest.mark.parametrize("suffix", [".srt", ".SRT"])
 def test_subtitles_of_dji_give_positions_and_focal_length(
     tmp_path: Path, video: Path, model: str, suffix: str
