@@ -35,6 +35,7 @@ from mpsfm_core.cli import (
     report,
     testsets,
     view,
+    work_folder,
 )
 from mpsfm_core.cli.errors import CommandGroup
 
@@ -63,6 +64,9 @@ def build_app() -> typer.Typer:
         pretty_exceptions_show_locals=False,
     )
     app.command("reconstruct")(reconstruct.reconstruct)
+    app.command("extract")(work_folder.extract)
+    app.command("match")(work_folder.match)
+    app.command("map")(work_folder.map_images)
     app.command("demo")(demo.demo)
     app.command("import")(import_capture.import_capture)
     app.command("dense")(dense.dense)

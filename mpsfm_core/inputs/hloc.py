@@ -17,14 +17,14 @@ _TO_COLMAP = 0.5
 
 
 class HlocFiles:
-    """The features file and the matches file that hloc wrote for a set of images.
+    """The features file and, if given, the matches file that hloc wrote for a set of images.
 
     All methods raise an :class:`InputError` that names the missing or damaged file or dataset.
     """
 
-    def __init__(self, features: Path, matches: Path) -> None:
+    def __init__(self, features: Path, matches: Path | None = None) -> None:
         self.features = _Hdf5(features)
-        self.matches = _Hdf5(matches)
+        self.matches = None if matches is None else _Hdf5(matches)
 
     def names(self) -> list[str]:
         """Return the names of the images that have keypoints."""
@@ -51,6 +51,19 @@ class HlocFiles:
             )
         return values.astype(np.float64) + _TO_COLMAP, float(std)
 
+    def descriptors(self, name: str) -> tuple[Float32, Float32 | None]:
+        """Read the descriptors (n, d) of an image, and the scores (n,) of its keypoints."""
+        where = f"{self.features.path}, descriptors of {name!r}"
+        values = self.features.read(f"{name}/descriptors")[0]
+        if values.ndim != 2 or not _finite(values):
+            raise InputError(f"{where}: must be finite and of shape (d, n), not {values.shape}")
+        if not self.features.has(f"{name}/scores"):
+            return values.T.astype(np.float32), None
+        scores = self.features.read(f"{name}/scores")[0].ravel()
+        if scores.shape != (values.shape[1],) or not _finite(scores):
+            raise InputError(f"{where}: scores must be finite and as many as descriptors")
+        return np.ascontiguousarray(values.T, np.float32), scores.astype(np.float32)
+
     def size(self, name: str) -> tuple[int, int] | None:
         """Return (width, height) of an image before EXIF rotation, None if the file has no size."""
         if not self.features.has(f"{name}/image_size"):
@@ -64,6 +77,7 @@ class HlocFiles:
 
     def pairs(self, names: list[str]) -> Iterator[tuple[str, str, Int64, Float32]]:
         """Yield both names, keypoint indices (m, 2) and scores (m,) in [0, 1] of each pair."""
+        assert self.matches is not None
         written = {name.replace("/", "-"): name for name in names}
         suffix = "/matches0"
         for dataset in self.matches.datasets():
@@ -77,6 +91,7 @@ class HlocFiles:
             yield (*images, indices, scores)
 
     def _matches(self, pair: str) -> tuple[Int64, Float32]:
+        assert self.matches is not None
         where = f"{self.matches.path}, pair {pair!r}"
         target = self.matches.read(f"{pair}/matches0")[0]
         if target.ndim != 1 or not np.issubdtype(target.dtype, np.integer):

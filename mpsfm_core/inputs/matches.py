@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mpsfm_core.data import Float32, Float64, Int64, SparseMatches
+from mpsfm_core.data import Features, Float32, Float64, Int64, SparseMatches
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.geometry import inside
 from mpsfm_core.inputs.colmap_database import read_database
@@ -73,6 +73,47 @@ def matches_from_hloc(features: Path, matches: Path, images: ImageSet) -> Import
     for first, second, indices, scores in files.pairs(list(index_of)):
         builder.match(index_of[first], index_of[second], indices, scores)
     return builder.finish()
+
+
+def features_from_hloc(
+    path: Path, images: ImageSet
+) -> tuple[dict[str, Features], dict[str, Int64]]:
+    """Import features with descriptors from a features file of hloc.
+
+    Returns:
+        Features in pixels of the undistorted views by image name, and the row (n,) in the file of
+        each feature. Keypoints outside of the view are left out.
+
+    Raises:
+        InputError: the file is damaged, or has keypoints of none of the images.
+    """
+    files = HlocFiles(path)
+    matched = match_names(images.names, files.names())
+    features: dict[str, Features] = {}
+    rows: dict[str, Int64] = {}
+    for image in images:
+        if image.name not in matched:
+            continue
+        stored = matched[image.name]
+        keypoints, std_px = files.keypoints(stored)
+        descriptors, scores = files.descriptors(stored)
+        if len(descriptors) != len(keypoints):
+            raise InputError(
+                f"{path}, {stored!r}: {len(keypoints)} keypoints, {len(descriptors)} descriptors"
+            )
+        xy = image.view_pixels(_upright(str(path), image, keypoints, files.size(stored)))
+        row = np.flatnonzero(np.isfinite(xy).all(axis=1) & inside(xy, image.pinhole.size))
+        rows[image.name] = row.astype(np.int64)
+        features[image.name] = Features(
+            np.ascontiguousarray(xy[row]),
+            descriptors[row],
+            None if scores is None else scores[row],
+            std_px=std_px * image.pinhole.width / image.original_size[0],
+        )
+    if not features:
+        difference = describe_name_difference(images.names, files.names())
+        raise InputError(f"{path}: the file has features of none of the images; {difference}")
+    return features, rows
 
 
 class _Builder:
