@@ -43,12 +43,14 @@ if TYPE_CHECKING:
         run_mapper,
         to_colmap,
     )
+    from mpsfm_core.calibration.calibrate import CalibrationImages, calibrate
     from mpsfm_core.config import Config, load_config
     from mpsfm_core.extraction.match_graph import MatchGraph, Priors
     from mpsfm_core.extraction.problem_builder import build_problem
     from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
     from mpsfm_core.pipeline.run import ReconstructionResult, reconstruct
     from mpsfm_core.providers.registry import Registry
+    from mpsfm_core.results import plots
     from mpsfm_core.results.exports.formats import export
 
     __version__: str
@@ -67,6 +69,7 @@ _LAZY_MODULES = {
         "run_mapper",
         "to_colmap",
     ),
+    "mpsfm_core.calibration.calibrate": ("CalibrationImages", "calibrate"),
     "mpsfm_core.config": ("Config", "load_config"),
     "mpsfm_core.extraction.match_graph": ("MatchGraph", "Priors"),
     "mpsfm_core.extraction.problem_builder": ("build_problem",),
@@ -80,6 +83,7 @@ _LAZY_MODULES = {
 _LAZY_NAMES = {name: module for module, names in _LAZY_MODULES.items() for name in names}
 
 __all__ = [
+    "CalibrationImages",
     "Cancelled",
     "Config",
     "DenseMatches",
@@ -110,6 +114,7 @@ __all__ = [
     "__version__",
     "build_mesh",
     "build_problem",
+    "calibrate",
     "densify",
     "evaluate",
     "export",
@@ -120,6 +125,7 @@ __all__ = [
     "load_config",
     "load_images",
     "match_images",
+    "plots",
     "predict_priors",
     "reconstruct",
     "run_mapper",
@@ -131,6 +137,8 @@ def __getattr__(name: str) -> Any:
     """Import an exported name at first use, or read the version of the installed package."""
     if name == "__version__":
         value: Any = importlib.import_module("mpsfm_core.providers.registry").core_version()
+    elif name == "plots":
+        value = importlib.import_module("mpsfm_core.results.plots")
     elif name in _LAZY_NAMES:
         value = getattr(importlib.import_module(_LAZY_NAMES[name]), name)
     else:

@@ -96,7 +96,7 @@ def load_images(
     Raises:
         InputError: images or cameras cannot be read, or a video has no ``output``.
 
-    Example:
+    Examples:
         >>> images = mpsfm.load_images("photos/")
         >>> images = mpsfm.load_images({"a": rgb_a, "b": rgb_b}, cameras=camera)
     """
@@ -148,7 +148,7 @@ def extract_features(
         InputError: the provider or its weights are missing.
         ProviderRunError: the provider failed on an image.
 
-    Example:
+    Examples:
         >>> features = mpsfm.extract_features(images, "sift")
         >>> features["view_0.jpg"].descriptors.shape
         (4096, 128)
@@ -199,7 +199,7 @@ def match_images(
         InputError: a provider is missing, or matcher and features are incompatible.
         ProviderRunError: a provider failed on an image or pair.
 
-    Example:
+    Examples:
         >>> matches = mpsfm.match_images(images, features, "mutual-nearest")
         >>> len(matches.verified["view_0.jpg", "view_1.jpg"])
         208
@@ -262,7 +262,7 @@ def predict_priors(
         InputError: a provider or its weights are missing.
         ProviderRunError: a provider failed on an image.
 
-    Example:
+    Examples:
         >>> priors = mpsfm.predict_priors(images, depth=MyDepth())
         >>> priors.depth["view_0.jpg"].variance.shape
         (290, 387)
@@ -295,7 +295,7 @@ def run_mapper(
     Raises:
         SettingsError: an option is unknown or out of range.
 
-    Example:
+    Examples:
         >>> result = mpsfm.run_mapper(problem, {"known_poses": "fixed"})
         >>> largest = result.reconstructions[0]
         >>> largest.poses["a"], largest.images[0].depth.variance
@@ -318,8 +318,9 @@ def to_colmap(
         images: Images of the problem. With images, the model has their original cameras and colored
             points; without, pinhole cameras and black points.
 
-    Example:
-        >>> mpsfm.to_colmap(result.reconstructions[0], problem).write("sparse/")
+    Examples:
+        >>> mpsfm.to_colmap(result.reconstructions[0], problem).num_points3D()
+        8490
     """
     if images is None:
         return build_pinhole_model(reconstruction, problem)
@@ -342,7 +343,7 @@ def from_colmap(
     Raises:
         InputError: an image has lens distortion and no image set, or neither points nor depth.
 
-    Example:
+    Examples:
         >>> reconstruction = mpsfm.from_colmap(pycolmap.Reconstruction("sparse/0"), images)
         >>> dense = mpsfm.densify(reconstruction, images)
     """
@@ -368,7 +369,7 @@ def densify(
     Returns:
         The reconstruction with dense depth maps.
 
-    Example:
+    Examples:
         >>> dense = mpsfm.densify(result.reconstructions[0], images)
         >>> cloud = mpsfm.fuse(dense, images)
     """
@@ -391,7 +392,7 @@ def fuse(reconstruction: Reconstruction, images: ImageSet, seed: int = 0) -> Fus
         images: Images of the reconstruction.
         seed: Seed of the selection of pixels.
 
-    Example:
+    Examples:
         >>> mpsfm.fuse(dense, images).points.shape
         (181534, 3)
     """
@@ -414,7 +415,7 @@ def build_mesh(
         InputError: the depth maps give no surface, or the libraries of
             ``pip install 'mpsfm-core[mesh]'`` are missing.
 
-    Example:
+    Examples:
         >>> mpsfm.build_mesh(dense, images).triangles.shape
         (120000, 3)
     """
@@ -445,7 +446,7 @@ def evaluate(
     Raises:
         InputError: a model cannot be read, an image has no true pose, or the convention is unknown.
 
-    Example:
+    Examples:
         >>> mpsfm.evaluate("out/", "truth/")["auc"]["5"]
         97.1
     """

@@ -13,15 +13,18 @@ import sys
 from pathlib import Path
 
 import cv2
+import pycolmap
 import pytest
 import typer.main
 
 import mpsfm_core
 from mpsfm_core import load_config
 from mpsfm_core.cli import build_app
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PAGES_WITH_CODE = [*PAGES, ROOT / "CONTRIBUTING.md"]
 
 
@@ -132,3 +135,45 @@ def test_site_builds_and_loads_nothing_external(tmp_path: Path) -> None:
             r"<(?:script|img|link)[^>]*(?:src|href)=\"(https?://[^\"]*)", page.read_text()
         )
         assert fetched == [], page.name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", ["library.md", "coming-from.md"])
+def test_python_snippets_run(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run the Python blocks of a page in order, with the arrays that the page assumes."""
+    monkeypatch.setenv("MPSFM_OFFLINE", "1")
+    monkeypatch.setenv("MPSFM_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "photos").mkdir()
+    for number in range(3):
+        photo = ROOT / "examples" / "sample_scene" / "images" / f"view_{number}.jpg"
+        shutil.copy(photo, tmp_path / "photos")
+    pycolmap.set_random_seed(0)
+    pycolmap.extract_features("database.db", "photos/", device=pycolmap.Device.cpu)
+    pycolmap.match_exhaustive("database.db", device=pycolmap.Device.cpu)
+    names = arrays_of_caller()
+    for block in blocks_of(ROOT / "docs" / page, "python"):
+        exec(compile(block, page, "exec"), names)
+    assert names["result"].reconstructions if page == "library.md" else names["result"].model
+
+
+def arrays_of_caller() -> dict[str, object]:
+    """Return keypoints, matches, depth and poses of three views, under the names of library.md."""
+    camera = mpsfm_core.PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
+    poses = arc_poses(3, 10.0)
+    problem = make_mapping_problem(room_scene(), camera, poses, points_per_view=200)
+    pairs = {(pair.image_a, pair.image_b): pair.matches for pair in problem.pairs}
+    names: dict[str, object] = {"camera": camera, "model": None}
+    names |= {"matches_ab": pairs[0, 1], "matches_bc": pairs[1, 2]}
+    for letter, image, pose in zip("abc", problem.images, poses, strict=True):
+        names[f"xy_{letter}"], names[f"pose_{letter}"] = image.keypoints, pose
+        names[f"depth_{letter}"], names[f"var_{letter}"] = image.depth.depth, image.depth.variance
+    return names
+
+
+def test_arrays_without_files_take_at_most_20_lines() -> None:
+    block = blocks_of(ROOT / "docs" / "library.md", "python")[1]
+    assert len(block.splitlines()) <= 20
+    names = arrays_of_caller()
+    exec(compile(block, "library.md", "exec"), names)
+    assert names["model"].num_reg_images() == 3  # type: ignore[attr-defined]

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mpsfm_core.cli.arguments import ConfigName, Offline, Overrides, Quiet, config_overrides
 from mpsfm_core.cli.errors import handle_sigterm
+
+if TYPE_CHECKING:
+    from mpsfm_core.data import Int64
 
 Work = Annotated[Path, typer.Argument(metavar="WORK", help="Folder of mpsfm extract.")]
 
@@ -105,7 +108,8 @@ def match(
             config=config,
             registry=registry,
         )
-        features, rows, matcher = None, {}, None
+        features, matcher = None, None
+        rows: dict[str, Int64] = {}
         if (work / files.FEATURES).is_file():
             features, rows = features_from_hloc(work / files.FEATURES, photos)
             matcher = config.matcher or config.dense_matcher
@@ -144,9 +148,8 @@ def map_images(
     from mpsfm_core.pipeline import work_folder as files
 
     settings = files.read_settings(work)
-    matches = [
-        work / name for name in ((files.FEATURES, files.MATCHES) if hloc else (files.DATABASE,))
-    ]
+    names = (files.FEATURES, files.MATCHES) if hloc else (files.DATABASE,)
+    matches = [work / name for name in names]
     for path in matches:
         if not path.is_file():
             raise InputError(f"{path} does not exist: run 'mpsfm match {work}' first")

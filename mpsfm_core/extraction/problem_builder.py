@@ -85,7 +85,7 @@ def build_problem(
     Raises:
         InputError: an image name is unknown, keypoints are missing, or an array has a wrong shape.
 
-    Example:
+    Examples:
         >>> problem = mpsfm.build_problem(cameras, {("a", "b"): indices}, keypoints=keypoints)
         >>> result = mpsfm.run_mapper(problem)
     """

@@ -153,7 +153,7 @@ def reconstruct(
         ReconstructionError: no reconstruction was possible; the reasons are in ``summary.json``.
         MpsfmError: a provider failed or violated the provider contract, or the disk is full.
 
-    Example:
+    Examples:
         >>> import mpsfm_core as mpsfm
         >>> result = mpsfm.reconstruct("photos/", "out/", depth="compact")
         >>> result.model.num_reg_images()

@@ -10,8 +10,8 @@
          database.db       COLMAP database with keypoints and verified matches
          result/           result folder of the reconstruction
 
-Each command reads the files of the earlier commands, so every file can be replaced by one of another
-program. Results of providers are cached, so a repeated command continues where it stopped.
+Each command reads the files of the earlier commands, so every file can be replaced by a file of
+another program. Results of providers are cached, so a repeated command continues where it stopped.
 """
 
 from __future__ import annotations

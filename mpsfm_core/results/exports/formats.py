@@ -83,11 +83,11 @@ def known_formats(registry: Registry | None = None) -> dict[str, ExportFormat]:
 
 
 def export(
-    folder: Path,
+    folder: str | Path,
     format_name: str,
-    output: Path | None = None,
+    output: str | Path | None = None,
     *,
-    photos: Path | None = None,
+    photos: str | Path | None = None,
     turn: bool | None = None,
     registry: Registry | None = None,
 ) -> dict[str, Any]:
@@ -108,18 +108,23 @@ def export(
 
     Raises:
         InputError: the export format is unknown, or the reconstruction is damaged or incomplete.
+
+    Examples:
+        >>> mpsfm.export("out/", "nerfstudio")["images"]
+        8
     """
+    folder = Path(folder)
     known = known_formats(registry)
     if format_name not in known:
         hint = install_hint(EXPORTS, format_name) or did_you_mean(format_name, known)
         raise InputError(f"no format {format_name!r}{hint}")
     chosen = known[format_name]
-    source = ExportSource.read(folder, photos)
+    source = ExportSource.read(folder, None if photos is None else Path(photos))
     if turn is None:
         turn = chosen.align_gravity and not source.is_georeferenced
     if turn:
         source = source.turned()
-    output = output or folder / "exports" / format_name
+    output = folder / "exports" / format_name if output is None else Path(output)
     described = _describe(source, format_name)
     with replace_entries(output, (*chosen.entries, DESCRIPTION)) as fresh:
         _writer_of(chosen)(source, fresh)
