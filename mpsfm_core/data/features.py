@@ -103,7 +103,13 @@ class SparseMatches:
 
 @dataclass(frozen=True, eq=False)
 class DenseMatches:
-    """Dense matches between positions of two images, without detected keypoints."""
+    """Dense matches between positions of two images, without detected keypoints.
+
+    Examples:
+        >>> points = np.array([[10.5, 20.5], [30.5, 40.5]])
+        >>> len(DenseMatches(points, points + 1, scores=np.ones(2, np.float32)))
+        2
+    """
 
     points_a: Float64
     """(m, 2) float64 positions of the matches in COLMAP pixels of the first image."""

@@ -111,7 +111,14 @@ class SceneState:
 
 @dataclass(frozen=True, eq=False)
 class VerifiedPair:
-    """Geometrically verified matches of two images."""
+    """Geometrically verified matches of two images.
+
+    Examples:
+        >>> matches = np.array([[0, 3], [1, 2]])
+        >>> scores, direction = np.ones(2, np.float32), np.array([1.0, 0.0, 0.0])
+        >>> len(VerifiedPair(0, 1, matches, scores, np.eye(3), direction))
+        2
+    """
 
     image_a: int
     """Index of the first image in :attr:`MappingProblem.images`, smaller than ``image_b``."""

@@ -94,6 +94,11 @@ class NormalPrior:
     The component ``n_z`` of a normal may be positive off the optical axis, for example on a floor.
     :mod:`mpsfm_core.providers.validation` checks that normals face the camera, because the
     constructor has no camera.
+
+    Examples:
+        >>> prior = NormalPrior.from_arrays(np.tile([0.0, 0.0, -2.0], (2, 3, 1)))
+        >>> prior.normals[0, 0].tolist()
+        [0.0, 0.0, -1.0]
     """
 
     normals: Float32
@@ -162,7 +167,13 @@ class NormalPrior:
 
 @dataclass(frozen=True, eq=False)
 class PairDepth:
-    """Depth of both views of a pair from a two-view network such as MASt3R."""
+    """Depth of both views of a pair from a two-view network such as MASt3R.
+
+    Examples:
+        >>> depth = DepthPrior.from_arrays(np.full((2, 3), 4.0), metric=False)
+        >>> PairDepth(depth, depth).depth_b.shape
+        (2, 3)
+    """
 
     depth_a: DepthPrior
     """Depth prior of the first view."""

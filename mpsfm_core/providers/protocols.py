@@ -101,7 +101,12 @@ CAPABILITIES: tuple[Capability, ...] = get_args(Capability)
 
 @dataclass(frozen=True)
 class ProviderContext:
-    """Device, threads, seed and weights access that the factory of a provider receives."""
+    """Device, threads, seed and weights access that the factory of a provider receives.
+
+    Examples:
+        >>> ProviderContext(resolve_weights=lambda uri, sha256: Path(uri)).device
+        'cpu'
+    """
 
     resolve_weights: Callable[[str, str | None], Path]
     """The function ``resolve_weights(uri, sha256)`` returns the local path of a weights file and

@@ -21,7 +21,12 @@ several images."""
 
 
 class ProviderConfig(Options):
-    """Configuration of one provider, with fallback providers in order of preference."""
+    """Configuration of one provider, with fallback providers in order of preference.
+
+    Examples:
+        >>> ProviderConfig(use="files", options={"directory": "depth/"}).use
+        'files'
+    """
 
     use: str
     """Name of the provider, as in the output of ``mpsfm plugins list``."""
