@@ -42,8 +42,9 @@ def extract(
     Other programs may replace these files before mpsfm match and mpsfm map. Repeat the command to
     continue an interrupted one.
     """
-    from mpsfm_core import extract_features, load_config, load_images, predict_priors
+    from mpsfm_core.api import extract_features, load_images, predict_priors
     from mpsfm_core.cli.progress import show_progress
+    from mpsfm_core.config import load_config
     from mpsfm_core.pipeline import work_folder as files
     from mpsfm_core.providers.registry import Registry
     from mpsfm_core.results.match_files import write_hloc_features
@@ -89,8 +90,9 @@ def match(
     Reads WORK/features.h5, which hloc or another program may have written. Writes WORK/matches.h5
     (hloc, before verification) and WORK/database.db (COLMAP, verified).
     """
-    from mpsfm_core import load_config, load_images, match_images
+    from mpsfm_core.api import load_images, match_images
     from mpsfm_core.cli.progress import show_progress
+    from mpsfm_core.config import load_config
     from mpsfm_core.inputs.matches import features_from_hloc
     from mpsfm_core.pipeline import work_folder as files
     from mpsfm_core.providers.registry import Registry
