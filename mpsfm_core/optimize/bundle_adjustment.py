@@ -1,11 +1,11 @@
 """Bundle adjustment with depth regularization (paper 3.3, ``C_BA + C_reg``).
 
-The variables are camera poses, 3D points and, optionally, focal lengths and log scales ``s`` of
-depth maps. Bundle adjustment minimizes::
+The variables are camera poses, 3D points and, optionally, focal lengths ``f``, radial distortions
+``k`` and log scales ``s`` of depth maps. Bundle adjustment minimizes::
 
     1/2 sum rho_r(|project(R X + t) - xy|^2 / std_px^2)
     + 1/2 sum rho_d((log z - log d - s)^2 / std^2) + 1/2 sum (s - expected)^2 / std_s^2
-    + 1/2 sum (log f - log f_prior)^2 / std_f^2
+    + 1/2 sum (log f - log f_prior)^2 / std_f^2 + 1/2 sum k^2 / std_k^2
 
 The optimizer is Levenberg-Marquardt (Triggs et al., "Bundle Adjustment -- A Modern Synthesis",
 2000). Each step eliminates the 3D points with the Schur complement, solves the reduced camera
@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import lapack
 from threadpoolctl import ThreadpoolController
 
@@ -44,6 +45,8 @@ MAX_DAMPING = 1e16
 """Levenberg-Marquardt damping above which bundle adjustment stops. [ours]"""
 MAX_FOCAL_STEP = 1.0
 """Largest change of a log focal length per step. [ours]"""
+MAX_RADIAL_STEP = 0.1
+"""Largest change of a radial distortion per step. [ours]"""
 CG_TOLERANCE = 1e-3
 """Relative tolerance of conjugate gradients on the reduced camera system. [ours]"""
 MAX_CG_ITERATIONS = 500
@@ -55,17 +58,21 @@ MIN_GAIN = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class BundleResult:
-    """Adjusted poses, points, focal lengths and depth scales, with a solver summary."""
+    """Adjusted poses, points, intrinsics and depth scales, with a solver summary."""
 
     rotations: Float64
     translations: Float64
     log_scales: Float64
     intrinsics: Float64
+    radial: Float64
     points: Float64
     std_log_focals: Float64
     """(k,) posterior standard deviation of each variable log focal length, from the inverse of the
     reduced camera system at the solution. The standard deviation is NaN for a constant focal length
     and infinite for an undetermined focal length."""
+    std_radial: Float64
+    """(k,) posterior standard deviation of each variable radial distortion, NaN if constant and
+    infinite if undetermined."""
     initial_cost: float
     final_cost: float
     iterations: int
@@ -78,10 +85,10 @@ class BundleResult:
 
 
 def adjust_bundle(problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:
-    """Adjust poses, points, focal lengths and depth scales; the cost never increases.
+    """Adjust poses, points, intrinsics and depth scales; the cost never increases.
 
     As in COLMAP, an observation whose point is behind the camera, or more than 89.9999 degrees off
-    its axis, has residual 0. If a step makes an observation invisible in this way, the observation
+    its axis, or where radial distortion folds the image over, has residual 0. If a step makes an observation invisible in this way, the observation
     keeps its previous cost. The adjusted parameters do not depend on the number of threads, bit for
     bit.
 
@@ -140,8 +147,8 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
         if damping > MAX_DAMPING:
             message = "no step lowers the cost"
             break
-    stds = normal.compute_focal_stds(state)
-    return BundleResult(*state, stds, initial_cost, cost, iteration, converged, message)
+    stds = normal.compute_intrinsic_stds(state)
+    return BundleResult(*state, *stds, initial_cost, cost, iteration, converged, message)
 
 
 class SchurComplementSolver:
@@ -149,11 +156,11 @@ class SchurComplementSolver:
 
     def __init__(self, p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> None:
         layout = p.bundle.layout
-        poses, focals = len(layout.pair), int(layout.focal_slot.max(initial=-1)) + 1
-        size = kernels.NUM_IMAGE_PARAMS * poses + focals
+        poses, intrinsics = len(layout.pair), int(self._intrinsic_slots(layout).max(initial=-1)) + 1
+        size = kernels.NUM_IMAGE_PARAMS * poses + intrinsics
         view = int(kernels.NUM_IMAGE_PARAMS)
-        block, border = (len(p.pairs), view, view), (focals, view * poses)
-        shapes = block, border, (focals, focals), size, size, size
+        block, border = (len(p.pairs), view, view), (intrinsics, view * poses)
+        shapes = block, border, (intrinsics, intrinsics), size, size, size
         self.parts = [
             kernels.ReducedCameraSystem(*(np.empty(shape) for shape in shapes)) for _ in p.ranges
         ]
@@ -189,10 +196,20 @@ class SchurComplementSolver:
             for array, summand in zip(self.total, part, strict=True):
                 array += summand
         self._add_scale_prior(state)
-        self._add_focal_prior(state)
+        self._add_intrinsic_priors(state)
         self.total.rhs[:] += self.total.gradient
         self._fix_constants()
-        return cost + self.p.scale_prior.cost(state) + self.p.focal_prior.cost(state)
+        return cost + self._prior_cost(state)
+
+    @staticmethod
+    def _intrinsic_slots(layout: kernels.ParameterLayout) -> NDArray[np.int32]:
+        """Return the slots (2k,) of the focal length and of the radial distortion of cameras."""
+        return np.concatenate([layout.focal_slot, layout.radial_slot])
+
+    def _prior_cost(self, state: kernels.BundleParameters) -> float:
+        """Return the cost of the priors on depth scales, focal lengths and radial distortions."""
+        cost = self.p.scale_prior.cost(state) + self.p.focal_prior.cost(state)
+        return cost + self.p.radial_prior.cost(state)
 
     def _add_scale_prior(self, state: kernels.BundleParameters) -> None:
         """Add the prior of the depth maps' log scales to the reduced camera system."""
@@ -204,32 +221,32 @@ class SchurComplementSolver:
         residuals = state.log_scales[prior.image] - prior.log_scale
         self.total.gradient[rows] += prior.weight * residuals
 
-    def _add_focal_prior(self, state: kernels.BundleParameters) -> None:
-        """Add the prior of the log focal lengths to the reduced camera system."""
-        prior, num_poses = self.p.focal_prior, len(self.p.bundle.layout.pair)
-        rows = kernels.NUM_IMAGE_PARAMS * num_poses + prior.slot
-        self.total.corner[prior.slot, prior.slot] += prior.weight
-        self.total.diagonal[rows] += prior.weight
-        self.total.gradient[rows] += prior.weight * prior.residuals(state)
+    def _add_intrinsic_priors(self, state: kernels.BundleParameters) -> None:
+        """Add the priors of focal lengths and radial distortions to the reduced camera system."""
+        num_poses = len(self.p.bundle.layout.pair)
+        for prior in (self.p.focal_prior, self.p.radial_prior):
+            rows = kernels.NUM_IMAGE_PARAMS * num_poses + prior.slot
+            self.total.corner[prior.slot, prior.slot] += prior.weight
+            self.total.diagonal[rows] += prior.weight
+            self.total.gradient[rows] += prior.weight * prior.residuals(state)
 
-    def compute_focal_stds(self, state: kernels.BundleParameters) -> Float64:
-        """Compute the posterior standard deviation of each log focal length.
+    def compute_intrinsic_stds(self, state: kernels.BundleParameters) -> tuple[Float64, Float64]:
+        """Compute the posterior standard deviation of log focal lengths and radial distortions.
 
-        The variance of a log focal length is a diagonal entry of the inverse reduced camera system.
+        The variance of a parameter is a diagonal entry of the inverse reduced camera system.
 
         Args:
-            state: Poses, points, focal lengths and depth scales at which the residuals are
-                linearized.
+            state: Poses, points, intrinsics and depth scales at which the residuals are linearized.
 
         Returns:
-            (k,) standard deviations of log focal lengths, NaN if constant and infinite if
-            undetermined.
+            (k,) standard deviations of log focal lengths, and (k,) of radial distortions, NaN if
+            constant and infinite if undetermined.
         """
-        slots = self.p.bundle.layout.focal_slot
-        stds = np.full(len(slots), np.nan)
+        slots = self._intrinsic_slots(self.p.bundle.layout)
+        stds, num_cameras = np.full(len(slots), np.nan), len(slots) // 2
         cameras = np.flatnonzero(slots >= 0)
         if not len(cameras):
-            return stds
+            return stds[:num_cameras], stds[num_cameras:]
         self.linearize(state, MIN_DAMPING)
         diagonal = self.total.diagonal
         boost = np.where(diagonal > 0, MIN_DAMPING * diagonal, 1.0)
@@ -243,7 +260,7 @@ class SchurComplementSolver:
         variances = columns[rows, np.arange(len(rows))]
         determined = (diagonal[rows] > 0) & (variances > 0)
         stds[cameras] = np.where(determined, np.sqrt(np.where(determined, variances, 1)), np.inf)
-        return stds
+        return stds[:num_cameras], stds[num_cameras:]
 
     def _fix_constants(self) -> None:
         """Remove constant parameters of images from the reduced camera system."""
@@ -277,8 +294,7 @@ class SchurComplementSolver:
         delta = solve(boost, -self.total.rhs)
         if not np.isfinite(delta).all():
             return np.inf, -np.inf, np.inf
-        focals = delta[self.total.border.shape[1] :]
-        np.clip(focals, -MAX_FOCAL_STEP, MAX_FOCAL_STEP, out=focals)
+        self._limit_intrinsic_steps(delta)
         for old, new in zip(state[:-1], trial[:-1], strict=True):
             np.copyto(new, old)
         kernels.update_cameras(delta, self.p.bundle.layout, state, trial)
@@ -299,9 +315,17 @@ class SchurComplementSolver:
             return costs
 
         visible, lost, predicted = (float(x) for x in np.sum(self.run(move), axis=0))
-        visible += self.p.scale_prior.cost(trial) + self.p.focal_prior.cost(trial)
+        visible += self._prior_cost(trial)
         predicted += 0.5 * float(delta @ (boost * delta - self.total.gradient))
         return visible, cost - visible - lost, predicted
+
+    def _limit_intrinsic_steps(self, delta: Float64) -> None:
+        """Clip the steps of focal lengths and radial distortions in ``delta`` (d,)."""
+        layout, first = self.p.bundle.layout, self.total.border.shape[1]
+        limits = ((layout.focal_slot, MAX_FOCAL_STEP), (layout.radial_slot, MAX_RADIAL_STEP))
+        for slots, limit in limits:
+            rows = first + slots[slots >= 0]
+            delta[rows] = np.clip(delta[rows], -limit, limit)
 
     def _solve_dense(self, boost: Float64, rhs: Float64) -> Float64:
         if not len(boost):

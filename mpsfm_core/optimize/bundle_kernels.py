@@ -6,11 +6,14 @@ Kernels allocate no memory, so numba's reference counting is disabled (``_nrt=Fa
 times faster.
 
 Observations are sorted by point, then by image. Each image with a variable pose or depth scale has
-a pose slot, an index into the camera parameters. Each variable focal length has a focal slot.
-A vector of camera parameters contains 7 parameters per pose slot (rotation, translation, log scale
-of the depth map), followed by one parameter per focal slot. A step updates rotation, translation,
-log scale and focal length by ``R <- exp(w) R``, ``t <- t + dt``, ``s <- s + ds`` and ``f <- f
-exp(a)``.
+a pose slot, an index into the camera parameters. Each variable focal length and each variable
+radial distortion has an intrinsic slot. A vector of camera parameters contains 7 parameters per
+pose slot (rotation, translation, log scale of the depth map), followed by one parameter per
+intrinsic slot. A step updates rotation, translation, log scale, focal length and radial distortion
+by ``R <- exp(w) R``, ``t <- t + dt``, ``s <- s + ds``, ``f <- f exp(a)`` and ``k <- k + dk``.
+
+The camera model is COLMAP's SIMPLE_RADIAL with two focal lengths, ``(fx u (1 + k r^2) + cx, fy v
+(1 + k r^2) + cy)`` with ``u = x / z``, ``v = y / z`` and ``r^2 = u^2 + v^2``.
 """
 
 from __future__ import annotations
@@ -44,8 +47,12 @@ cameras. Points with outliers converge slowly under robust losses, and the addit
 the run time. [tuned: benchmarks.bundle_adjustment]"""
 POINT_STEP_DAMPING = 1e-6
 """Levenberg-Marquardt damping of the steps of single points with fixed cameras. [ours]"""
-NUM_IMAGE_PARAMS, NUM_FOCAL_PARAMS = np.int64(7), np.int64(1)
-"""Number of parameters of an image (pose and log scale of its depth map) and of a focal length."""
+MIN_RADIAL_SLOPE = 0.1
+"""Smallest derivative ``1 + 3 k r^2`` of the distorted radius at a point that projects into an
+image. The distortion folds the image over where the derivative is 0. [ours]"""
+NUM_IMAGE_PARAMS, NUM_INTRINSIC_PARAMS = np.int64(7), np.int64(1)
+"""Number of parameters of an image (pose and log scale of its depth map) and of an intrinsic
+slot."""
 LOG_SCALE_IDX = 6
 """Index of the depth map's log scale among the 7 parameters of an image."""
 _ONLY = np.int64(0)
@@ -75,6 +82,9 @@ class ParameterLayout(NamedTuple):
     camera_of_image: Int32
     pose_slot: Int32
     focal_slot: Int32
+    """(k,) intrinsic slot of the focal length of each camera."""
+    radial_slot: Int32
+    """(k,) intrinsic slot of the radial distortion of each camera."""
     variable_point: Bool
     variable_scale: Bool
     pair: Int32
@@ -109,6 +119,8 @@ class BundleParameters(NamedTuple):
     """(n,) log of the scale factor on the depth map of each image."""
     intrinsics: Float64
     """(k, 4) camera parameters fx, fy, cx, cy in pixels."""
+    radial: Float64
+    """(k,) radial distortion coefficient of each camera."""
     points: Float64
     """(p, 3) points in the world frame."""
 
@@ -120,9 +132,9 @@ class ReducedCameraSystem(NamedTuple):
     """(pairs, 7, 7) blocks of the Schur complement for pairs of images with common points. Blocks
     on the diagonal store only their upper triangle."""
     border: Float64
-    """(focals, 7 poses) block between focal lengths and image parameters."""
+    """(intrinsics, 7 poses) block between intrinsic and image parameters."""
     corner: Float64
-    """(focals, focals) block of the Schur complement for the focal lengths."""
+    """(intrinsics, intrinsics) block of the Schur complement for the intrinsic parameters."""
     gradient: Float64
     """(d,) gradient of the cost by the camera parameters, before the elimination of points."""
     diagonal: Float64
@@ -136,12 +148,12 @@ class EliminationBuffers(NamedTuple):
 
     slots: Int64
     """(longest,) pose slots of the images that observe the current point."""
-    focals: Int64
-    """(longest,) focal slots of the cameras that observe the current point."""
+    intrinsics: Int64
+    """(2 longest,) intrinsic slots of the cameras that observe the current point."""
     y: Float64
     """(longest, 3, 7) blocks of the normal equations between the point and image parameters."""
     yf: Float64
-    """(longest, 3, 1) blocks of the normal equations between the point and focal lengths."""
+    """(2 longest, 3, 1) blocks of the normal equations between the point and intrinsics."""
     columns: Float64
     before: Float64
     """(longest, 2) cost and point depth of each observation before a step."""
@@ -155,9 +167,10 @@ class LinearizedObservation(NamedTuple):
 
     The point in the camera frame is ``(x, y, z) = q + t`` with the rotated point ``q = R X``. The
     vector ``g`` is the gradient of the cost by the camera-frame point, and ``h`` is the
-    Gauss-Newton matrix, whose entry ``hxy`` is 0. Steps of pose, 3D point and focal length displace
-    the camera-frame point by ``w x q + dt``, ``R dX`` and ``(x, y, 0) da``. The fields ``gs``,
-    ``hss`` and ``hzs`` are the derivatives by the log scale of the depth map.
+    Gauss-Newton matrix, whose entry ``hxy`` is 0 without distortion. Steps of pose, 3D point, focal
+    length and radial distortion displace the camera-frame point by ``w x q + dt``, ``R dX``,
+    ``by_focal (x, y, 0) da`` and ``by_radial (x, y, 0) dk``. The fields ``gs``, ``hss`` and ``hzs``
+    are the derivatives by the log scale of the depth map.
     """
 
     visible: bool
@@ -179,6 +192,9 @@ class LinearizedObservation(NamedTuple):
     gs: float
     hss: float
     hzs: float
+    hxy: float
+    by_focal: float
+    by_radial: float
 
 
 def allocate_buffers(longest: int) -> EliminationBuffers:
@@ -186,9 +202,9 @@ def allocate_buffers(longest: int) -> EliminationBuffers:
     longest = max(longest, 1)
     return EliminationBuffers(
         slots=np.empty(longest, np.int64),
-        focals=np.empty(longest, np.int64),
+        intrinsics=np.empty(2 * longest, np.int64),
         y=np.empty((longest, 3, NUM_IMAGE_PARAMS)),
-        yf=np.empty((longest, 3, 1)),
+        yf=np.empty((2 * longest, 3, 1)),
         columns=np.empty((3, NUM_IMAGE_PARAMS)),
         before=np.empty((longest, 2)),
         block=np.empty((1, 10)),
@@ -253,6 +269,68 @@ def number_covisible_poses(
 
 
 @_helper
+def _linearize_distorted_observation(
+    k: int,
+    image: int,
+    camera: int,
+    qx: float,
+    qy: float,
+    qz: float,
+    x: float,
+    y: float,
+    z: float,
+    bundle: BundleData,
+    state: BundleParameters,
+) -> LinearizedObservation:
+    """Linearize an observation in front of a camera with radial distortion."""
+    obs, robust = bundle.obs, bundle.robust
+    n = 0.0
+    inverse = 1.0 / z
+    u, v, radial = x * inverse, y * inverse, state.radial[camera]
+    r2 = u * u + v * v
+    factor, radius_slope = 1.0 + radial * r2, 1.0 + 3.0 * radial * r2
+    if not (factor > MIN_RADIAL_SLOPE and radius_slope > MIN_RADIAL_SLOPE):
+        return LinearizedObservation(
+            False, n, qx, qy, qz, x, y, z, n, n, n, n, n, n, n, n, n, n, n, n, n, n
+        )
+    fx = state.intrinsics[camera, 0] * obs.weight[k]
+    fy = state.intrinsics[camera, 1] * obs.weight[k]
+    ru = fx * u * factor + (state.intrinsics[camera, 2] - obs.xy[k, 0]) * obs.weight[k]
+    rv = fy * v * factor + (state.intrinsics[camera, 3] - obs.xy[k, 1]) * obs.weight[k]
+    rho, weight = evaluate_loss(
+        robust.reprojection_loss, ru * ru + rv * rv, robust.reprojection_scale
+    )
+    # The rows of d(ru, rv) / d(x, y). The derivative by z is the product of these rows and -(u, v).
+    ux = fx * inverse * (factor + 2.0 * radial * u * u)
+    uy = fx * inverse * 2.0 * radial * u * v
+    vx = fy * inverse * 2.0 * radial * u * v
+    vy = fy * inverse * (factor + 2.0 * radial * v * v)
+    gx, gy = weight * (ux * ru + vx * rv), weight * (uy * ru + vy * rv)
+    gz = -gx * u - gy * v
+    hxx, hyy = weight * (ux * ux + vx * vx), weight * (uy * uy + vy * vy)
+    hxy = weight * (ux * uy + vx * vy)
+    hxz, hyz = -hxx * u - hxy * v, -hxy * u - hyy * v
+    hzz = -hxz * u - hyz * v
+    gs = hss = hzs = 0.0
+    if obs.depth_weight[k] > 0.0:
+        slope_s = obs.depth_weight[k]
+        rd = (np.log(z) - obs.log_depth[k] - state.log_scales[image]) * slope_s
+        depth_rho, weight = evaluate_loss(robust.depth_loss, rd * rd, robust.depth_scale)
+        slope = slope_s * inverse
+        rho += depth_rho
+        gz += weight * slope * rd
+        hzz += weight * slope * slope
+        if bundle.layout.variable_scale[image]:
+            gs = -weight * slope_s * rd
+            hss = weight * slope_s * slope_s
+            hzs = -weight * slope * slope_s
+    return LinearizedObservation(
+        True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, hxz, hyz, hzz, gs, hss, hzs,
+        hxy, factor / radius_slope, r2 / radius_slope,
+    )  # fmt: skip
+
+
+@_helper
 def linearize_observation(
     k: int, p: int, bundle: BundleData, state: BundleParameters
 ) -> LinearizedObservation:
@@ -267,12 +345,18 @@ def linearize_observation(
     x = qx + state.translations[image, 0]
     y = qy + state.translations[image, 1]
     z = qz + state.translations[image, 2]
+    n = 0.0
     if not (z > MIN_DEPTH and z * MAX_SLOPE > abs(x) + abs(y)):
-        n = 0.0
-        return LinearizedObservation(False, n, qx, qy, qz, x, y, z, n, n, n, n, n, n, n, n, n, n, n)
+        return LinearizedObservation(
+            False, n, qx, qy, qz, x, y, z, n, n, n, n, n, n, n, n, n, n, n, n, n, n
+        )
+    camera = bundle.layout.camera_of_image[image]
+    if state.radial[camera] != 0.0 or bundle.layout.radial_slot[camera] >= 0:
+        return _linearize_distorted_observation(
+            k, image, camera, qx, qy, qz, x, y, z, bundle, state
+        )
     inverse = 1.0 / z
     u, v = x * inverse, y * inverse
-    camera = bundle.layout.camera_of_image[image]
     fx = state.intrinsics[camera, 0] * obs.weight[k]
     fy = state.intrinsics[camera, 1] * obs.weight[k]
     ru = fx * u + (state.intrinsics[camera, 2] - obs.xy[k, 0]) * obs.weight[k]
@@ -301,8 +385,9 @@ def linearize_observation(
             hss = weight * slope_s * slope_s
             hzs = -weight * slope * slope_s
     return LinearizedObservation(
-        True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, hxz, hyz, hzz, gs, hss, hzs
-    )
+        True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, hxz, hyz, hzz, gs, hss, hzs,
+        n, 1.0, n,
+    )  # fmt: skip
 
 
 @_helper
@@ -325,6 +410,12 @@ def _fill_pose_columns(s: LinearizedObservation, columns: Float64) -> None:
     columns[2, 5] = s.hzz
     columns[0, 6] = columns[1, 6] = 0.0
     columns[2, 6] = s.hzs
+    if s.hxy != 0.0:
+        columns[0, 0] -= s.hxy * s.qz
+        columns[1, 1] += s.hxy * s.qz
+        columns[0, 2] += s.hxy * s.qx
+        columns[1, 2] -= s.hxy * s.qy
+        columns[1, 3] = columns[0, 4] = s.hxy
 
 
 @_helper
@@ -356,6 +447,7 @@ def _add_pose(
         if b >= 2:
             blocks[row, 2, b] += s.qx * c1 - s.qy * c0
     blocks[row, 3, 3] += s.hxx
+    blocks[row, 3, 4] += s.hxy
     blocks[row, 3, 5] += s.hxz
     blocks[row, 4, 4] += s.hyy
     blocks[row, 4, 5] += s.hyz
@@ -365,24 +457,51 @@ def _add_pose(
 
 
 @_helper
-def _add_focal(
+def _add_intrinsic(
     s: LinearizedObservation,
+    by: float,
     columns: Float64,
-    focal: int,
+    intrinsic: int,
     slot: int,
     poses: int,
     system: ReducedCameraSystem,
 ) -> None:
-    """Add the gradient and blocks of an observation's focal length to the camera system."""
-    own = s.x * s.x * s.hxx + s.y * s.y * s.hyy
-    system.gradient[NUM_IMAGE_PARAMS * poses + focal] += s.x * s.gx + s.y * s.gy
-    system.diagonal[NUM_IMAGE_PARAMS * poses + focal] += own
-    system.corner[focal, focal] += own
+    """Add the gradient and blocks of an intrinsic parameter to the camera system.
+
+    A step of the parameter displaces the camera-frame point by ``by (x, y, 0)``.
+    """
+    x, y = by * s.x, by * s.y
+    own = x * x * s.hxx + y * y * s.hyy
+    if s.hxy != 0.0:
+        own += 2.0 * x * y * s.hxy
+    system.gradient[NUM_IMAGE_PARAMS * poses + intrinsic] += x * s.gx + y * s.gy
+    system.diagonal[NUM_IMAGE_PARAMS * poses + intrinsic] += own
+    system.corner[intrinsic, intrinsic] += own
     if slot >= 0:
         for a in range(NUM_IMAGE_PARAMS):
-            system.border[focal, NUM_IMAGE_PARAMS * slot + a] += (
-                s.x * columns[0, a] + s.y * columns[1, a]
+            system.border[intrinsic, NUM_IMAGE_PARAMS * slot + a] += (
+                x * columns[0, a] + y * columns[1, a]
             )
+
+
+@_helper
+def _add_focal_and_radial(
+    s: LinearizedObservation, focal: int, radial: int, system: ReducedCameraSystem
+) -> None:
+    """Add the block between the focal length and the radial distortion of a camera."""
+    both = s.x * s.x * s.hxx + s.y * s.y * s.hyy + 2.0 * s.x * s.y * s.hxy
+    both *= s.by_focal * s.by_radial
+    system.corner[focal, radial] += both
+    system.corner[radial, focal] += both
+
+
+@_helper
+def _fill_intrinsic_column(s: LinearizedObservation, by: float, columns: Float64) -> None:
+    """Multiply an observation's Gauss-Newton matrix by the Jacobian of an intrinsic parameter."""
+    x, y = by * s.x, by * s.y
+    columns[0, 0] = x * s.hxx + y * s.hxy
+    columns[1, 0] = y * s.hyy + x * s.hxy
+    columns[2, 0] = x * s.hxz + y * s.hyz
 
 
 @_helper
@@ -396,6 +515,9 @@ def _add_point(
         block[p, 6 + a] += r0 * s.gx + r1 * s.gy + r2 * s.gz
         c0 = r0 * s.hxx + r2 * s.hxz
         c1 = r1 * s.hyy + r2 * s.hyz
+        if s.hxy != 0.0:
+            c0 += r1 * s.hxy
+            c1 += r0 * s.hxy
         c2 = r0 * s.hxz + r1 * s.hyz + r2 * s.hzz
         for b in range(a + 1):
             block[p, a * (a + 1) // 2 + b] += (
@@ -505,9 +627,9 @@ def _eliminate_from_poses(
 
 
 @_helper
-def _eliminate_from_focals(
+def _eliminate_from_intrinsics(
     count: int,
-    num_focals: int,
+    num_intrinsics: int,
     z0: float,
     z1: float,
     z2: float,
@@ -515,18 +637,18 @@ def _eliminate_from_focals(
     system: ReducedCameraSystem,
     scratch: EliminationBuffers,
 ) -> None:
-    """Subtract a point's Schur complement from the blocks of its focal lengths."""
-    focals, yf, slots, y = scratch.focals, scratch.yf, scratch.slots, scratch.y
-    for f in range(num_focals):
+    """Subtract a point's Schur complement from the blocks of its intrinsics."""
+    intrinsics, yf, slots, y = scratch.intrinsics, scratch.yf, scratch.slots, scratch.y
+    for f in range(num_intrinsics):
         y0, y1, y2 = yf[f, 0, 0], yf[f, 1, 0], yf[f, 2, 0]
-        system.rhs[NUM_IMAGE_PARAMS * poses + focals[f]] -= y0 * z0 + y1 * z1 + y2 * z2
+        system.rhs[NUM_IMAGE_PARAMS * poses + intrinsics[f]] -= y0 * z0 + y1 * z1 + y2 * z2
         for a in range(count):
             for i in range(NUM_IMAGE_PARAMS):
-                system.border[focals[f], NUM_IMAGE_PARAMS * slots[a] + i] -= (
+                system.border[intrinsics[f], NUM_IMAGE_PARAMS * slots[a] + i] -= (
                     y0 * y[a, 0, i] + y1 * y[a, 1, i] + y2 * y[a, 2, i]
                 )
-        for g in range(num_focals):
-            system.corner[focals[f], focals[g]] -= (
+        for g in range(num_intrinsics):
+            system.corner[intrinsics[f], intrinsics[g]] -= (
                 y0 * yf[g, 0, 0] + y1 * yf[g, 1, 0] + y2 * yf[g, 2, 0]
             )
 
@@ -558,7 +680,7 @@ def eliminate_points(
         last: Index after the last point.
         damping: Levenberg-Marquardt damping of the points; the camera blocks remain undamped.
         bundle: Observations, parameter layout and robust losses.
-        state: Poses, points, focal lengths and depth scales.
+        state: Poses, points, intrinsics and depth scales.
         system: Reduced camera system to which the points of the range are added.
         eliminated: (p, 10) output with a row per point: 6 entries of ``L^-1`` with the damped block
             ``V = L L^T``, the gradient, and the mean of the diagonal of V. Rows of constant or
@@ -569,11 +691,11 @@ def eliminate_points(
         Cost of the observations of the points ``first:last``.
     """
     obs, layout = bundle.obs, bundle.layout
-    slots, focals, columns = scratch.slots, scratch.focals, scratch.columns
+    slots, intrinsics, columns = scratch.slots, scratch.intrinsics, scratch.columns
     poses = len(layout.pair)
     cost = 0.0
     for p in range(first, last):
-        count = num_focals = np.int64(0)
+        count = num_intrinsics = np.int64(0)
         for a in range(10):
             eliminated[p, a] = 0.0
         for k in range(obs.start[p], obs.start[p + 1]):
@@ -584,11 +706,16 @@ def eliminate_points(
             image = obs.image[k]
             slot = layout.pose_slot[image]
             focal = layout.focal_slot[layout.camera_of_image[image]]
+            radial = layout.radial_slot[layout.camera_of_image[image]]
             _fill_pose_columns(s, columns)
             if slot >= 0:
                 _add_pose(s, columns, slot, layout.pair[slot, slot], system)
             if focal >= 0:
-                _add_focal(s, columns, focal, slot, poses, system)
+                _add_intrinsic(s, s.by_focal, columns, focal, slot, poses, system)
+            if radial >= 0:
+                _add_intrinsic(s, s.by_radial, columns, radial, slot, poses, system)
+            if focal >= 0 and radial >= 0:
+                _add_focal_and_radial(s, focal, radial, system)
             if not layout.variable_point[p]:
                 continue
             _add_point(s, state.rotations, image, eliminated, p)
@@ -602,16 +729,16 @@ def eliminate_points(
                 _add_coupling(
                     columns, NUM_IMAGE_PARAMS, state.rotations, image, scratch.y, count - 1, fresh
                 )
-            if focal >= 0:
-                n = _find_or_add(focals, num_focals, focal)
-                columns[0, 0] = s.x * s.hxx
-                columns[1, 0] = s.y * s.hyy
-                columns[2, 0] = s.x * s.hxz + s.y * s.hyz
-                fresh = n == num_focals
-                _add_coupling(
-                    columns, NUM_FOCAL_PARAMS, state.rotations, image, scratch.yf, n, fresh
-                )
-                num_focals = max(num_focals, n + 1)
+            for parameter in range(2):
+                intrinsic, by = (focal, s.by_focal) if parameter == 0 else (radial, s.by_radial)
+                if intrinsic >= 0:
+                    n = _find_or_add(intrinsics, num_intrinsics, intrinsic)
+                    _fill_intrinsic_column(s, by, columns)
+                    fresh = n == num_intrinsics
+                    _add_coupling(
+                        columns, NUM_INTRINSIC_PARAMS, state.rotations, image, scratch.yf, n, fresh
+                    )
+                    num_intrinsics = max(num_intrinsics, n + 1)
         if not _invert_factor(eliminated, p, damping):
             for a in range(10):
                 eliminated[p, a] = 0.0
@@ -622,10 +749,10 @@ def eliminate_points(
         z2 = eliminated[p, 3] * g0 + eliminated[p, 4] * g1 + eliminated[p, 5] * g2
         for a in range(count):
             _whiten(eliminated, p, scratch.y, a, NUM_IMAGE_PARAMS)
-        for f in range(num_focals):
-            _whiten(eliminated, p, scratch.yf, f, NUM_FOCAL_PARAMS)
+        for f in range(num_intrinsics):
+            _whiten(eliminated, p, scratch.yf, f, NUM_INTRINSIC_PARAMS)
         _eliminate_from_poses(count, z0, z1, z2, layout.pair, system, scratch)
-        _eliminate_from_focals(count, num_focals, z0, z1, z2, poses, system, scratch)
+        _eliminate_from_intrinsics(count, num_intrinsics, z0, z1, z2, poses, system, scratch)
     return cost
 
 
@@ -662,11 +789,18 @@ def _joint_step(
             dz = delta[n] * s.qy - delta[n + 1] * s.qx + delta[n + 5]
             ds = delta[n + LOG_SCALE_IDX]
         focal = layout.focal_slot[layout.camera_of_image[image]]
+        radial = layout.radial_slot[layout.camera_of_image[image]]
         if focal >= 0:
-            dx += s.x * delta[NUM_IMAGE_PARAMS * len(layout.pair) + focal]
-            dy += s.y * delta[NUM_IMAGE_PARAMS * len(layout.pair) + focal]
+            dx += s.by_focal * s.x * delta[NUM_IMAGE_PARAMS * len(layout.pair) + focal]
+            dy += s.by_focal * s.y * delta[NUM_IMAGE_PARAMS * len(layout.pair) + focal]
+        if radial >= 0:
+            dx += s.by_radial * s.x * delta[NUM_IMAGE_PARAMS * len(layout.pair) + radial]
+            dy += s.by_radial * s.y * delta[NUM_IMAGE_PARAMS * len(layout.pair) + radial]
         ux = s.hxx * dx + s.hxz * dz
         uy = s.hyy * dy + s.hyz * dz
+        if s.hxy != 0.0:
+            ux += s.hxy * dy
+            uy += s.hxy * dx
         uz = s.hxz * dx + s.hyz * dy + s.hzz * dz + s.hzs * ds
         g0 += rotation[image, 0, 0] * ux + rotation[image, 1, 0] * uy + rotation[image, 2, 0] * uz
         g1 += rotation[image, 0, 1] * ux + rotation[image, 1, 1] * uy + rotation[image, 2, 1] * uz
@@ -783,7 +917,7 @@ def rotation_from_vector(x: float, y: float, z: float) -> Any:
 def update_cameras(
     delta: Float64, layout: ParameterLayout, state: BundleParameters, trial: BundleParameters
 ) -> None:
-    """Apply a camera step ``delta`` to the poses, depth scales and focal lengths of ``trial``."""
+    """Apply a camera step ``delta`` to the poses, depth scales and intrinsics of ``trial``."""
     for image in range(len(layout.pose_slot)):
         slot = layout.pose_slot[image]
         if slot < 0:
@@ -804,6 +938,9 @@ def update_cameras(
             scale = np.exp(delta[NUM_IMAGE_PARAMS * len(layout.pair) + layout.focal_slot[camera]])
             trial.intrinsics[camera, 0] *= scale
             trial.intrinsics[camera, 1] *= scale
+        if layout.radial_slot[camera] >= 0:
+            slot = layout.radial_slot[camera]
+            trial.radial[camera] += delta[NUM_IMAGE_PARAMS * len(layout.pair) + slot]
 
 
 @_kernel

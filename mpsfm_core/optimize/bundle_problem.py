@@ -73,6 +73,14 @@ class BundleProblem:
     prior_std_log_focals: Float64 | float = np.inf
     """(k,) standard deviation of the prior on ``log fx``, or one number for all (infinite without
     prior)."""
+    radial: Float64 | None = None
+    """(k,) radial distortion coefficient of each camera, as in COLMAP's SIMPLE_RADIAL (None uses
+    0)."""
+    variable_radial: Bool | None = None
+    """(k,) bool, True for cameras with variable radial distortion (None keeps all constant)."""
+    prior_std_radial: Float64 | float = np.inf
+    """(k,) standard deviation of the zero-mean prior on ``radial``, or one number for all (infinite
+    without prior)."""
     log_scales: Float64 | None = None
     """(n,) log of the scale factor on the depth map of each image (None uses 0)."""
     expected_log_scales: Float64 | None = None
@@ -113,7 +121,7 @@ class FocalPrior(NamedTuple):
     camera: Int64
     """(s,) index of the camera of each focal length."""
     slot: Int64
-    """(s,) focal slot of the camera of each focal length."""
+    """(s,) intrinsic slot of each focal length."""
     log_focal: Float64
     """(s,) mean."""
     weight: Float64
@@ -122,6 +130,27 @@ class FocalPrior(NamedTuple):
     def residuals(self, state: kernels.BundleParameters) -> Float64:
         """Return the residuals (s,), log focal lengths minus their prior means."""
         residuals: Float64 = np.log(state.intrinsics[self.camera, 0]) - self.log_focal
+        return residuals
+
+    def cost(self, state: kernels.BundleParameters) -> float:
+        """Return the cost of the prior, half the weighted sum of squared residuals."""
+        residuals = self.residuals(state)
+        return 0.5 * float(residuals @ (self.weight * residuals))
+
+
+class RadialPrior(NamedTuple):
+    """Gaussian prior with zero mean on the variable radial distortions of cameras."""
+
+    camera: Int64
+    """(s,) index of the camera of each radial distortion."""
+    slot: Int64
+    """(s,) intrinsic slot of each radial distortion."""
+    weight: Float64
+    """(s,) inverse variance of the prior on each parameter."""
+
+    def residuals(self, state: kernels.BundleParameters) -> Float64:
+        """Return the residuals (s,), which equal the radial distortions."""
+        residuals: Float64 = state.radial[self.camera]
         return residuals
 
     def cost(self, state: kernels.BundleParameters) -> float:
@@ -139,6 +168,7 @@ class PreparedBundle(NamedTuple):
     """(b, 2) pose slots of the two images of each block of the reduced camera system."""
     scale_prior: ScalePrior
     focal_prior: FocalPrior
+    radial_prior: RadialPrior
     held: Bool
     """(s, 7) bool, True for constant parameters of the images with a pose slot."""
     ranges: list[PointRange]
@@ -166,6 +196,7 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
     variable_pose = _mask(problem.variable_pose, "variable_pose", images, True)
     variable_point = _mask(problem.variable_point, "variable_point", points, True)
     variable_focal = _mask(problem.variable_focal, "variable_focal", cameras, False)
+    variable_radial = _mask(problem.variable_radial, "variable_radial", cameras, False)
     variable_scale = _mask(problem.variable_scale, "variable_scale", images, False)
     moving = variable_pose | variable_scale
     poses = np.count_nonzero(moving)
@@ -173,6 +204,7 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
         _indices(problem.camera_of_image, "camera_of_image", images, cameras),
         _slots(moving),
         _slots(variable_focal),
+        _slots(variable_radial, first=np.count_nonzero(variable_focal)),
         variable_point,
         variable_scale,
         np.full((poses, poses), -1, dtype=np.int32),
@@ -195,6 +227,7 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
         pairs,
         _scale_prior(problem, variable_scale, layout.pose_slot),
         _focal_prior(problem, variable_focal, layout.focal_slot),
+        _radial_prior(problem, variable_radial, layout.radial_slot),
         held[moving],
         _ranges(obs.start, len(pairs)),
         int(np.diff(obs.start).max(initial=0)),
@@ -225,8 +258,9 @@ def _state(problem: BundleProblem) -> kernels.BundleParameters:
     return kernels.BundleParameters(
         _numbers(problem.rotations, "rotations", (count, 3, 3)).copy(),
         _numbers(problem.translations, "translations", (count, 3)).copy(),
-        _log_scales(problem.log_scales, "log_scales", count).copy(),
+        _numbers_or_zero(problem.log_scales, "log_scales", count).copy(),
         _numbers(problem.intrinsics, "intrinsics", (len(problem.intrinsics), 4)).copy(),
+        _numbers_or_zero(problem.radial, "radial", len(problem.intrinsics)).copy(),
         _numbers(problem.points, "points", (len(problem.points), 3)).copy(),
     )
 
@@ -261,7 +295,7 @@ def _sorted_by_point(
     return start[:-1], order
 
 
-def _log_scales(values: Float64 | None, name: str, count: int) -> Float64:
+def _numbers_or_zero(values: Float64 | None, name: str, count: int) -> Float64:
     return _numbers(np.zeros(count) if values is None else values, name, (count,))
 
 
@@ -269,7 +303,7 @@ def _scale_prior(
     problem: BundleProblem, variable: Bool, pose_slot: NDArray[np.int32]
 ) -> ScalePrior:
     count = len(variable)
-    expected = _log_scales(problem.expected_log_scales, "expected_log_scales", count)
+    expected = _numbers_or_zero(problem.expected_log_scales, "expected_log_scales", count)
     std = np.broadcast_to(np.asarray(problem.std_log_scales, dtype=np.float64), (count,))
     if not (std > 0).all():
         raise DataError("std_log_scales", "must be positive")
@@ -292,6 +326,16 @@ def _focal_prior(
     camera = np.flatnonzero(variable & np.isfinite(std))
     slot = focal_slot[camera].astype(np.int64)
     return FocalPrior(camera, slot, means[camera], 1.0 / std[camera] ** 2)
+
+
+def _radial_prior(
+    problem: BundleProblem, variable: Bool, radial_slot: NDArray[np.int32]
+) -> RadialPrior:
+    std = np.broadcast_to(np.asarray(problem.prior_std_radial, dtype=np.float64), variable.shape)
+    if not (std > 0).all():
+        raise DataError("prior_std_radial", "must be positive")
+    camera = np.flatnonzero(variable & np.isfinite(std))
+    return RadialPrior(camera, radial_slot[camera].astype(np.int64), 1.0 / std[camera] ** 2)
 
 
 def _numbers(values: ArrayLike, name: str, shape: tuple[int, ...]) -> Float64:
@@ -328,8 +372,8 @@ def _mask(values: Bool | None, name: str, count: int, default: bool) -> Bool:
     return array
 
 
-def _slots(variable: Bool) -> NDArray[np.int32]:
-    return np.where(variable, np.cumsum(variable) - 1, -1).astype(np.int32)
+def _slots(variable: Bool, first: int = 0) -> NDArray[np.int32]:
+    return np.where(variable, first + np.cumsum(variable) - 1, -1).astype(np.int32)
 
 
 def _scale_gauge(anchor: int, variable: Bool, state: kernels.BundleParameters) -> tuple[int, int]:

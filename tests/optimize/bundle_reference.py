@@ -86,17 +86,19 @@ def without_depth(problem: BundleProblem) -> BundleProblem:
 def to_pycolmap(problem: BundleProblem) -> pycolmap.Reconstruction:
     """The same scene as a reconstruction (ids are indices plus 1).
 
-    Cameras are PINHOLE if their focal lengths differ, else SIMPLE_PINHOLE.
+    Cameras are SIMPLE_RADIAL if the problem has radial distortions, else PINHOLE if their focal
+    lengths differ, else SIMPLE_PINHOLE.
     """
     rec = pycolmap.Reconstruction()
     for number, (fx, fy, *center) in enumerate(problem.intrinsics, start=1):
+        model, params = "PINHOLE", [fx, fy, *center]
+        if problem.radial is not None:
+            model, params = "SIMPLE_RADIAL", [fx, *center, problem.radial[number - 1]]
+        elif fx == fy:
+            model, params = "SIMPLE_PINHOLE", [fx, *center]
         rec.add_camera_with_trivial_rig(
             pycolmap.Camera(
-                model="SIMPLE_PINHOLE" if fx == fy else "PINHOLE",
-                width=SIZE[0],
-                height=SIZE[1],
-                params=[fx, *center] if fx == fy else [fx, fy, *center],
-                camera_id=number,
+                model=model, width=SIZE[0], height=SIZE[1], params=params, camera_id=number
             )
         )
     row = np.empty(len(problem.obs_image), dtype=np.int64)
@@ -126,12 +128,14 @@ def ceres_adjuster(
     tolerance: float = 1e-6,
     *,
     refine_focal: bool = False,
+    refine_radial: bool = False,
     fix_scale: bool = True,
 ) -> Any:
     """Pycolmap's adjuster with our defaults: soft-L1 loss, first pose (and scale) constant."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = refine_focal
-    options.refine_extra_params = options.print_summary = False
+    options.refine_extra_params = refine_radial
+    options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.loss_function_scale = SOFT_L1_OPTIONS.reprojection_scale
     solver = options.ceres.solver_options
@@ -201,13 +205,31 @@ class ScaleCost(pyceres.CostFunction):  # type: ignore[misc]
         return True
 
 
-class LogFocalCost(pyceres.CostFunction):  # type: ignore[misc]
-    """(log f - mean) / std of the parameters of a SIMPLE_PINHOLE camera."""
+class RadialCost(pyceres.CostFunction):  # type: ignore[misc]
+    """k / std of the parameters of a SIMPLE_RADIAL camera."""
 
-    def __init__(self, mean: float, std: float) -> None:
+    def __init__(self, std: float) -> None:
         super().__init__()
         self.set_num_residuals(1)
-        self.set_parameter_block_sizes([3])
+        self.set_parameter_block_sizes([4])
+        self.std = std
+
+    def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
+        """Ceres' callback."""
+        residuals[0] = parameters[0][3] / self.std
+        if jacobians is not None and jacobians[0] is not None:
+            jacobians[0][:] = [0, 0, 0, 1 / self.std]
+        return True
+
+
+class LogFocalCost(pyceres.CostFunction):  # type: ignore[misc]
+    """(log f - mean) / std of the ``size`` parameters of a camera, the first of which is f."""
+
+    def __init__(self, mean: float, std: float, size: int) -> None:
+        super().__init__()
+        self.set_num_residuals(1)
+        self.set_parameter_block_sizes([size])
+        self.size = size
         self.mean = mean
         self.std = std
 
@@ -216,7 +238,8 @@ class LogFocalCost(pyceres.CostFunction):  # type: ignore[misc]
         focal = parameters[0][0]
         residuals[0] = (np.log(focal) - self.mean) / self.std
         if jacobians is not None and jacobians[0] is not None:
-            jacobians[0][:] = [1 / (focal * self.std), 0, 0]
+            jacobians[0][:] = 0
+            jacobians[0][0] = 1 / (focal * self.std)
         return True
 
 
@@ -233,12 +256,20 @@ def solve_with_ceres(
     count = len(problem.rotations)
     given = np.zeros(count) if problem.log_scales is None else problem.log_scales
     log_scales = [np.array([value]) for value in given]
-    adjuster = ceres_adjuster(rec, 1e-13, refine_focal=refine_focal, fix_scale=plain)
-    priors = []
+    refine_radial = problem.variable_radial is not None
+    adjuster = ceres_adjuster(
+        rec, 1e-13, refine_focal=refine_focal, refine_radial=refine_radial, fix_scale=plain
+    )
+    priors: list[Any] = []
     if problem.prior_log_focals is not None:
         for k, mean in enumerate(problem.prior_log_focals):
-            priors.append(LogFocalCost(float(mean), float(problem.prior_std_log_focals)))
-            adjuster.problem.add_residual_block(priors[-1], None, [rec.cameras[k + 1].params])
+            params = rec.cameras[k + 1].params
+            priors.append(LogFocalCost(mean, float(problem.prior_std_log_focals), len(params)))
+            adjuster.problem.add_residual_block(priors[-1], None, [params])
+    if problem.radial is not None and np.isfinite(problem.prior_std_radial):
+        for camera in rec.cameras.values():
+            priors.append(RadialCost(float(problem.prior_std_radial)))
+            adjuster.problem.add_residual_block(priors[-1], None, [camera.params])
     if not plain:
         ceres = adjuster.problem
         loss = pyceres.LossFunction({"name": "cauchy", "params": [SOFT_L1_OPTIONS.depth_scale]})
@@ -286,7 +317,11 @@ def whitened_residuals(
     in_camera = np.einsum("mij,mj->mi", problem.rotations[image], seen)
     in_camera += problem.translations[image]
     intrinsics = problem.intrinsics[problem.camera_of_image[image]]
-    xy = intrinsics[:, :2] * in_camera[:, :2] / in_camera[:, 2:] + intrinsics[:, 2:]
+    uv = in_camera[:, :2] / in_camera[:, 2:]
+    if problem.radial is not None:
+        radial = problem.radial[problem.camera_of_image[image]]
+        uv = uv * (1 + radial * (uv**2).sum(axis=1))[:, None]
+    xy = intrinsics[:, :2] * uv + intrinsics[:, 2:]
     pixel = (xy - problem.obs_xy) / np.broadcast_to(problem.obs_std_px, len(image))[:, None]
     depth = np.zeros(len(image))
     if problem.obs_log_depth is not None:
@@ -295,18 +330,19 @@ def whitened_residuals(
 
 
 def dense_information(problem: BundleProblem) -> Float64:
-    """J^T J by central differences over free poses (6 each), points and log focal lengths.
+    """J^T J by central differences over free poses (6 each), points, log focal lengths and, if the
+    problem has them, radial distortions.
 
     The weights of the robust losses are those at the problem's own state.
     """
     poses, cameras = np.flatnonzero(problem.variable_pose), len(problem.intrinsics)
-    sizes = 6 * len(poses), problem.points.size, cameras
+    sizes = 6 * len(poses), problem.points.size, cameras, 0 if problem.radial is None else cameras
     fixed = whitened_residuals(problem, robust=False)
     robust = whitened_residuals(problem)
     weight = np.divide(robust, fixed, out=np.ones_like(fixed), where=fixed != 0)
 
     def residuals(change: Float64) -> Float64:
-        pose, point, focal = np.split(change, np.cumsum(sizes)[:-1])
+        pose, point, focal, radial = np.split(change, np.cumsum(sizes)[:-1])
         rotations, translations = problem.rotations.copy(), problem.translations.copy()
         for row, step in zip(poses, pose.reshape(-1, 6), strict=True):
             rotations[row] = rotation(step[:3]) @ rotations[row]
@@ -317,6 +353,7 @@ def dense_information(problem: BundleProblem) -> Float64:
             translations=translations,
             points=problem.points + point.reshape(-1, 3),
             intrinsics=problem.intrinsics * np.exp(np.outer(focal, [1, 1, 0, 0])),
+            radial=None if problem.radial is None else problem.radial + radial,
         )
         return (weight * whitened_residuals(moved, robust=False)).ravel()
 

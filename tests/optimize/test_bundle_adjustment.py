@@ -28,7 +28,7 @@ from tests.optimize.bundle_reference import (
 )
 
 TIGHT = soft_l1(function_tolerance=1e-13, max_iterations=1000)
-PARAMETERS = ("rotations", "translations", "log_scales", "intrinsics", "points")
+PARAMETERS = ("rotations", "translations", "log_scales", "intrinsics", "radial", "points")
 
 
 def assert_same_optimum(start: BundleProblem, *, refine_focal: bool = False) -> None:
@@ -53,6 +53,9 @@ def assert_same_optimum(start: BundleProblem, *, refine_focal: bool = False) -> 
     if refine_focal:
         theirs = [rec.cameras[k + 1].params[0] for k in range(len(start.intrinsics))]
         np.testing.assert_allclose(result.intrinsics[:, 0], theirs, rtol=1e-5)
+    if start.radial is not None:
+        theirs = [rec.cameras[k + 1].params[3] for k in range(len(start.intrinsics))]
+        np.testing.assert_allclose(result.radial, theirs, atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -177,19 +180,77 @@ def test_adjust_bundle_with_focal_prior_reaches_ceres_optimum(depth: bool) -> No
     assert_same_optimum(start if depth else without_depth(start), refine_focal=True)
 
 
+@pytest.mark.parametrize("depth", [True, False])
+@pytest.mark.parametrize("prior_std", [np.inf, 0.02])
+@pytest.mark.parametrize("radial", [-0.25, -0.034, 0.1])
+def test_adjust_bundle_with_radial_distortion_reaches_ceres_optimum(
+    depth: bool, prior_std: float, radial: float
+) -> None:
+    """Observations of a SIMPLE_RADIAL camera, from no distortion and a wrong focal length."""
+    start = perturb(distorted(make_problem(8, 120, 5), radial), 0)
+    start = replace(
+        start,
+        intrinsics=start.intrinsics * [1.03, 1.03, 1, 1],
+        radial=np.zeros(1),
+        variable_focal=np.array([True]),
+        variable_radial=np.array([True]),
+        prior_std_radial=prior_std,
+    )
+    assert_same_optimum(start if depth else without_depth(start), refine_focal=True)
+
+
+def test_adjust_bundle_with_exact_distorted_observations_recovers_two_cameras() -> None:
+    truth = make_problem(6, 200, 5)
+    truth = replace(
+        truth,
+        intrinsics=np.repeat(truth.intrinsics, 2, axis=0),
+        camera_of_image=np.arange(6) % 2,
+        radial=np.array([-0.1, 0.05]),
+        variable_focal=np.ones(2, dtype=np.bool_),
+        variable_radial=np.ones(2, dtype=np.bool_),
+    )
+    truth = exact(truth)
+    start = replace(
+        perturb(truth, 0, 0.5),
+        intrinsics=truth.intrinsics * [[1.05, 1.05, 1, 1], [0.97, 0.97, 1, 1]],
+        radial=np.zeros(2),
+    )
+    result = adjust_bundle(start, TIGHT)
+    np.testing.assert_allclose(result.intrinsics, truth.intrinsics, rtol=1e-6)
+    np.testing.assert_allclose(result.radial, truth.radial, atol=1e-6)
+    assert (result.std_radial > 0).all() and (result.std_radial < 0.01).all()
+
+
+def test_adjust_bundle_with_constant_radial_distortion_keeps_it() -> None:
+    truth = exact(replace(make_problem(6, 100, 5), radial=np.array([-0.1])))
+    result = adjust_bundle(perturb(truth, 0), TIGHT)
+    assert result.radial.tolist() == [-0.1] and np.isnan(result.std_radial).all()
+    np.testing.assert_allclose(result.points, truth.points, atol=1e-5)
+
+
+def distorted(problem: BundleProblem, radial: float) -> BundleProblem:
+    """The problem with observations of a camera with radial distortion, and the same noise."""
+    noise = whitened_residuals(problem, robust=False)[:, :2]
+    bent = replace(problem, radial=np.full(len(problem.intrinsics), radial))
+    return replace(bent, obs_xy=exact(bent).obs_xy - noise)
+
+
 @pytest.mark.parametrize("dense_poses", [500, 0])
 @pytest.mark.parametrize("prior_std", [np.inf, 0.01])
-def test_adjust_bundle_focal_stds_match_the_dense_hessian(
+def test_adjust_bundle_intrinsic_stds_match_the_dense_hessian(
     dense_poses: int, prior_std: float
 ) -> None:
-    """The inverse of J^T J by finite differences over poses, points and two focal lengths."""
+    """The inverse of J^T J by finite differences over poses, points and two cameras."""
     problem = make_problem(4, 40, 4)
     problem = replace(
         problem,
         intrinsics=np.repeat(problem.intrinsics, 2, axis=0),
         camera_of_image=np.arange(4) % 2,
+        radial=np.array([-0.1, 0.05]),
         variable_focal=np.ones(2, dtype=np.bool_),
+        variable_radial=np.ones(2, dtype=np.bool_),
         prior_std_log_focals=prior_std,
+        prior_std_radial=prior_std,
     )
     options = TIGHT.model_copy(update={"dense_poses": dense_poses})
     result = adjust_bundle(problem, options)
@@ -198,12 +259,14 @@ def test_adjust_bundle_focal_stds_match_the_dense_hessian(
         rotations=result.rotations,
         translations=result.translations,
         intrinsics=result.intrinsics,
+        radial=result.radial,
         points=result.points,
     )
     information = dense_information(solved)
-    information[-2:, -2:] += np.eye(2) / prior_std**2
-    expected = np.sqrt(np.diagonal(np.linalg.inv(information))[-2:])
-    np.testing.assert_allclose(result.std_log_focals, expected, rtol=0.01)
+    information[-4:, -4:] += np.eye(4) / prior_std**2
+    expected = np.sqrt(np.diagonal(np.linalg.inv(information))[-4:])
+    np.testing.assert_allclose(result.std_log_focals, expected[:2], rtol=0.01)
+    np.testing.assert_allclose(result.std_radial, expected[2:], rtol=0.01)
 
 
 def test_adjust_bundle_focal_std_is_nan_if_constant_and_infinite_if_unobserved() -> None:
@@ -229,7 +292,11 @@ def exact(problem: BundleProblem) -> BundleProblem:
 
 
 def assert_fixed(problem: BundleProblem, result: BundleResult, names: tuple[str, ...]) -> None:
-    given = replace(problem, log_scales=np.zeros(len(problem.rotations)))
+    given = replace(
+        problem,
+        log_scales=np.zeros(len(problem.rotations)),
+        radial=np.zeros(len(problem.intrinsics)),
+    )
     for name in names:
         np.testing.assert_array_equal(getattr(result, name), getattr(given, name))
 
@@ -486,6 +553,9 @@ def test_iteration_limit_is_reported() -> None:
         ("variable_focal", np.ones(2, dtype=np.bool_)),
         ("prior_std_log_focals", 0.0),
         ("prior_log_focals", np.zeros(2)),
+        ("radial", np.zeros(2)),
+        ("variable_radial", np.ones(2, dtype=np.bool_)),
+        ("prior_std_radial", 0.0),
         ("log_scales", np.zeros(4)),
         ("expected_log_scales", np.full(5, np.nan)),
         ("std_log_scales", 0.0),
