@@ -110,7 +110,7 @@ class ChoiceReason(ReasonCode):
 
 
 class CameraReason(ReasonCode):
-    """Reasons why bundle adjustment does not refine the focal length of a camera."""
+    """Reasons why bundle adjustment does not refine focal length or distortion of a camera."""
 
     KNOWN = ("known",)
     """The focal length is known from the user's input."""
@@ -124,6 +124,12 @@ class CameraReason(ReasonCode):
     OUT_OF_RANGE = ("out-of-range", "equivalent_mm")
     """The refined focal length is implausible for any lens; its 35 mm equivalent is
     ``equivalent_mm``."""
+    DISTORTION_NOT_ESTIMATED = ("distortion-not-estimated",)
+    """The focal length is not refined, or refinement of distortion is disabled."""
+    DISTORTION_NOT_OBSERVABLE = ("distortion-not-observable", "radial_std")
+    """The images do not constrain the radial distortion, whose std is ``radial_std``."""
+    DISTORTION_OUT_OF_RANGE = ("distortion-out-of-range", "radial")
+    """The refined coefficient ``radial`` is implausible for SIMPLE_RADIAL."""
 
 
 class GpsReason(ReasonCode):

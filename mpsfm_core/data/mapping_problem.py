@@ -49,6 +49,10 @@ class MappingImage:
     """Prior std of the logarithm of a guessed focal length."""
     focal_guess_px: float | None = None
     """Prior mean of ``fx`` in pixels of the undistorted view (None means ``camera.fx``)."""
+    radial: float = 0.0
+    """Coefficient of the radial distortion (SIMPLE_RADIAL) that was removed from the view.
+
+    Bundle adjustment refines the coefficient together with a guessed focal length."""
     known_pose: Pose | None = None
     """Known camera pose ``cam_from_world`` that the user provides, or None."""
     depth_group: int | None = None
@@ -76,6 +80,15 @@ class MappingImage:
     def shared_camera(self) -> tuple[int, PinholeCamera]:
         """Number and intrinsics, which are equal for images that share a guessed focal length."""
         return self.camera_id, self.camera
+
+    def with_camera(self, camera: PinholeCamera) -> MappingImage:
+        """Return the image with another focal length; the prior keeps its mean.
+
+        The distortion that was removed from the view stays the same in pixels, so its coefficient
+        is scaled by the squared ratio of focal lengths.
+        """
+        radial = self.radial * (camera.fx / self.camera.fx) ** 2
+        return replace(self, camera=camera, focal_guess_px=self.focal_prior_px, radial=radial)
 
     @property
     def focal_prior_px(self) -> float:

@@ -140,6 +140,8 @@ class RefinementOptions(Options):
     it is faster and less accurate. [reference]"""
     refine_focal: bool = Field(True)
     """Refine guessed focal lengths that the images determine; known focal lengths stay fixed."""
+    refine_distortion: bool = Field(True)
+    """Estimate the radial distortion (SIMPLE_RADIAL) of cameras whose focal length is refined."""
     final_robust: bool = expert(False)
     """End with a global refinement with a sharper depth loss.
     [paper, robust reconstruction] [tuned: benchmarks.ablation]"""

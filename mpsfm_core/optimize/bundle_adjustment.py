@@ -88,9 +88,9 @@ def adjust_bundle(problem: BundleProblem, options: BundleOptions | None = None) 
     """Adjust poses, points, intrinsics and depth scales; the cost never increases.
 
     As in COLMAP, an observation whose point is behind the camera, or more than 89.9999 degrees off
-    its axis, or where radial distortion folds the image over, has residual 0. If a step makes an observation invisible in this way, the observation
-    keeps its previous cost. The adjusted parameters do not depend on the number of threads, bit for
-    bit.
+    its axis, has residual 0. The same holds where radial distortion folds the image over. If a step
+    makes an observation invisible in this way, the observation keeps its previous cost. The
+    adjusted parameters do not depend on the number of threads, bit for bit.
 
     Args:
         problem: Parameters and observations of bundle adjustment, which are copied.

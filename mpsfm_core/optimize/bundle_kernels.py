@@ -269,6 +269,31 @@ def number_covisible_poses(
 
 
 @_helper
+def _linearize_depth(
+    k: int, image: int, z: float, bundle: BundleData, state: BundleParameters
+) -> tuple[float, float, float, float, float, float]:
+    """Linearize the log-depth residual of an observation at depth ``z``.
+
+    Returns:
+        Twice the cost, gradient and Gauss-Newton entry by depth, and the fields ``gs``, ``hss`` and
+        ``hzs``; all are 0 if the observation has no depth.
+    """
+    obs, robust = bundle.obs, bundle.robust
+    gs = hss = hzs = 0.0
+    if not obs.depth_weight[k] > 0.0:
+        return gs, gs, gs, gs, hss, hzs
+    slope_s = obs.depth_weight[k]
+    rd = (np.log(z) - obs.log_depth[k] - state.log_scales[image]) * slope_s
+    rho, weight = evaluate_loss(robust.depth_loss, rd * rd, robust.depth_scale)
+    slope = slope_s * (1.0 / z)
+    if bundle.layout.variable_scale[image]:
+        gs = -weight * slope_s * rd
+        hss = weight * slope_s * slope_s
+        hzs = -weight * slope * slope_s
+    return rho, weight * slope * rd, weight * slope * slope, gs, hss, hzs
+
+
+@_helper
 def _linearize_distorted_observation(
     k: int,
     image: int,
@@ -311,19 +336,10 @@ def _linearize_distorted_observation(
     hxy = weight * (ux * uy + vx * vy)
     hxz, hyz = -hxx * u - hxy * v, -hxy * u - hyy * v
     hzz = -hxz * u - hyz * v
-    gs = hss = hzs = 0.0
-    if obs.depth_weight[k] > 0.0:
-        slope_s = obs.depth_weight[k]
-        rd = (np.log(z) - obs.log_depth[k] - state.log_scales[image]) * slope_s
-        depth_rho, weight = evaluate_loss(robust.depth_loss, rd * rd, robust.depth_scale)
-        slope = slope_s * inverse
-        rho += depth_rho
-        gz += weight * slope * rd
-        hzz += weight * slope * slope
-        if bundle.layout.variable_scale[image]:
-            gs = -weight * slope_s * rd
-            hss = weight * slope_s * slope_s
-            hzs = -weight * slope * slope_s
+    depth_rho, gd, hdd, gs, hss, hzs = _linearize_depth(k, image, z, bundle, state)
+    rho += depth_rho
+    gz += gd
+    hzz += hdd
     return LinearizedObservation(
         True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, hxz, hyz, hzz, gs, hss, hzs,
         hxy, factor / radius_slope, r2 / radius_slope,
@@ -371,19 +387,10 @@ def linearize_observation(
     hxx, hyy = weight * fx * fx, weight * fy * fy
     hzz = hxx * u * u + hyy * v * v
     hxz, hyz = -hxx * u, -hyy * v
-    gs = hss = hzs = 0.0
-    if obs.depth_weight[k] > 0.0:
-        slope_s = obs.depth_weight[k]
-        rd = (np.log(z) - obs.log_depth[k] - state.log_scales[image]) * slope_s
-        depth_rho, weight = evaluate_loss(robust.depth_loss, rd * rd, robust.depth_scale)
-        slope = slope_s * inverse
-        rho += depth_rho
-        gz += weight * slope * rd
-        hzz += weight * slope * slope
-        if bundle.layout.variable_scale[image]:
-            gs = -weight * slope_s * rd
-            hss = weight * slope_s * slope_s
-            hzs = -weight * slope * slope_s
+    depth_rho, gd, hdd, gs, hss, hzs = _linearize_depth(k, image, z, bundle, state)
+    rho += depth_rho
+    gz += gd
+    hzz += hdd
     return LinearizedObservation(
         True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, hxz, hyz, hzz, gs, hss, hzs,
         n, 1.0, n,

@@ -204,7 +204,7 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
         _indices(problem.camera_of_image, "camera_of_image", images, cameras),
         _slots(moving),
         _slots(variable_focal),
-        _slots(variable_radial, first=np.count_nonzero(variable_focal)),
+        _slots(variable_radial, first=int(np.count_nonzero(variable_focal))),
         variable_point,
         variable_scale,
         np.full((poses, poses), -1, dtype=np.int32),

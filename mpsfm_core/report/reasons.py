@@ -276,6 +276,23 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "has.",
         "Give the focal length with --intrinsics.",
     ),
+    CameraReason.DISTORTION_NOT_ESTIMATED: (
+        "distortion not estimated",
+        "Bundle adjustment did not estimate the radial distortion, because the focal length is a "
+        "guess.",
+        "Give the camera with --intrinsics if its lens distorts.",
+    ),
+    CameraReason.DISTORTION_NOT_OBSERVABLE: (
+        "distortion not observable",
+        "The photos leave a standard deviation of {radial_std:.2f} of the radial distortion.",
+        "Give the camera with --intrinsics if its lens distorts.",
+    ),
+    CameraReason.DISTORTION_OUT_OF_RANGE: (
+        "implausible distortion",
+        "Bundle adjustment ends at a radial distortion of {radial:.2f}, which the camera model "
+        "SIMPLE_RADIAL does not describe.",
+        "Give the camera with --intrinsics.",
+    ),
 }
 
 
@@ -297,7 +314,7 @@ def explain_pair(stored: Mapping[str, Any]) -> Explanation:
 
 
 def explain_camera(stored: Mapping[str, Any]) -> Explanation:
-    """Explain why a focal length is not refined, from the reason in ``summary.json``."""
+    """Explain why an intrinsic parameter is not refined, from the reason in ``summary.json``."""
     return explain(reason_from_json(CameraReason, stored))
 
 

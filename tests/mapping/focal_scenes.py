@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.extraction.matching.verification import verify_matches
 from mpsfm_core.extraction.options import VerificationOptions
+from mpsfm_core.geometry.distortion import distort_rays
 from mpsfm_core.mapping.component import Component
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
@@ -28,6 +31,20 @@ def make_room() -> MappingProblem:
 def scale_focal(camera: PinholeCamera, factor: float) -> PinholeCamera:
     """Return the camera with another focal length."""
     return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
+
+
+def distort(problem: MappingProblem, radial: float) -> MappingProblem:
+    """Return the problem with keypoints of a lens with radial distortion."""
+    center = np.array([CAMERA.cx, CAMERA.cy])
+    images = (
+        replace(
+            image,
+            keypoints=center
+            + CAMERA.fx * distort_rays((image.keypoints - center) / CAMERA.fx, radial),
+        )
+        for image in problem.images
+    )
+    return replace(problem, images=tuple(images))
 
 
 def guess_focals(

@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from mpsfm_core.data import Float64, Int64, MappingImage, MappingProblem, PinholeCamera, Pose
+from mpsfm_core.geometry.distortion import change_distortion
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration.pose_hypotheses import (
     MAX_FOCAL_CORRESPONDENCES,
@@ -50,6 +51,7 @@ def find_deviating_focals(
     guessed = [image.shared_camera for image in problem.images if not image.focal_known]
     num_images = Counter(guessed)
     cameras = {problem.images[i.index].shared_camera: i.camera for i in model.images}
+    radials = {problem.images[i.index].shared_camera: i.radial for i in model.images}
     correspondences = _collect_correspondences(problem, model)
     focals = {}
     for index, (keypoints, points) in correspondences.items():
@@ -61,6 +63,8 @@ def find_deviating_focals(
             continue
         step = max(1, len(keypoints) // MAX_FOCAL_CORRESPONDENCES)
         xy, xyz = image.keypoints[keypoints[::step]], model.points[points[::step]]
+        radial = radials.get(image.shared_camera, image.radial)
+        xy = change_distortion(xy, (image.camera, image.radial), (camera, radial))
         max_error_px = options.max_error_px
         shared = estimate_absolute_pose(camera, xy, xyz, options, seed)
         support = _measure_support(camera, shared[:2], xy, xyz, max_error_px) if shared else 0.0
@@ -89,12 +93,8 @@ def split_cameras(
     for number, (index, focal_px) in enumerate(own_focals.items(), first_id):
         image = images[index]
         aspect = image.camera.fy / image.camera.fx
-        split[index] = replace(
-            image,
-            camera_id=number,
-            camera=replace(image.camera, fx=focal_px, fy=focal_px * aspect),
-            focal_guess_px=image.focal_prior_px,
-        )
+        camera = replace(image.camera, fx=focal_px, fy=focal_px * aspect)
+        split[index] = replace(image.with_camera(camera), camera_id=number)
     return tuple(split)
 
 

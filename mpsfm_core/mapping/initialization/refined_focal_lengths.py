@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import MappingImage, MappingProblem, VerifiedPair
+from mpsfm_core.data import Bool, MappingImage, MappingProblem, VerifiedPair
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.mapping.initialization.camera_splitting import (
     find_deviating_focals,
@@ -54,13 +54,7 @@ def apply_refined_focal_lengths(
         return None
     changed = [new is not old for new, old in zip(images, problem.images, strict=True)]
     refined = replace(problem, images=images)
-    pairs = tuple(
-        _estimate_relative_pose(refined, pair, options.seed)
-        if changed[pair.image_a] or changed[pair.image_b]
-        else pair
-        for pair in problem.pairs
-    )
-    return replace(refined, pairs=pairs)
+    return estimate_relative_poses(refined, np.array(changed), options.seed)
 
 
 def _apply_shared_focals(
@@ -78,11 +72,26 @@ def _apply_shared_focals(
     return tuple(
         image
         if image.focal_known or image.shared_camera not in cameras
-        else replace(
-            image, camera=cameras[image.shared_camera], focal_guess_px=image.focal_prior_px
-        )
+        else image.with_camera(cameras[image.shared_camera])
         for image in problem.images
     )
+
+
+def estimate_relative_poses(problem: MappingProblem, changed: Bool, seed: int) -> MappingProblem:
+    """Return the problem with new relative poses of the pairs of changed images.
+
+    Args:
+        problem: The mapping problem with changed intrinsics or keypoints.
+        changed: (n,) bool mask of the changed images.
+        seed: Seed of RANSAC.
+    """
+    pairs = tuple(
+        _estimate_relative_pose(problem, pair, seed)
+        if changed[pair.image_a] or changed[pair.image_b]
+        else pair
+        for pair in problem.pairs
+    )
+    return replace(problem, pairs=pairs)
 
 
 def _estimate_relative_pose(problem: MappingProblem, pair: VerifiedPair, seed: int) -> VerifiedPair:

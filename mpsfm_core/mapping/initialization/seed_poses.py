@@ -46,9 +46,7 @@ def apply_seed_poses(
     cameras = {key: counts.most_common(1)[0][0] for key, counts in refined.items()}
     images = tuple(
         replace(
-            image,
-            camera=cameras.get(image.shared_camera, image.camera),
-            focal_guess_px=image.focal_prior_px,
+            image.with_camera(cameras.get(image.shared_camera, image.camera)),
             known_pose=poses.get(index, image.known_pose),
         )
         for index, image in enumerate(problem.images)

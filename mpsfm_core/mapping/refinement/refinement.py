@@ -13,21 +13,20 @@ from dataclasses import replace
 import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64
-from mpsfm_core.geometry.focal_length import compute_equivalent_mm
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.depth_noise import DepthNoise, measure_depth_noise
 from mpsfm_core.mapping.refinement.filtering import filter_points
-from mpsfm_core.mapping.refinement.focal_lengths import decide_focal_outcome
 from mpsfm_core.mapping.refinement.keypoint_noise import measure_loss_scale
-from mpsfm_core.mapping.scene.focal_outcome import MIN_FOCAL_IMAGES, FocalOutcome
+from mpsfm_core.mapping.refinement.self_calibration import calibrate_cameras, has_guessed_camera
+from mpsfm_core.mapping.scene.calibration_outcome import MIN_FOCAL_IMAGES
 from mpsfm_core.mapping.scene.local_bundle import find_local_bundle
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, lift_low_parallax
-from mpsfm_core.optimize.bundle_adjustment import BundleProblem, BundleResult, adjust_bundle
+from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
 from mpsfm_core.optimize.covariance import compute_point_covariances, propagate_depth_variance
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
-from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, BundleOptions, Loss
+from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, Loss
 from mpsfm_core.optimize.subsampling import (
     compute_subsampling_step,
     subsample_camera,
@@ -201,7 +200,7 @@ class Refiner:
         Args:
             variable: Images to adjust.
             local: Keep points with long tracks fixed (local bundle adjustment).
-            focal: Also refine guessed focal lengths that the observations determine.
+            focal: Also refine guessed intrinsics that the observations determine.
             reprojection_scale: Factor on the scale of the reprojection loss.
             depth_scale: Factor on the scale of the depth loss.
             max_iterations: Maximum number of iterations, or None to use the option.
@@ -234,11 +233,12 @@ class Refiner:
             rotations=scene.rotations[images],
             translations=scene.translations[images],
             intrinsics=scene.intrinsics[images][first],
+            radial=scene.radial[images][first],
             camera_of_image=camera_rows,
             points=tracks.xyz[points],
             obs_image=image_rows,
             obs_point=point_rows,
-            obs_xy=scene.keypoints[observations],
+            obs_xy=scene.distorted_keypoints[observations],
             obs_std_px=scene.keypoint_std_px[images][image_rows] / np.sqrt(weight),
             obs_log_depth=log_depth if regularized else None,
             obs_std_log_depth=log_std * self.noise.std_factor,
@@ -257,7 +257,13 @@ class Refiner:
             }
         )
         if focal:
-            result = self._adjust_with_focals(problem, options, images[first])
+            result = calibrate_cameras(
+                scene,
+                problem,
+                options,
+                images[first],
+                refine_distortion=self.options.refine_distortion,
+            )
         else:
             result = adjust_bundle(problem, options)
         scene.rotations[images] = result.rotations
@@ -357,60 +363,12 @@ class Refiner:
         )
         depth_map.set_refined(refined)
 
-    def _guessed(self, images: Int64) -> Bool:
-        """Return a bool mask (m,) of the images whose focal length is a guess."""
-        known = [self.scene.problem.images[i].focal_known for i in images]
-        return ~np.array(known, dtype=np.bool_)
-
     def can_refine_focals(self) -> bool:
         """Return whether enough images are registered to refine a guessed focal length."""
         images = self.scene.registered_images()
         if not self.options.refine_focal or len(images) < MIN_FOCAL_IMAGES:
             return False
-        return bool(self._guessed(images).any())
-
-    def _adjust_with_focals(
-        self, problem: BundleProblem, options: BundleOptions, representatives: Int64
-    ) -> BundleResult:
-        """Run bundle adjustment with guessed focal lengths, and apply well-determined estimates.
-
-        Cameras whose estimated focal length is refused keep the guess, and bundle adjustment is
-        repeated with their focal lengths fixed. The outcome of each camera is recorded in the
-        scene.
-
-        Args:
-            problem: The bundle adjustment problem with constant focal lengths.
-            options: Options of bundle adjustment.
-            representatives: (k,) index of one image of each camera of the problem.
-        """
-        scene = self.scene
-        images = [scene.problem.images[image] for image in representatives]
-        prior_stds = np.array([image.focal_log_std for image in images])
-        variable = self._guessed(representatives)
-        problem = replace(
-            problem,
-            prior_log_focals=np.log([image.focal_prior_px for image in images]),
-            prior_std_log_focals=prior_stds,
-        )
-        while True:
-            result = adjust_bundle(replace(problem, variable_focal=variable), options)
-            refused = np.zeros_like(variable)
-            for row in map(int, np.flatnonzero(variable)):
-                focal_px = float(result.intrinsics[row, 0])
-                # the prior variance bounds the posterior variance, also if the reduced system was
-                # singular
-                std = min(float(result.std_log_focals[row]), float(prior_stds[row]))
-                equivalent_mm = compute_equivalent_mm(focal_px, *images[row].camera.size)
-                outcome = decide_focal_outcome(equivalent_mm, std, prior_stds[row])
-                refused[row] = outcome != FocalOutcome.REFINED
-                scene.set_focal_outcome(int(representatives[row]), outcome, std, focal_px)
-            if not refused.any():
-                break
-            variable &= ~refused
-        for row in map(int, np.flatnonzero(variable)):
-            fx, fy = map(float, result.intrinsics[row, :2])
-            scene.set_shared_focal(int(representatives[row]), fx, fy)
-        return result
+        return bool(has_guessed_camera(self.scene, images).any())
 
     def _measure_keypoint_noise(self) -> None:
         """Measure the scale of the Cauchy loss from the epipolar errors of matches."""

@@ -8,7 +8,7 @@ from mpsfm_core.data import DepthPrior, PosedImage, SceneState
 from mpsfm_core.data.decisions import CameraReason, Reason
 from mpsfm_core.geometry.focal_length import compute_equivalent_mm
 from mpsfm_core.geometry.statistics import MAD_TO_STD
-from mpsfm_core.mapping.scene.focal_outcome import MIN_FOCAL_IMAGES, FocalOutcome
+from mpsfm_core.mapping.scene.calibration_outcome import MIN_FOCAL_IMAGES, CalibrationOutcome
 from mpsfm_core.mapping.scene.reconstruction import MetricScale, Reconstruction, RegisteredImage
 from mpsfm_core.mapping.scene.scene import Scene
 
@@ -90,7 +90,7 @@ def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> R
     """
     image, depth_map = scene.problem.images[index], scene.maps[index]
     depth = depth_map.depth * np.float32(factor)
-    log_std = float(scene.focal_log_std[index])
+    log_std, radial_std = float(scene.focal_log_std[index]), float(scene.radial_std[index])
     variance = (depth_map.log_std * depth) ** 2
     return RegisteredImage(
         index=index,
@@ -103,6 +103,9 @@ def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> R
         scale=depth_map.scale * factor,
         focal_log_std=log_std if np.isfinite(log_std) else None,
         focal_reason=_get_focal_reason(scene, index),
+        radial=float(scene.radial[index]),
+        radial_std=radial_std if np.isfinite(radial_std) else None,
+        radial_reason=_get_radial_reason(scene, index),
     )
 
 
@@ -110,13 +113,13 @@ def _get_focal_reason(scene: Scene, index: int) -> Reason | None:
     """Return the reason why a focal length is not refined, or None if it is refined."""
     if scene.problem.images[index].focal_known:
         return CameraReason.KNOWN.because()
-    outcome = FocalOutcome(int(scene.focal_outcome[index]))
-    if outcome == FocalOutcome.REFINED:
+    outcome = CalibrationOutcome(int(scene.focal_outcome[index]))
+    if outcome == CalibrationOutcome.REFINED:
         return None
-    if outcome == FocalOutcome.NOT_OBSERVABLE:
+    if outcome == CalibrationOutcome.NOT_OBSERVABLE:
         std_ratio = round(float(scene.focal_log_std[index]), 4)
         return CameraReason.NOT_OBSERVABLE.because(focal_length_std_ratio=std_ratio)
-    if outcome == FocalOutcome.OUT_OF_RANGE:
+    if outcome == CalibrationOutcome.OUT_OF_RANGE:
         width, height = scene.problem.images[index].camera.size
         equivalent_mm = compute_equivalent_mm(float(scene.focal_estimate_px[index]), width, height)
         return CameraReason.OUT_OF_RANGE.because(equivalent_mm=round(equivalent_mm, 2))
@@ -126,3 +129,17 @@ def _get_focal_reason(scene: Scene, index: int) -> Reason | None:
             num_images=num_images, min_images=MIN_FOCAL_IMAGES
         )
     return CameraReason.NOT_ESTIMATED.because()
+
+
+def _get_radial_reason(scene: Scene, index: int) -> Reason | None:
+    """Return the reason why a radial distortion is not refined, or None if refined or known."""
+    outcome = CalibrationOutcome(int(scene.radial_outcome[index]))
+    if scene.problem.images[index].focal_known or outcome == CalibrationOutcome.REFINED:
+        return None
+    if outcome == CalibrationOutcome.NOT_OBSERVABLE:
+        std = round(float(scene.radial_std[index]), 4)
+        return CameraReason.DISTORTION_NOT_OBSERVABLE.because(radial_std=std)
+    if outcome == CalibrationOutcome.OUT_OF_RANGE:
+        radial = round(float(scene.radial_estimate[index]), 4)
+        return CameraReason.DISTORTION_OUT_OF_RANGE.because(radial=radial)
+    return CameraReason.DISTORTION_NOT_ESTIMATED.because()

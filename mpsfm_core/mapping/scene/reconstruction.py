@@ -43,6 +43,14 @@ class RegisteredImage:
     estimated."""
     focal_reason: Reason | None = None
     """Reason (``CameraReason``) why the focal length is not refined, or None if it is refined."""
+    radial: float = 0.0
+    """Radial distortion coefficient (SIMPLE_RADIAL) of the original image. The mapper refines the
+    coefficient that was removed from the view."""
+    radial_std: float | None = None
+    """Posterior standard deviation of the radial distortion, or None if not estimated."""
+    radial_reason: Reason | None = None
+    """Reason (``CameraReason``) why the radial distortion is not refined, or None if it is
+    refined or known."""
 
     def state_dict(self) -> StateDict:
         """Return the image for a checkpoint."""

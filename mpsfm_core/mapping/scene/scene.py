@@ -9,8 +9,9 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import camera_center
+from mpsfm_core.geometry.distortion import distort_rays, undistort_rays
+from mpsfm_core.mapping.scene.calibration_outcome import CalibrationOutcome
 from mpsfm_core.mapping.scene.depth_map import DepthMap
-from mpsfm_core.mapping.scene.focal_outcome import FocalOutcome
 from mpsfm_core.mapping.scene.graph import CorrespondenceGraph
 from mpsfm_core.mapping.scene.kernels import compute_max_triangulation_angles
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
@@ -32,6 +33,10 @@ class Snapshot(NamedTuple):
     focal_outcome: Int64
     focal_log_std: Float64
     focal_estimate_px: Float64
+    radial: Float64
+    radial_outcome: Int64
+    radial_std: Float64
+    radial_estimate: Float64
 
 
 class Scene:
@@ -50,14 +55,23 @@ class Scene:
         intrinsics: (n, 4) float64 intrinsics fx, fy, cx, cy of each image in pixels.
         camera_of: (n,) int64 camera index of each image. Images with the same number and
             estimated focal length share a camera.
-        focal_outcome: (n,) int64 :class:`FocalOutcome` of the camera of each image.
+        focal_outcome: (n,) int64 :class:`CalibrationOutcome` of the camera of each image.
         focal_log_std: (n,) float64 posterior standard deviation of the log focal length of each
             image, NaN without an estimate.
         focal_estimate_px: (n,) float64 estimated ``fx`` of each image, also an implausible one, NaN
             without an estimate.
+        radial: (n,) float64 coefficient of the radial distortion (SIMPLE_RADIAL) of each image.
+        radial_outcome: (n,) int64 :class:`CalibrationOutcome` of the radial distortion of each
+            image.
+        radial_std: (n,) float64 posterior standard deviation of the radial distortion of each
+            image, NaN without an estimate.
+        radial_estimate: (n,) float64 estimated radial distortion of each image, also an implausible
+            one, NaN without an estimate.
         depth_group_of: (n,) int64 depth group of each image. The depth priors of a group have the
             same unit and share their scale.
-        keypoints: (k, 2) float64 keypoints of all images in pixels.
+        distorted_keypoints: (k, 2) float64 keypoints of all images in pixels, with the radial
+            distortion of the lens.
+        keypoints: (k, 2) float64 keypoints of all images in pixels, without radial distortion.
         keypoint_std_px: (n,) float64 standard deviation of the keypoint positions of each image, in
             pixels.
         maps: Depth map of each image.
@@ -73,6 +87,7 @@ class Scene:
         self.keypoints: Float64 = np.concatenate(
             [np.zeros((0, 2)), *(image.keypoints for image in problem.images)]
         )
+        self.distorted_keypoints: Float64 = self.keypoints.copy()
         self.keypoint_std_px: Float64 = np.array([i.keypoint_std_px for i in problem.images])
         self.intrinsics: Float64 = np.array([image.camera.params for image in problem.images])
         self.camera_of: Int64 = _shared_cameras(problem)
@@ -93,6 +108,11 @@ class Scene:
         self.focal_outcome: Int64 = np.zeros(count, dtype=np.int64)
         self.focal_log_std: Float64 = np.full(count, np.nan)
         self.focal_estimate_px: Float64 = np.full(count, np.nan)
+        self.radial: Float64 = np.array([image.radial for image in problem.images])
+        self.radial_outcome: Int64 = np.zeros(count, dtype=np.int64)
+        self.radial_std: Float64 = np.full(count, np.nan)
+        self.radial_estimate: Float64 = np.full(count, np.nan)
+        self._distort_keypoints()
         self.tracks = Tracks(len(self.keypoints))
 
     @property
@@ -165,13 +185,15 @@ class Scene:
     def has_determined_focal(self, images: Int64) -> Bool:
         """Return a bool mask (m,) of the images whose focal length is known or refined."""
         known = np.array([image.focal_known for image in self.problem.images], dtype=np.bool_)
-        determined: Bool = (known | (self.focal_outcome == FocalOutcome.REFINED))[images]
+        determined: Bool = (known | (self.focal_outcome == CalibrationOutcome.REFINED))[images]
         return determined
 
     def set_focal(self, image: int, fx: float, fy: float) -> None:
         """Set the focal length of one image, in pixels."""
         self.intrinsics[image, :2] = fx, fy
         self.maps[image].set_camera(self.camera(image))
+        if self.radial[image]:
+            self.set_radial(image, float(self.radial[image]))
 
     def set_shared_focal(self, image: int, fx: float, fy: float) -> None:
         """Set the focal length in pixels of all images that share the camera of an image."""
@@ -182,7 +204,7 @@ class Scene:
             self.set_focal(int(other), fx, fy)
 
     def set_focal_outcome(
-        self, image: int, outcome: FocalOutcome, log_std: float, estimate_px: float
+        self, image: int, outcome: CalibrationOutcome, log_std: float, estimate_px: float
     ) -> None:
         """Record the outcome of self-calibration for all images that share a camera.
 
@@ -196,6 +218,36 @@ class Scene:
         self.focal_outcome[shares_camera] = outcome
         self.focal_log_std[shares_camera] = log_std
         self.focal_estimate_px[shares_camera] = estimate_px
+
+    def set_radial(self, image: int, radial: float) -> None:
+        """Set the radial distortion of one image, and undistort its keypoints."""
+        self.radial[image] = radial
+        rows = self.graph.keypoints_of(image)
+        focal_px, center = self.intrinsics[image, :2], self.intrinsics[image, 2:]
+        distorted = (self.distorted_keypoints[rows] - center) / focal_px
+        self.keypoints[rows] = center + focal_px * undistort_rays(distorted, radial)
+
+    def set_shared_radial(self, image: int, radial: float) -> None:
+        """Set the radial distortion of all images that share the camera of an image."""
+        shares_camera = self.camera_of == self.camera_of[image]
+        for other in np.flatnonzero(shares_camera & (self.radial != radial)):
+            self.set_radial(int(other), radial)
+
+    def set_radial_outcome(
+        self, image: int, outcome: CalibrationOutcome, std: float, estimate: float
+    ) -> None:
+        """Record the outcome of self-calibration of the radial distortion of a camera.
+
+        Args:
+            image: Index of an image that was taken by the camera.
+            outcome: The decision.
+            std: Posterior standard deviation of the radial distortion.
+            estimate: Estimated radial distortion, also an implausible one.
+        """
+        shares_camera = self.camera_of == self.camera_of[image]
+        self.radial_outcome[shares_camera] = outcome
+        self.radial_std[shares_camera] = std
+        self.radial_estimate[shares_camera] = estimate
 
     def centers(self) -> Float64:
         """Return the camera centers (n, 3) in world coordinates."""
@@ -294,8 +346,21 @@ class Scene:
             self.tracks.point_of[self.graph.keypoints_of(image.index)] = image.point_ids
             self.set_shared_focal(image.index, image.camera.fx, image.camera.fy)
             if image.focal_log_std is not None and image.focal_reason is None:
-                outcome = FocalOutcome.REFINED
+                outcome = CalibrationOutcome.REFINED
                 self.set_focal_outcome(image.index, outcome, image.focal_log_std, image.camera.fx)
+            self.set_shared_radial(image.index, image.radial)
+            if image.radial_std is not None and image.radial_reason is None:
+                outcome = CalibrationOutcome.REFINED
+                self.set_radial_outcome(image.index, outcome, image.radial_std, image.radial)
+
+    def _distort_keypoints(self) -> None:
+        """Restore the radial distortion that was removed from the keypoints of the images."""
+        for image in map(int, np.flatnonzero(self.radial)):
+            rows = self.graph.keypoints_of(image)
+            focal_px, center = self.intrinsics[image, :2], self.intrinsics[image, 2:]
+            rays = (self.keypoints[rows] - center) / focal_px
+            distorted = distort_rays(rays, float(self.radial[image]))
+            self.distorted_keypoints[rows] = center + focal_px * distorted
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the scene's state for :meth:`restore`."""
@@ -311,6 +376,10 @@ class Scene:
             self.focal_outcome.copy(),
             self.focal_log_std.copy(),
             self.focal_estimate_px.copy(),
+            self.radial.copy(),
+            self.radial_outcome.copy(),
+            self.radial_std.copy(),
+            self.radial_estimate.copy(),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -323,6 +392,11 @@ class Scene:
         self.focal_outcome = snapshot.focal_outcome.copy()
         self.focal_log_std = snapshot.focal_log_std.copy()
         self.focal_estimate_px = snapshot.focal_estimate_px.copy()
+        for image in np.flatnonzero(self.radial != snapshot.radial):
+            self.set_radial(int(image), float(snapshot.radial[image]))
+        self.radial_outcome = snapshot.radial_outcome.copy()
+        self.radial_std = snapshot.radial_std.copy()
+        self.radial_estimate = snapshot.radial_estimate.copy()
         self.tracks.xyz = snapshot.xyz.copy()
         self.tracks.point_of = snapshot.point_of.copy()
         for depth_map, (scale, active, refined) in zip(self.maps, snapshot.maps, strict=True):

@@ -11,14 +11,16 @@ import pytest
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.decisions import CameraReason
 from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.geometry.distortion import undistort_rays
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement.focal_lengths import decide_focal_outcome
+from mpsfm_core.mapping.refinement.self_calibration import decide_focal_outcome
+from mpsfm_core.mapping.scene.calibration_outcome import CalibrationOutcome
 from mpsfm_core.mapping.scene.conversion import convert_scene
-from mpsfm_core.mapping.scene.focal_outcome import FocalOutcome
 from tests.mapping.focal_scenes import (
     CAMERA,
     POSES,
+    distort,
     guess_focals,
     make_room,
     register_true_poses,
@@ -51,11 +53,56 @@ def test_reconstruct_with_wrong_focal_lengths_refines_all(
             assert rotation_angle_deg(relative @ true_relative.T) < 0.5
 
 
+@pytest.mark.parametrize(("radial", "factor"), [(-0.25, 1.2), (-0.1, 0.8), (0.05, 1.6)])
+def test_reconstruct_with_radial_distortion_refines_shared_camera(
+    room: MappingProblem, radial: float, factor: float
+) -> None:
+    problem = guess_focals(distort(room, radial), [factor] * 5)
+    model = reconstruct(problem).reconstructions[0]
+    assert len(model.images) == 5
+    for image in model.images:
+        assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
+        assert image.radial == pytest.approx(radial, abs=0.01)
+        assert image.radial_reason is None
+        assert image.radial_std is not None and 0 < image.radial_std < 0.01
+        relative = image.rotation @ model.images[0].rotation.T
+        true_relative = POSES[image.index][:, :3] @ POSES[0][:, :3].T
+        assert rotation_angle_deg(relative @ true_relative.T) < 0.3
+
+
+def test_reconstruct_of_partly_undistorted_views_refines_the_original_distortion(
+    room: MappingProblem,
+) -> None:
+    """Views from which a coefficient of -0.08 was removed, although -0.1 is true."""
+    distorted = guess_focals(distort(room, -0.1), [1.0] * 5)
+    center = np.array([CAMERA.cx, CAMERA.cy])
+    images = []
+    for image in distorted.images:
+        rays = undistort_rays((image.keypoints - center) / CAMERA.fx, -0.08)
+        images.append(replace(image, keypoints=center + CAMERA.fx * rays, radial=-0.08))
+    for image in reconstruct(replace(distorted, images=tuple(images))).reconstructions[0].images:
+        assert image.radial == pytest.approx(-0.1, abs=0.005)
+        assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
+
+
+def test_reconstruct_without_refinement_of_distortion_keeps_pinhole_cameras(
+    room: MappingProblem,
+) -> None:
+    options = MapperOptions.model_validate(
+        {"max_runs": 1, "refinement": {"refine_distortion": False}}
+    )
+    problem = guess_focals(distort(room, -0.05), [1.0] * 5)
+    for image in reconstruct(problem, options).reconstructions[0].images:
+        assert image.radial == 0 and image.radial_std is None
+        assert image.radial_reason == CameraReason.DISTORTION_NOT_ESTIMATED.because()
+
+
 def test_reconstruct_with_known_focal_lengths_keeps_them(room: MappingProblem) -> None:
     for image in reconstruct(room).reconstructions[0].images:
         assert image.camera == CAMERA
         assert image.focal_reason == CameraReason.KNOWN.because()
         assert image.focal_log_std is None
+        assert image.radial == 0 and image.radial_std is image.radial_reason is None
 
 
 def test_reconstruct_without_refinement_keeps_guesses(room: MappingProblem) -> None:
@@ -89,7 +136,9 @@ def test_adjust_with_implausible_camera_refines_the_others(room: MappingProblem)
     component.refiner.adjust(list(range(5)), focal=True)
     scene = component.scene
     assert scene.intrinsics[4, 0] == enlarged.camera.fx
-    assert scene.focal_outcome.tolist() == [FocalOutcome.REFINED] * 4 + [FocalOutcome.OUT_OF_RANGE]
+    assert scene.focal_outcome.tolist() == [CalibrationOutcome.REFINED] * 4 + [
+        CalibrationOutcome.OUT_OF_RANGE
+    ]
     assert scene.intrinsics[:4, 0] == pytest.approx(CAMERA.fx, rel=0.005)
     reason = convert_scene(scene).images[4].focal_reason
     assert reason is not None and reason.code == CameraReason.OUT_OF_RANGE
@@ -108,14 +157,14 @@ def test_adjust_with_narrow_prior_keeps_the_guess(room: MappingProblem) -> None:
 @pytest.mark.parametrize(
     ("equivalent_mm", "posterior_std", "prior_std", "expected"),
     [
-        (7.9, 0.01, 0.7, FocalOutcome.OUT_OF_RANGE),
-        (801.0, 0.01, 0.7, FocalOutcome.OUT_OF_RANGE),
-        (28.0, 0.4, 0.7, FocalOutcome.NOT_OBSERVABLE),
-        (28.0, np.inf, 0.7, FocalOutcome.NOT_OBSERVABLE),
-        (28.0, 0.04, 0.1, FocalOutcome.REFINED),
+        (7.9, 0.01, 0.7, CalibrationOutcome.OUT_OF_RANGE),
+        (801.0, 0.01, 0.7, CalibrationOutcome.OUT_OF_RANGE),
+        (28.0, 0.4, 0.7, CalibrationOutcome.NOT_OBSERVABLE),
+        (28.0, np.inf, 0.7, CalibrationOutcome.NOT_OBSERVABLE),
+        (28.0, 0.04, 0.1, CalibrationOutcome.REFINED),
     ],
 )
 def test_decide_focal_outcome_by_range_and_information(
-    equivalent_mm: float, posterior_std: float, prior_std: float, expected: FocalOutcome
+    equivalent_mm: float, posterior_std: float, prior_std: float, expected: CalibrationOutcome
 ) -> None:
     assert decide_focal_outcome(equivalent_mm, posterior_std, prior_std) == expected

@@ -1,0 +1,21 @@
+"""Outcome of self-calibration for the guessed intrinsics of a camera."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+MIN_FOCAL_IMAGES = 3
+"""Number of registered images from which guessed intrinsics are refined. [ours]"""
+
+
+class CalibrationOutcome(IntEnum):
+    """Decision of self-calibration about the focal length or radial distortion of a camera."""
+
+    NOT_ESTIMATED = 0
+    """The parameter is known, or bundle adjustment did not estimate the parameter."""
+    REFINED = 1
+    """The camera takes the estimate of bundle adjustment."""
+    NOT_OBSERVABLE = 2
+    """The observations do not determine the parameter, so the camera keeps the guess."""
+    OUT_OF_RANGE = 3
+    """The estimate is not plausible, so the camera keeps the guess."""
