@@ -57,28 +57,39 @@ def main() -> None:
     parser.add_argument("--output", type=Path, help="also write the table to this file")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    rows = []
-    for name in arguments.sets:
-        folder = arguments.photos / name
-        methods = [f"seed {seed}" for seed in range(arguments.seeds)]
-        for method in [*methods, *([] if arguments.without_colmap else ["COLMAP"])]:
-            start = time.perf_counter()
-            verdict = ""
-            if method == "COLMAP":
-                models = reconstruct_with_colmap(folder / "images")
-            else:
-                overrides = [f"runtime.seed={method.split()[1]}", *arguments.overrides]
-                models, verdict = reconstruct_with_defaults(folder / "images", overrides)
-            row = {"set": name, "method": method, **measure(models, folder), "verdict": verdict}
-            row["seconds"] = time.perf_counter() - start
-            rows.append(row)
-            print(json.dumps(row), file=sys.stderr, flush=True)
+    methods = [f"seed {seed}" for seed in range(arguments.seeds)]
+    methods += [] if arguments.without_colmap else ["COLMAP"]
+    rows = [
+        reconstruct_and_measure(arguments.photos / name, method, arguments.overrides)
+        for name in arguments.sets
+        for method in methods
+    ]
     text = format_table(rows)
     print(text)
     if arguments.output:
         arguments.output.write_text(text + "\n", encoding="utf-8")
     if arguments.json:
         print(json.dumps({"rows": rows}))
+
+
+def reconstruct_and_measure(folder: Path, method: str, overrides: Sequence[str]) -> dict[str, Any]:
+    """Reconstruct a set of photos, and print and return its row of the table.
+
+    Args:
+        folder: Folder of the set of photos.
+        method: ``COLMAP``, or ``seed`` and the random seed of our mapper.
+        overrides: Options of our configuration, as ``KEY=VALUE``.
+    """
+    start, verdict = time.perf_counter(), ""
+    if method == "COLMAP":
+        models = reconstruct_with_colmap(folder / "images")
+    else:
+        seed = f"runtime.seed={method.split()[1]}"
+        models, verdict = reconstruct_with_defaults(folder / "images", [seed, *overrides])
+    row = {"set": folder.name, "method": method, **measure(models, folder), "verdict": verdict}
+    row["seconds"] = time.perf_counter() - start
+    print(json.dumps(row), file=sys.stderr, flush=True)
+    return row
 
 
 def reconstruct_with_defaults(

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
         predict_priors,
         run_mapper,
         to_colmap,
+        undistort_views,
     )
     from mpsfm_core.calibration.calibrate import CalibrationImages, calibrate
     from mpsfm_core.config import Config, load_config
@@ -68,6 +69,7 @@ _LAZY_MODULES = {
         "predict_priors",
         "run_mapper",
         "to_colmap",
+        "undistort_views",
     ),
     "mpsfm_core.calibration.calibrate": ("CalibrationImages", "calibrate"),
     "mpsfm_core.config": ("Config", "load_config"),
@@ -130,6 +132,7 @@ __all__ = [
     "reconstruct",
     "run_mapper",
     "to_colmap",
+    "undistort_views",
 ]
 
 

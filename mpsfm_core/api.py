@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,7 @@ from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.refinement.depth_maps import refine_depth_maps
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.pipeline.provider_resolution import resolve_providers
 from mpsfm_core.pipeline.stages import Stages
@@ -56,6 +58,11 @@ from mpsfm_core.providers.registry import Registry
 from mpsfm_core.results.colmap_model import build_pinhole_model, reconstruction_from_model
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.original_images import OriginalImages
+from mpsfm_core.results.refined_views import (
+    undistort_cameras,
+    undistort_images,
+    undistort_problem,
+)
 from mpsfm_core.results.writer import ComponentResult
 from mpsfm_core.support.threads import limit_threads
 
@@ -307,6 +314,36 @@ def run_mapper(
         return mapper.reconstruct(problem, options, stages)
 
 
+def undistort_views(
+    result: MappingResult,
+    problem: MappingProblem,
+    images: ImageSet,
+    options: MapperOptions | None = None,
+) -> tuple[MappingResult, MappingProblem, ImageSet]:
+    """Undistort views again with the radial distortion that the mapper estimated.
+
+    Depth maps are refined again in the new views. Nothing changes without estimated distortion.
+
+    Args:
+        result: Result of :func:`run_mapper`.
+        problem: Mapping problem.
+        images: Images of the problem.
+        options: Options of the mapper.
+
+    Example:
+        >>> result, problem, images = mpsfm.undistort_views(result, problem, images)
+    """
+    refined = undistort_images(images, problem, result.reconstructions)
+    if refined is images:
+        return result, problem, images
+    problem = undistort_problem(images, refined, problem)
+    parts = (
+        refine_depth_maps(problem, undistort_cameras(refined, part), options or MapperOptions())
+        for part in result.reconstructions
+    )
+    return replace(result, reconstructions=tuple(parts)), problem, refined
+
+
 def to_colmap(
     reconstruction: Reconstruction, problem: MappingProblem, images: ImageSet | None = None
 ) -> pycolmap.Reconstruction:
@@ -316,7 +353,7 @@ def to_colmap(
         reconstruction: Element of the result of :func:`run_mapper`.
         problem: Mapping problem, which has the keypoints.
         images: Images of the problem. With images, the model has their original cameras and colored
-            points; without, pinhole cameras and black points.
+            points; without, the cameras of the views and black points.
 
     Examples:
         >>> mpsfm.to_colmap(result.reconstructions[0], problem).num_points3D()
@@ -324,7 +361,9 @@ def to_colmap(
     """
     if images is None:
         return build_pinhole_model(reconstruction, problem)
-    return ComponentResult.of(reconstruction, OriginalImages(images, problem)).model
+    refined = undistort_images(images, problem, [reconstruction])
+    photos = OriginalImages(refined, undistort_problem(images, refined, problem))
+    return ComponentResult.of(undistort_cameras(refined, reconstruction), photos).model
 
 
 def from_colmap(

@@ -168,7 +168,7 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
     _row("scale", ", ".join(describe_scale(result.summary)))
     if place := result.summary["georeference"]:
         _row("place", _place(place))
-    if refined := _refined_focal_lengths(images["details"].values()):
+    if refined := _refined_cameras(images["details"].values()):
         _row("cameras", refined)
     weak = [f"{name} ({count})" for name, count in weakest(result.summary)]
     if weak:
@@ -209,6 +209,20 @@ def _place(georeference: Mapping[str, Any]) -> str:
         f"{georeference['inliers']} of {georeference['images']} GPS positions fit, "
         f"{georeference['rms_m']:.1f} m off; up by {georeference['up']}"
     )
+
+
+def _refined_cameras(details: Collection[Mapping[str, Any]]) -> str:
+    """Describe refined focal lengths and radial distortions in the summary; empty if none."""
+    radials = [
+        image["radial_distortion"]
+        for image in details
+        if "radial_distortion" in image and "radial_distortion_reason" not in image
+    ]
+    texts = [_refined_focal_lengths(details)]
+    if radials:
+        span = " to ".join(dict.fromkeys(f"{value:+.3f}" for value in (min(radials), max(radials))))
+        texts.append(f"radial distortion estimated as {span}")
+    return ", ".join(text for text in texts if text)
 
 
 def _refined_focal_lengths(details: Collection[Mapping[str, Any]]) -> str:

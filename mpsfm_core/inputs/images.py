@@ -105,8 +105,8 @@ class SourceImage:
     def refined_camera(self, pinhole: PinholeCamera) -> pycolmap.Camera:
         """Scale the original camera to the refined focal length of its undistorted view.
 
-        Only estimated focal lengths are refined, and their cameras have no distortion. Scaling the
-        focal length of a camera without distortion is exact.
+        Focal lengths are refined together with distortion, and views of cameras with refined
+        distortion are undistorted again. The factor of the focal length then is 1.
         """
         camera = pycolmap.Camera(self.camera.todict())
         params = np.array(camera.params)
@@ -220,6 +220,17 @@ class ImageSet:
             write_file(path, data)
             images.append(replace(image, path=path, pixels=None))
         return ImageSet(images, self._options, self.left_out)
+
+    def with_cameras(self, cameras: Mapping[str, pycolmap.Camera]) -> ImageSet:
+        """Return a copy of the images with other cameras of some original images, by name."""
+
+        def changed(image: SourceImage) -> SourceImage:
+            camera = cameras.get(image.name)
+            if camera is None:
+                return image
+            return replace(image, camera=camera, pinhole=_view_camera(camera, self._options))
+
+        return ImageSet([changed(image) for image in self.images], self._options, self.left_out)
 
     def mask(self, index: int) -> Bool | None:
         """Return the mask of an undistorted view; images without a mask are not decoded."""

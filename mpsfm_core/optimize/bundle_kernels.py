@@ -269,28 +269,38 @@ def number_covisible_poses(
 
 
 @_helper
-def _linearize_depth(
-    k: int, image: int, z: float, bundle: BundleData, state: BundleParameters
+def _add_depth_residual(
+    k: int,
+    image: int,
+    z: float,
+    inverse: float,
+    rho: float,
+    gz: float,
+    hzz: float,
+    bundle: BundleData,
+    state: BundleParameters,
 ) -> tuple[float, float, float, float, float, float]:
-    """Linearize the log-depth residual of an observation at depth ``z``.
+    """Add the log-depth residual of an observation at depth ``z`` to its derivatives.
 
     Returns:
-        Twice the cost, gradient and Gauss-Newton entry by depth, and the fields ``gs``, ``hss`` and
-        ``hzs``; all are 0 if the observation has no depth.
+        Twice the cost, the fields ``gz`` and ``hzz`` with the log-depth residual, and the fields
+        ``gs``, ``hss`` and ``hzs``, which are 0 if the scale is constant or depth is invalid.
     """
     obs, robust = bundle.obs, bundle.robust
     gs = hss = hzs = 0.0
-    if not obs.depth_weight[k] > 0.0:
-        return gs, gs, gs, gs, hss, hzs
-    slope_s = obs.depth_weight[k]
-    rd = (np.log(z) - obs.log_depth[k] - state.log_scales[image]) * slope_s
-    rho, weight = evaluate_loss(robust.depth_loss, rd * rd, robust.depth_scale)
-    slope = slope_s * (1.0 / z)
-    if bundle.layout.variable_scale[image]:
-        gs = -weight * slope_s * rd
-        hss = weight * slope_s * slope_s
-        hzs = -weight * slope * slope_s
-    return rho, weight * slope * rd, weight * slope * slope, gs, hss, hzs
+    if obs.depth_weight[k] > 0.0:
+        slope_s = obs.depth_weight[k]
+        rd = (np.log(z) - obs.log_depth[k] - state.log_scales[image]) * slope_s
+        depth_rho, weight = evaluate_loss(robust.depth_loss, rd * rd, robust.depth_scale)
+        slope = slope_s * inverse
+        rho += depth_rho
+        gz += weight * slope * rd
+        hzz += weight * slope * slope
+        if bundle.layout.variable_scale[image]:
+            gs = -weight * slope_s * rd
+            hss = weight * slope_s * slope_s
+            hzs = -weight * slope * slope_s
+    return rho, gz, hzz, gs, hss, hzs
 
 
 @_helper
@@ -336,10 +346,9 @@ def _linearize_distorted_observation(
     hxy = weight * (ux * uy + vx * vy)
     hxz, hyz = -hxx * u - hxy * v, -hxy * u - hyy * v
     hzz = -hxz * u - hyz * v
-    depth_rho, gd, hdd, gs, hss, hzs = _linearize_depth(k, image, z, bundle, state)
-    rho += depth_rho
-    gz += gd
-    hzz += hdd
+    rho, gz, hzz, gs, hss, hzs = _add_depth_residual(
+        k, image, z, inverse, rho, gz, hzz, bundle, state
+    )
     return LinearizedObservation(
         True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, hxz, hyz, hzz, gs, hss, hzs,
         hxy, factor / radius_slope, r2 / radius_slope,
@@ -387,10 +396,9 @@ def linearize_observation(
     hxx, hyy = weight * fx * fx, weight * fy * fy
     hzz = hxx * u * u + hyy * v * v
     hxz, hyz = -hxx * u, -hyy * v
-    depth_rho, gd, hdd, gs, hss, hzs = _linearize_depth(k, image, z, bundle, state)
-    rho += depth_rho
-    gz += gd
-    hzz += hdd
+    rho, gz, hzz, gs, hss, hzs = _add_depth_residual(
+        k, image, z, inverse, rho, gz, hzz, bundle, state
+    )
     return LinearizedObservation(
         True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, hxz, hyz, hzz, gs, hss, hzs,
         n, 1.0, n,

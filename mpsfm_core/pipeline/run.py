@@ -35,8 +35,10 @@ from mpsfm_core.inputs.matches import (
 from mpsfm_core.inputs.models import describe_name_difference, match_names, read_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.refinement.depth_maps import refine_depth_maps
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
 from mpsfm_core.pipeline import precompile, resources
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, MappingCheckpoints
@@ -48,6 +50,11 @@ from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.report.page import write_report
 from mpsfm_core.results.georeference import georeference
 from mpsfm_core.results.original_images import OriginalImages
+from mpsfm_core.results.refined_views import (
+    undistort_cameras,
+    undistort_images,
+    undistort_problem,
+)
 from mpsfm_core.results.summary import FORMAT as SUMMARY_FORMAT
 from mpsfm_core.results.summary import (
     RunSummary,
@@ -274,9 +281,14 @@ class _Run:
         images, extraction = self._extract(images)
         self._finish_compilation()
         mapping = self._map(extraction.problem.with_poses(self._known_poses))
+        views = images
         if self._config.has_second_pass:
-            extraction, mapping = self._run_second_pass(images, extraction, mapping)
-        originals = OriginalImages(images, extraction.problem)
+            extraction, views, mapping = self._run_second_pass(images, extraction, mapping)
+        refined = undistort_images(views, extraction.problem, mapping.reconstructions)
+        problem = undistort_problem(images, refined, extraction.problem)
+        if refined is not views:
+            mapping = self._refine_depth_maps(refined, problem, mapping)
+        originals = OriginalImages(refined, problem)
         if not mapping.reconstructions:
             self._fail(images, extraction, mapping, originals)
         mapping = self._georeference(images, mapping)
@@ -379,14 +391,19 @@ class _Run:
 
     def _run_second_pass(
         self, images: ImageSet, extraction: Extraction, mapping: MappingResult
-    ) -> tuple[Extraction, MappingResult]:
-        """Match images with too few points after the fast pass, and map again from seed poses."""
+    ) -> tuple[Extraction, ImageSet, MappingResult]:
+        """Match images with too few points after the fast pass, and map again from seed poses.
+
+        Returns:
+            Extraction with all matches, images with the cameras whose views were mapped again, and
+            result of the mapper.
+        """
         config = self._config
         assert config.fast_pass is not None
         seeds = select_seed_images(mapping, config.fast_pass.min_points)
         unconstrained = frozenset(range(len(images))) - {image.index for image in seeds}
         if not unconstrained:
-            return extraction, mapping
+            return extraction, images, mapping
         matchers = (config.matcher, config.dense_matcher)
         names = " and ".join(matcher.use for matcher in matchers if matcher is not None)
         self._stages.notice(
@@ -397,19 +414,39 @@ class _Run:
             extraction = extend_matches(
                 images, config, self._registry, extraction, unconstrained, self._stages
             )
-        return extraction, self._map_from_seeds(extraction, seeds)
+        refined = undistort_images(images, extraction.problem, mapping.reconstructions)
+        seeds = [
+            replace(seed, camera=refined[seed.index].pinhole) if seed.radial else seed
+            for seed in seeds
+        ]
+        problem = undistort_problem(images, refined, extraction.problem)
+        changed = np.array([new is not old for new, old in zip(refined, images, strict=True)])
+        problem = estimate_relative_poses(problem, changed, config.runtime.seed)
+        return extraction, refined, self._map_from_seeds(problem, seeds)
 
     def _map_from_seeds(
-        self, extraction: Extraction, seeds: list[RegisteredImage]
+        self, problem: MappingProblem, seeds: list[RegisteredImage]
     ) -> MappingResult:
         """Map again from the poses of the fast pass, or poses that the user fixed."""
-        problem = extraction.problem.with_poses(self._known_poses)
+        problem = problem.with_poses(self._known_poses)
         options = self._config.mapper_options()
         if not self._known_poses:
             options = options.model_copy(update={"known_poses": "guess"})
         if options.known_poses != "fixed":
             problem = apply_seed_poses(problem, seeds)
         return self._map(problem, options)
+
+    def _refine_depth_maps(
+        self, refined: ImageSet, problem: MappingProblem, mapping: MappingResult
+    ) -> MappingResult:
+        """Refine the depth maps in views that are undistorted with the refined cameras."""
+        options = self._config.mapper_options()
+        with self._stages.stage("mapping"):
+            parts = (
+                refine_depth_maps(problem, undistort_cameras(refined, part), options)
+                for part in mapping.reconstructions
+            )
+            return replace(mapping, reconstructions=tuple(parts))
 
     def _georeference(self, images: ImageSet, mapping: MappingResult) -> MappingResult:
         """Align reconstructions with GPS positions, if enough images have a position."""
@@ -465,7 +502,9 @@ class _Run:
             components = [ComponentResult.of(part, originals) for part in mapping.reconstructions]
             models = tuple(component.model for component in components)
 
-            summarize = partial(self._summarize, "success", images, extraction, mapping, models)
+            summarize = partial(
+                self._summarize, "success", images, extraction, mapping, models, originals
+            )
             if self._output is None:
                 summary = summarize()
             else:
@@ -484,7 +523,7 @@ class _Run:
     ) -> None:
         """Write a summary with the reasons of the failure, and raise ReconstructionError."""
         self._delete_checkpoints()
-        summary = self._summarize("failed", images, extraction, mapping, ())
+        summary = self._summarize("failed", images, extraction, mapping, (), originals)
         hint = ""
         if self._output is not None:
             write_failure(self._output, originals, self._config.results, summary)
@@ -523,6 +562,7 @@ class _Run:
         extraction: Extraction,
         mapping: MappingResult,
         models: Sequence[pycolmap.Reconstruction],
+        originals: OriginalImages,
     ) -> RunSummary:
         """Collect the facts of all stages for ``summary.json``."""
         config, stages = self._config, self._stages
@@ -539,7 +579,7 @@ class _Run:
             "versions": describe_versions(),
             "photos": None if self._image_folder is None else str(self._image_folder.resolve()),
             "matches_from": None if self._imported is None else self._imported.source,
-            "images": describe_images(images, extraction.report, mapping),
+            "images": describe_images(images, extraction.report, mapping, originals),
             "pairs": describe_pairs(extraction.report, mapping, extraction.problem),
             "reconstructions": describe_reconstructions(mapping, models, extraction.problem),
             "mapping_runs": mapping.report.runs,

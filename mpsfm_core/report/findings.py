@@ -59,6 +59,7 @@ def findings(summary: Mapping[str, Any]) -> list[Finding]:
         *_providers(summary),
         *_scale(summary),
         *_focal_lengths(summary),
+        *_distortions(summary),
         *_weak(summary),
     ]
     return sorted(collected, key=lambda finding: _ORDER.index(finding.level))
@@ -277,6 +278,27 @@ def _range(changes: Sequence[float]) -> str:
     """Return smallest and largest relative change as text, one value if they are equal."""
     ends = dict.fromkeys(f"{change:+.0%}" for change in (min(changes), max(changes)))
     return " to ".join(ends)
+
+
+def _distortions(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield findings about estimated and refused radial distortions."""
+    details = summary["images"]["details"]
+    refined = {
+        name: (image["radial_distortion"], image["radial_distortion_std"])
+        for name, image in details.items()
+        if "radial_distortion" in image and "radial_distortion_reason" not in image
+    }
+    if refined:
+        radials, stds = zip(*refined.values(), strict=True)
+        span = " to ".join(dict.fromkeys(f"{value:+.3f}" for value in (min(radials), max(radials))))
+        yield Finding(
+            "note",
+            f"The radial distortion of {_count(len(refined), 'photo')} was estimated",
+            f"The coefficient k1 of COLMAP's SIMPLE_RADIAL is {span}. Its standard deviation is at "
+            f"most {max(stds):.3f}.",
+            "Give the camera with --intrinsics if you know it.",
+            tuple(refined),
+        )
 
 
 def _weak(summary: Mapping[str, Any]) -> Iterator[Finding]:

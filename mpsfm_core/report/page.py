@@ -178,6 +178,8 @@ class _ImageEntries:
             "focal": details["focal_length_px"],
             "focal_from": details["focal_length_from"],
             "refined_focal": details.get("refined_focal_length_px"),
+            "radial": details.get("radial_distortion"),
+            "radial_std": details.get("radial_distortion_std"),
             **self._in_model(name),
             **self._camera(name, prior),
             "pictures": self._pictures(name, prior, refined),

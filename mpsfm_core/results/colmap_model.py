@@ -77,8 +77,17 @@ def build_model(
 def build_pinhole_model(
     reconstruction: Reconstruction, problem: MappingProblem
 ) -> pycolmap.Reconstruction:
-    """Build a COLMAP model with pinhole cameras and black points, without the images."""
-    cameras = [colmap_from_pinhole(image.camera) for image in reconstruction.images]
+    """Build a COLMAP model of the views with black points, without the images.
+
+    The cameras are pinhole cameras, or SIMPLE_RADIAL if the mapper estimated radial distortion of
+    views that are not undistorted.
+    """
+    cameras = [
+        _with_distortion(image.camera, image.radial)
+        if image.radial and not problem.images[image.index].radial
+        else colmap_from_pinhole(image.camera)
+        for image in reconstruction.images
+    ]
     keypoints = [problem.images[image.index].keypoints for image in reconstruction.images]
     black = np.zeros((len(reconstruction.points), 3), np.uint8)
     return build_model(reconstruction, cameras, keypoints, black)
@@ -221,6 +230,13 @@ def _check_free_space(path: Path, size: int) -> None:
                 file.write(bytes(min(_BLOCK, size - start)))
     finally:
         path.unlink(missing_ok=True)
+
+
+def _with_distortion(pinhole: PinholeCamera, radial: float) -> pycolmap.Camera:
+    params = [(pinhole.fx * pinhole.fy) ** 0.5, pinhole.cx, pinhole.cy, radial]
+    return pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=pinhole.width, height=pinhole.height, params=params
+    )
 
 
 def _with_id(camera: pycolmap.Camera, camera_id: int) -> pycolmap.Camera:

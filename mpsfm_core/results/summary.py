@@ -28,6 +28,7 @@ from mpsfm_core.mapping.scene.reconstruction import (
 )
 from mpsfm_core.providers.registry import core_version
 from mpsfm_core.results.evidence import count_explained_matches, describe_evidence
+from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.support.format_versions import check_version
 
 FORMAT = 1
@@ -48,7 +49,7 @@ class ImagesSummary(TypedDict):
     failed: dict[str, str]
     """Errors of providers, by image name."""
     details: dict[str, dict[str, Any]]
-    """Focal length and :class:`~mpsfm_core.extraction.report.ImageReport`, by
+    """Focal length, distortion and :class:`~mpsfm_core.extraction.report.ImageReport`, by
     image name."""
 
 
@@ -177,14 +178,18 @@ def describe_mapping_steps(mapping: MappingResult) -> dict[str, dict[str, Any]]:
 
 
 def describe_images(
-    images: ImageSet, extraction: ExtractionReport, mapping: MappingResult
+    images: ImageSet,
+    extraction: ExtractionReport,
+    mapping: MappingResult,
+    photos: OriginalImages,
 ) -> ImagesSummary:
     """Describe status and statistics of all images, with reasons for unregistered images.
 
     Args:
-        images: images of the run.
+        images: images of the run, with the cameras that were given or guessed.
         extraction: report of the extraction of features, priors and matches.
         mapping: result of the mapper.
+        photos: original images with the refined cameras.
     """
     component = {
         image.name: number
@@ -210,7 +215,7 @@ def describe_images(
         "failed": extraction["failed"],
         "details": {
             image.name: {
-                **_focal_length(image, registered.get(image.name)),
+                **_describe_camera(image, registered.get(image.name), photos),
                 **extraction["images"][image.name],
             }
             for image in images
@@ -218,21 +223,28 @@ def describe_images(
     }
 
 
-def _focal_length(image: SourceImage, registered: RegisteredImage | None) -> dict[str, Any]:
-    """Describe initial and refined focal length of an image, with std or the reason of no std."""
+def _describe_camera(
+    image: SourceImage, registered: RegisteredImage | None, photos: OriginalImages
+) -> dict[str, Any]:
+    """Describe initial and refined focal length and distortion, with std or a reason of no std."""
     described: dict[str, Any] = {
         "focal_length_from": image.focal_source,
         "focal_length_px": image.camera.mean_focal_length(),
     }
     if registered is None:
         return described
-    focal_px = image.refined_camera(registered.camera).mean_focal_length()
-    if registered.camera != image.pinhole:
+    focal_px = photos.original_camera(registered).mean_focal_length()
+    if focal_px != described["focal_length_px"]:
         described["refined_focal_length_px"] = focal_px
     if registered.focal_log_std is not None:
         described["focal_length_std_px"] = focal_px * registered.focal_log_std
     if registered.focal_reason is not None:
         described["focal_length_reason"] = registered.focal_reason.to_json()
+    if registered.radial_std is not None:
+        described["radial_distortion"] = registered.radial
+        described["radial_distortion_std"] = registered.radial_std
+    if registered.radial_reason is not None:
+        described["radial_distortion_reason"] = registered.radial_reason.to_json()
     return described
 
 

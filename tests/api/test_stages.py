@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -174,3 +175,24 @@ def test_model_without_images_has_pinhole_cameras(known: Any) -> None:
     model = mpsfm.to_colmap(result.reconstructions[0], known)
     assert {camera.model_name for camera in model.cameras.values()} == {"PINHOLE"}
     assert isinstance(model, pycolmap.Reconstruction)
+
+
+def test_radial_distortion_reaches_the_colmap_model(known: Any) -> None:
+    center, focal_px, radial = np.array([160.0, 120.0]), 280.0, -0.1
+    names = [image.name for image in known.images]
+    keypoints = {}
+    for image in known.images:
+        rays = (image.keypoints - center) / focal_px
+        distorted = rays * (1 + radial * (rays**2).sum(axis=1, keepdims=True))
+        keypoints[image.name] = center + focal_px * distorted
+    guesses = [
+        replace(image, keypoints=keypoints[image.name], focal_known=False) for image in known.images
+    ]
+    poses = [(pose[:, :3], pose[:, 3]) for pose in POSES]
+    problem = replace(known, images=tuple(guesses)).with_poses(dict(zip(names, poses, strict=True)))
+    result = mpsfm.run_mapper(problem, {"known_poses": "fixed"})
+    model = mpsfm.to_colmap(result.reconstructions[0], problem)
+    (camera,) = model.cameras.values()
+    assert camera.model_name == "SIMPLE_RADIAL"
+    np.testing.assert_allclose(camera.params, [focal_px, *center, radial], rtol=0.02)
+    assert model.compute_mean_reprojection_error() < 0.5

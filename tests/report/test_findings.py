@@ -207,6 +207,26 @@ def test_findings_of_a_kept_guess_give_the_reason() -> None:
     assert "standard deviation of 40%" in finding.text
 
 
+def test_findings_of_an_estimated_distortion_give_its_std() -> None:
+    report = summary()
+    for name, radial in (("a", -0.031), ("b", -0.034)):
+        report["images"]["details"][name] |= {
+            "focal_length_from": "exif",
+            "radial_distortion": radial,
+            "radial_distortion_std": 0.002,
+        }
+    (finding,) = findings(report)
+    assert (finding.level, finding.images) == ("note", ("a", "b"))
+    assert "is -0.034 to -0.031. Its standard deviation is at most 0.002" in finding.text
+
+
+def test_explain_of_a_refused_distortion_gives_the_estimate() -> None:
+    reason = CameraReason.DISTORTION_OUT_OF_RANGE.because(radial=0.7)
+    assert "0.70" in explain(reason).text
+    reason = CameraReason.DISTORTION_NOT_OBSERVABLE.because(radial_std=0.08)
+    assert "0.08" in explain(reason).text
+
+
 def doubts(report: dict[str, Any]) -> list[DoubtReason]:
     """Return the codes of the doubts of a run."""
     return [doubt.reason.code for doubt in judge(report).doubts]

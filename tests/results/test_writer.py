@@ -192,7 +192,9 @@ def test_a_refined_focal_length_reaches_the_photos_camera(solved, tmp_path: Path
     np.testing.assert_allclose(camera.params, [154, 155.1, 80.5, 59])
     mapping = MappingResult((reconstruction,), solved.result.report)
     nothing: dict[str, dict[str, object]] = {name: {} for name in images.names}
-    details = describe_images(images, {"images": nothing, "failed": {}}, mapping)["details"]
+    photos = OriginalImages(images, problem)
+    report = {"images": nothing, "failed": {}}
+    details = describe_images(images, report, mapping, photos)["details"]
     assert details["images/0.png"] == {
         "focal_length_from": "default",
         "focal_length_px": pytest.approx(140.5),
@@ -260,7 +262,7 @@ def test_images_that_nothing_confirms_are_in_the_model_without_points(
 
 def test_the_summary_tells_which_images_nothing_confirms(solved, tmp_path: Path) -> None:
     images = photos_of(solved, tmp_path, PINHOLE)
-    _, reconstruction = seen_through(solved, images)
+    problem, reconstruction = seen_through(solved, images)
     first, second, third = reconstruction.images
     guessed = [replace(image, confirmed=False) for image in (second, third)]
     best = replace(reconstruction, images=(first, *guessed))
@@ -272,7 +274,9 @@ def test_the_summary_tells_which_images_nothing_confirms(solved, tmp_path: Path)
         }
     )
     extraction = {"images": {name: {} for name in images.names}, "failed": {}}
-    described = describe_images(images, extraction, MappingResult((best, other), report))
+    described = describe_images(
+        images, extraction, MappingResult((best, other), report), OriginalImages(images, problem)
+    )
     assert described["registered"] == ["images/0.png"]
     assert described["unconfirmed"] == {
         "images/1.png": {"code": "no-valid-depth"},
@@ -306,7 +310,7 @@ def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path)
         "pairs_verified": 1,
         "failed": {},
     }
-    described = describe_images(images, extraction, mapping)
+    described = describe_images(images, extraction, mapping, OriginalImages(images, problem))
     assert described["total"] == 4
     assert described["registered"] == ["images/0.png", "images/1.png", "images/2.png"]
     assert described["unregistered"] == {"images/3.png": {"code": "no-verified-matches"}}

@@ -100,6 +100,63 @@ def test_default_focal_length_is_refined_and_reported(photo_scene, mpsfm, tmp_pa
     assert f"focal length refined from {guess:.0f} (default) to {told[1]:.0f} px" in ended.out
 
 
+def test_radial_distortion_is_estimated_for_all_results(photo_scene, mpsfm, tmp_path: Path) -> None:
+    (camera,) = pycolmap.Reconstruction(str(photo_scene.truth)).cameras.values()
+    distorted = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=320, height=240, params=[280, 160, 120, -0.2]
+    )
+    photos, output = tmp_path / "photos", tmp_path / "out"
+    resample_images(photo_scene.images, photos, camera, distorted)
+    ended = mpsfm(
+        "reconstruct",
+        photos,
+        "--config",
+        photo_scene.config,
+        "--output",
+        output,
+        "--set",
+        f"inputs.default_focal_ratio={1.06 * 280 / 320}",
+    )
+    assert ended.code == 0, ended.err
+    assert "radial distortion estimated as -0." in ended.out
+    model = pycolmap.Reconstruction(str(output / "sparse"))
+    (refined,) = model.cameras.values()
+    assert refined.model_name == "SIMPLE_RADIAL"
+    assert refined.focal_length == pytest.approx(280, rel=0.02)
+    assert refined.params[3] == pytest.approx(-0.2, abs=0.02)
+    errors_px = [
+        np.linalg.norm(image.project_point(model.points3D[point.point3D_id].xyz) - point.xy)
+        for image in model.images.values()
+        for point in image.get_observation_points2D()
+    ]
+    assert np.median(errors_px) < 0.5
+    undistorted = pycolmap.Reconstruction(str(output / "undistorted" / "sparse"))
+    (pinhole,) = undistorted.cameras.values()
+    assert pinhole.model_name == "PINHOLE"
+    assert cv2.imread(str(output / "undistorted" / "images" / "0.png")).shape[:2] == (
+        pinhole.height,
+        pinhole.width,
+    )
+    summary = json.loads((output / "summary.json").read_text())
+    for image in summary["images"]["details"].values():
+        assert image["radial_distortion"] == pytest.approx(refined.params[3])
+        assert 0 < image["radial_distortion_std"] < 0.02
+    report = evaluate(read_poses(output), read_poses(photo_scene.truth))
+    assert report["registered"] == 5 and report["auc"]["5"] > 80
+
+
+def resample_images(source: Path, target: Path, old: pycolmap.Camera, new: pycolmap.Camera) -> None:
+    """Write the images of a folder as a camera with other intrinsics takes them."""
+    target.mkdir()
+    x, y = np.meshgrid(np.arange(new.width) + 0.5, np.arange(new.height) + 0.5)
+    rays = new.cam_from_img(np.column_stack([x.ravel(), y.ravel()]))
+    xy = old.img_from_cam(np.column_stack([rays, np.ones(len(rays))])) - 0.5
+    pixels = xy.reshape(new.height, new.width, 2).astype(np.float32)
+    for path in source.iterdir():
+        image = cv2.imread(str(path))
+        cv2.imwrite(str(target / path.name), cv2.remap(image, pixels, None, cv2.INTER_CUBIC))
+
+
 def test_refined_focal_lengths_of_several_cameras_are_printed_as_range() -> None:
     known = {"focal_length_from": "intrinsics", "focal_length_px": 500.0}
     guessed = {"focal_length_from": "exif", "focal_length_px": 1000.0}

@@ -183,6 +183,11 @@ class Refiner:
         covariances = self._covariances(images)
         parallel_map(lambda image: self._integrate(image, *covariances), images)
 
+    def refine_depth(self, images: list[int]) -> None:
+        """Measure the depth noise, and refine the depth maps of images with the current points."""
+        self._measure_noise()
+        self.integrate(images)
+
     def adjust(
         self,
         variable: list[int],

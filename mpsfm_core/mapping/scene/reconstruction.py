@@ -55,15 +55,21 @@ class RegisteredImage:
     def state_dict(self) -> StateDict:
         """Return the image for a checkpoint."""
         parts = {"camera": {**vars(self.camera)}, "depth": {**vars(self.depth)}}
-        reason = self.focal_reason and self.focal_reason.to_json()
-        return {**vars(self), **parts, "focal_reason": reason}
+        reasons = {
+            "focal_reason": self.focal_reason and self.focal_reason.to_json(),
+            "radial_reason": self.radial_reason and self.radial_reason.to_json(),
+        }
+        return {**vars(self), **parts, **reasons}
 
     @classmethod
     def from_state_dict(cls, state: StateDict) -> RegisteredImage:
         """Restore an image from a checkpoint."""
         parts = {"camera": PinholeCamera(**state["camera"]), "depth": DepthPrior(**state["depth"])}
-        reason = state["focal_reason"] and reason_from_json(CameraReason, state["focal_reason"])
-        return cls(**{**state, **parts, "focal_reason": reason})
+        reasons = {
+            name: state[name] and reason_from_json(CameraReason, state[name])
+            for name in ("focal_reason", "radial_reason")
+        }
+        return cls(**{**state, **parts, **reasons})
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,183 @@
+"""Undistort views again with the radial distortion that the mapper estimated.
+
+The first views of guessed cameras are pinhole images of guessed focal length. If the mapper finds
+radial distortion, keypoints, depth and normal priors move to views that are undistorted with the
+refined cameras. Depth along z and normals in the camera frame keep their values.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import (
+    Bool,
+    DepthPrior,
+    Float32,
+    Float64,
+    MappingImage,
+    MappingProblem,
+    NormalPrior,
+)
+from mpsfm_core.geometry import pixel_centers, project, scale_pixels
+from mpsfm_core.geometry.distortion import undistort_rays
+from mpsfm_core.inputs.images import ImageSet, SourceImage
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+
+MIN_VALID_WEIGHT = 0.999
+"""Smallest interpolation weight of valid pixels for which a resampled pixel is valid. [ours]"""
+
+
+def undistort_images(
+    images: ImageSet, problem: MappingProblem, reconstructions: Sequence[Reconstruction]
+) -> ImageSet:
+    """Return the images with the SIMPLE_RADIAL cameras that the mapper estimated.
+
+    Images that are not registered take the camera of a registered image with the same guessed
+    camera. The images are returned unchanged if no radial distortion was estimated.
+
+    Args:
+        images: Images whose views were mapped.
+        problem: Mapping problem of these views.
+        reconstructions: Components that the mapper reconstructed.
+    """
+    registered = {image.index: image for part in reconstructions for image in part.images}
+    shared = {
+        problem.images[image.index].camera: image
+        for image in reversed(list(registered.values()))
+        if not problem.images[image.index].focal_known
+    }
+    cameras = {}
+    for index, (source, image) in enumerate(zip(images, problem.images, strict=True)):
+        refined = registered.get(index)
+        if refined is None and not image.focal_known:
+            refined = shared.get(image.camera)
+        if refined is not None and refined.radial:
+            cameras[source.name] = _refined_camera(source, refined)
+    return images.with_cameras(cameras) if cameras else images
+
+
+def undistort_problem(
+    images: ImageSet, refined: ImageSet, problem: MappingProblem
+) -> MappingProblem:
+    """Return the mapping problem of ``images`` with the views of ``refined``.
+
+    Args:
+        images: Images whose views the problem describes.
+        refined: The same images with refined cameras.
+        problem: The mapping problem.
+    """
+    views = []
+    for old, new, view in zip(images, refined, problem.images, strict=True):
+        views.append(view if new is old else _ViewWarp(old, new).move_view(view))
+    return replace(problem, images=tuple(views))
+
+
+def undistort_cameras(refined: ImageSet, reconstruction: Reconstruction) -> Reconstruction:
+    """Return a reconstruction with the pinhole cameras of the refined views.
+
+    The depth maps stay those of the mapped views, so they have to be refined again.
+
+    Args:
+        refined: Images with the cameras that :func:`undistort_images` estimated.
+        reconstruction: One component of the result of the mapper.
+    """
+    images = (
+        replace(image, camera=refined[image.index].pinhole) if image.radial else image
+        for image in reconstruction.images
+    )
+    return replace(reconstruction, images=tuple(images))
+
+
+def _refined_camera(source: SourceImage, registered: RegisteredImage) -> pycolmap.Camera:
+    """Return the SIMPLE_RADIAL camera of an upright original image."""
+    camera = source.camera
+    focal_px = camera.mean_focal_length() * registered.camera.fx / source.pinhole.fx
+    center = camera.principal_point_x, camera.principal_point_y
+    return pycolmap.Camera(
+        model="SIMPLE_RADIAL",
+        width=camera.width,
+        height=camera.height,
+        params=[focal_px, *center, registered.radial],
+        camera_id=camera.camera_id,
+    )
+
+
+class _ViewWarp:
+    """Resampling from the view of one camera to the view of another camera of the same image."""
+
+    def __init__(self, old: SourceImage, new: SourceImage) -> None:
+        self._old, self._new = old, new
+        self._pixels: dict[tuple[int, int], Float32] = {}
+
+    def move_view(self, image: MappingImage) -> MappingImage:
+        """Return an image of the mapping problem on the new view."""
+        return replace(
+            image,
+            camera=self._new.pinhole,
+            focal_guess_px=image.focal_prior_px,
+            radial=self._radial,
+            keypoints=self.move_keypoints(image.keypoints),
+            depth=self.move_depth(image.depth),
+            normals=self.move_normals(image.normals),
+        )
+
+    @property
+    def _radial(self) -> float:
+        return float(self._new.camera.params[self._new.camera.extra_params_idxs()[0]])
+
+    def move_keypoints(self, xy: Float64) -> Float64:
+        """Map pixels (n, 2) of the old view to pixels of the new view."""
+        camera = self._new.camera
+        center = np.array([camera.principal_point_x, camera.principal_point_y])
+        distorted = (self._old.original_pixels(xy) - center) / camera.mean_focal_length()
+        rays = undistort_rays(distorted, self._radial)
+        return project(self._new.pinhole, np.column_stack([rays, np.ones(len(rays))]))
+
+    def move_depth(self, prior: DepthPrior) -> DepthPrior:
+        """Resample a depth map by bilinear interpolation of log depth."""
+        safe = np.where(prior.valid, prior.depth, np.float32(1))
+        depth = np.exp(self._resample(np.log(safe)))
+        variance = prior.variance
+        if variance is not None:
+            variance = self._resample(np.where(prior.valid, variance / safe**2, 0)) * depth**2
+        return DepthPrior.from_arrays(
+            depth, variance, self._resample_mask(prior.valid), metric=prior.metric
+        )
+
+    def move_normals(self, prior: NormalPrior) -> NormalPrior:
+        """Resample a normal map by bilinear interpolation."""
+        variance = None if prior.variance is None else self._resample(prior.variance)
+        return NormalPrior.from_arrays(
+            self._resample(prior.normals), variance, self._resample_mask(prior.valid)
+        )
+
+    def _resample_mask(self, mask: Bool) -> Bool:
+        weight = self._resample(mask.astype(np.float32), cv2.BORDER_CONSTANT)
+        valid: Bool = weight > MIN_VALID_WEIGHT
+        return valid
+
+    def _resample(self, values: Float32, border: int = cv2.BORDER_REPLICATE) -> Float32:
+        """Resample a map (h, w) or (h, w, 3) of the old view to a map of the new view."""
+        rows, columns = values.shape[:2]
+        if (rows, columns) not in self._pixels:
+            self._pixels[rows, columns] = self._map_pixels(rows, columns)
+        xy = self._pixels[rows, columns]
+        resampled: Float32 = cv2.remap(values, xy, None, cv2.INTER_LINEAR, borderMode=border)
+        return resampled
+
+    def _map_pixels(self, rows: int, columns: int) -> Float32:
+        """Return the position (h, w, 2) on a map of the old view of each pixel of a new map."""
+        old, new = self._old.pinhole, self._new.pinhole
+        width = max(1, round(columns * new.width / old.width))
+        height = max(1, round(rows * new.height / old.height))
+        centers = pixel_centers(width, height).reshape(-1, 2)
+        view = scale_pixels(centers, (width, height), new.size)
+        xy = self._old.view_pixels(self._new.original_pixels(view))
+        pixels = scale_pixels(xy, old.size, (columns, rows)) - 0.5
+        positions: Float32 = pixels.astype(np.float32).reshape(height, width, 2)
+        return positions
