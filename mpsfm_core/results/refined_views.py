@@ -47,7 +47,7 @@ def undistort_images(
     """
     registered = {image.index: image for part in reconstructions for image in part.images}
     shared = {
-        problem.images[image.index].camera: image
+        problem.images[image.index].shared_camera: image
         for image in reversed(list(registered.values()))
         if not problem.images[image.index].focal_known
     }
@@ -55,7 +55,7 @@ def undistort_images(
     for index, (source, image) in enumerate(zip(images, problem.images, strict=True)):
         refined = registered.get(index)
         if refined is None and not image.focal_known:
-            refined = shared.get(image.camera)
+            refined = shared.get(image.shared_camera)
         if refined is not None and refined.radial:
             cameras[source.name] = _refined_camera(source, refined)
     return images.with_cameras(cameras) if cameras else images

@@ -6,7 +6,13 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mpsfm_core.geometry.distortion import MIN_SLOPE, distort_rays, undistort_rays
+from mpsfm_core.data import PinholeCamera
+from mpsfm_core.geometry.distortion import (
+    MIN_SLOPE,
+    change_distortion,
+    distort_rays,
+    undistort_rays,
+)
 
 
 @pytest.mark.parametrize("radial", [-0.25, -0.03, 0.0, 0.1])
@@ -26,3 +32,15 @@ def test_undistort_rays_without_an_inverse_returns_the_largest_radius() -> None:
     radius = np.hypot(*undistorted[0])
     assert 1 + 3 * -0.3 * radius**2 == pytest.approx(MIN_SLOPE)
     assert undistorted[1].tolist() == [0, 0]
+
+
+def test_change_distortion_of_undistorted_pixels_equals_undistortion_of_the_original() -> None:
+    original = np.random.default_rng(0).uniform([0, 0], [640, 480], (50, 2))
+    old, new = (
+        PinholeCamera(640, 480, 500, 500, 320, 240),
+        PinholeCamera(640, 480, 550, 550, 320, 240),
+    )
+    start = change_distortion(original, (old, 0.0), (old, -0.1))
+    changed = change_distortion(start, (old, -0.1), (new, -0.15))
+    expected = change_distortion(original, (new, 0.0), (new, -0.15))
+    np.testing.assert_allclose(changed, expected, atol=1e-9)
