@@ -49,8 +49,8 @@ from mpsfm_core.inputs import images as image_inputs
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.depth_map_refinement import refine_depth_maps
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement.depth_maps import refine_depth_maps
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.pipeline.provider_resolution import resolve_providers
 from mpsfm_core.pipeline.stages import Stages

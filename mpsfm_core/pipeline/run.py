@@ -35,10 +35,10 @@ from mpsfm_core.inputs.matches import (
 from mpsfm_core.inputs.models import describe_name_difference, match_names, read_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.depth_map_refinement import refine_depth_maps
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement.depth_maps import refine_depth_maps
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
 from mpsfm_core.pipeline import precompile, resources
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, MappingCheckpoints

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from mpsfm_core.mapping.depth_map_refinement import refine_depth_maps
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement.depth_maps import refine_depth_maps
 from tests.mapping.focal_scenes import make_room
 
 
