@@ -110,6 +110,13 @@ def is_plain_rgb(data: bytes) -> bool:
     return False
 
 
+def has_alpha(data: bytes) -> bool:
+    """Return whether a PNG or WebP image has an alpha channel."""
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return len(data) > 25 and data[25] in (4, 6)
+    return data[8:16] == b"WEBPVP8X" and len(data) > 20 and bool(data[20] & 0x10)
+
+
 def is_cut_jpeg(data: bytes) -> bool:
     """Return whether a JPEG lacks its end marker; decoders fill missing pixels with gray."""
     if data[:2] != b"\xff\xd8":

@@ -37,7 +37,13 @@ from mpsfm_core.inputs.image_search import (
     select_listed_images,
 )
 from mpsfm_core.inputs.intrinsics import Intrinsics, read_intrinsics
-from mpsfm_core.inputs.masks import MaskFile, find_masks, orient_masks, resize_mask
+from mpsfm_core.inputs.masks import (
+    MaskFile,
+    decode_opacity,
+    find_masks,
+    orient_masks,
+    resize_mask,
+)
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.undistortion import (
     UndistortionMap,
@@ -350,7 +356,8 @@ def load_images(
     images = []
     for name, file in usable.items():
         image = _source_image(name, folder / name, file, *cameras[name], options)
-        images.append(replace(image, mask=oriented_masks.get(name)))
+        alpha = MaskFile(image.path, image.orientation, True) if file.is_transparent else None
+        images.append(replace(image, mask=oriented_masks.get(name, alpha)))
     _warn_of_default_focal_lengths(images, options)
     return ImageSet(images, options, left_out)
 
@@ -440,6 +447,7 @@ class _ProbedImage:
     digest: str
     fault: str = ""
     gps: GpsPosition | None = None
+    is_transparent: bool = False
 
     @property
     def oriented_size(self) -> tuple[tuple[int, int], int]:
@@ -533,9 +541,11 @@ def _probe(path: Path, options: InputOptions) -> _ProbedImage:
                 f"first, for example with ffmpeg's v360 filter"
             )
         size = upright_size(data, header, path)
+        is_transparent = decode_opacity(data, path) is not None
     except InputError as error:
         return _ProbedImage((0, 0), ImageHeader(None, 1, {}), "", str(error))
-    return _ProbedImage(size, header, hashlib.sha256(data).hexdigest(), gps=read_gps(data))
+    digest = hashlib.sha256(data).hexdigest()
+    return _ProbedImage(size, header, digest, "", read_gps(data), is_transparent)
 
 
 def _report_left_out(left_out: Mapping[str, str], total: int, options: InputOptions) -> None:

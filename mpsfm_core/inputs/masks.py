@@ -22,7 +22,7 @@ from mpsfm_core.inputs.image_decoding import (
     orient,
     read_bytes,
 )
-from mpsfm_core.inputs.image_header import read_header
+from mpsfm_core.inputs.image_header import has_alpha, read_header
 from mpsfm_core.inputs.image_search import list_names, walk_files
 from mpsfm_core.support.threads import thread_limit
 
@@ -45,9 +45,16 @@ class MaskFile:
     """Path of the mask file."""
     orientation: int = 1
     """EXIF orientation that rotates the mask upright, 1 for an upright mask."""
+    is_alpha: bool = False
+    """Whether the file is the image, whose alpha channel is the mask."""
 
     def read(self, max_pixels: int) -> Bool:
-        """Decode the upright mask, (H, W) bool, False at black pixels."""
+        """Decode the upright mask, (H, W) bool, False at black or transparent pixels."""
+        if self.is_alpha:
+            opaque = decode_opacity(read_bytes(self.path), self.path)
+            if opaque is None:
+                raise InputError(f"image {self.path} has changed during the run")
+            return _turn(opaque, self.orientation)
         return _turn(decode_mask(self.path, max_pixels), self.orientation)
 
 
@@ -200,6 +207,21 @@ def decode_mask(path: Path, max_pixels: int) -> Bool:
     is_lossy = data[:3] == b"\xff\xd8\xff" or (data[8:12] == b"WEBP" and data[12:16] == b"VP8 ")
     allowed = values > (_LOSSY_THRESHOLD if is_lossy else 0)
     return _turn(np.asarray(allowed), read_header(data).orientation)
+
+
+def decode_opacity(data: bytes, path: Path) -> Bool | None:
+    """Decode the alpha channel of a PNG or WebP image, before EXIF rotation.
+
+    Returns:
+        (H, W) bool, False at transparent pixels, or None if all or no pixels are transparent.
+    """
+    if not has_alpha(data):
+        return None
+    values = decode_stored(data, path)
+    if values.ndim != 3 or values.shape[2] not in (2, 4):
+        return None
+    opaque: Bool = values[..., -1] > np.iinfo(values.dtype).max // 2
+    return opaque if opaque.any() and not opaque.all() else None
 
 
 def resize_mask(mask: Bool, size: tuple[int, int]) -> Bool:

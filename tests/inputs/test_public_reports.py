@@ -77,6 +77,30 @@ def test_cameras_of_rare_models_are_undistorted(tmp_path: Path, model: str) -> N
     assert images[0].pinhole.fx == pytest.approx(90, rel=0.05)
 
 
+@pytest.mark.parametrize("flag", [1, 6])
+@pytest.mark.parametrize("suffix", [".png", ".webp"])
+def test_transparent_pixels_of_photos_are_masked(tmp_path: Path, suffix: str, flag: int) -> None:
+    """colmap/colmap#3806: PNG with transparent pixels are not read."""
+    pixels = np.dstack([np.asarray(picture()), np.full(SIZE[::-1], 255, np.uint8)])
+    for name, top in (("a", 0), ("b", 255), ("c", 255)):
+        pixels[:20, :, 3] = top
+        saved = Image.fromarray(pixels if name != "c" else pixels * np.uint8([1, 1, 1, 0]))
+        saved.save(
+            tmp_path / f"{name}{suffix}", lossless=True, exact=True, exif=exif({0x112: flag})
+        )
+    images = load(tmp_path)
+    expected = np.ones(SIZE[::-1], np.bool_)
+    expected[:20] = False
+    expected = expected if flag == 1 else np.rot90(expected, -1)
+    np.testing.assert_array_equal(images.mask(0), expected)
+    np.testing.assert_array_equal(images.view(0).mask, expected)
+    assert images.mask(1) is None and images.mask(2) is None  # all or no pixels are opaque
+    (tmp_path / "masks").mkdir()
+    Image.new("L", SIZE, 255).save(tmp_path / "masks" / "a.png")
+    masked = load(tmp_path, options=InputOptions(masks=tmp_path / "masks"))
+    assert masked.view(0).mask is not None and masked.view(0).mask.all()
+
+
 def test_one_mask_for_a_folder_of_photos_is_not_guessed(tmp_path: Path) -> None:
     """colmap/colmap#1251: one mask for all images of a camera."""
     photos = write_photos(tmp_path / "photos", ("front/a.jpg", "front/b.jpg"))
