@@ -58,7 +58,6 @@ from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.results.options import ResultOptions
 
 TOLERANCES = (0.02, 0.05)
 """Distance thresholds in meters for accuracy and completeness of point clouds."""
@@ -189,7 +188,7 @@ def measured(
                 )
                 seen = report.measured
                 seconds = (time.process_time() - started) / len(model.images)
-            cloud, *_ = fuse_depth_maps(model, view_of(photos), ResultOptions())
+            cloud, *_ = fuse_depth_maps(model, view_of(photos))
             errors = set_errors(scene, photos, problem, model, seen, cloud)
             errors_by_set.append({**errors, "cpu_s_photo": seconds})
         usable = [each for each in errors_by_set if len(each) > 1]

@@ -44,7 +44,6 @@ from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.results.colmap_model import build_model
-from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.ply import read_ply
 
 MODE = "moderate"
@@ -140,7 +139,7 @@ def ours(
     model = model if prior else without_prior(model)
     poses_use_depth = prior and not true_poses
     model, report = densify(model, view, DenseOptions(), poses_use_depth=poses_use_depth)
-    cloud = fuse_depth_maps(model, view, ResultOptions()).points
+    cloud = fuse_depth_maps(model, view).points
     return {image.name: image.depth for image in model.images}, cloud, dict(report.measured)
 
 

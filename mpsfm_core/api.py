@@ -56,7 +56,6 @@ from mpsfm_core.pipeline.provider_resolution import resolve_providers
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.results.colmap_model import build_pinhole_model, reconstruction_from_model
-from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.refined_views import (
     undistort_cameras,
@@ -435,7 +434,7 @@ def fuse(reconstruction: Reconstruction, images: ImageSet, seed: int = 0) -> Fus
         >>> mpsfm.fuse(dense, images).points.shape
         (181534, 3)
     """
-    return fuse_depth_maps(reconstruction, _ViewsByName(images), ResultOptions(), seed)
+    return fuse_depth_maps(reconstruction, _ViewsByName(images), seed=seed)
 
 
 def build_mesh(

@@ -156,7 +156,7 @@ class DoubtReason(ReasonCode):
     FEW_POINTS = ("few-points", "num_images", "min_points")
     """``num_images`` images observe fewer than ``min_points`` 3D points."""
     FEW_EXPLAINED_MATCHES = ("few-explained-matches", "num_images", "min_ratio")
-    """In ``num_images`` images, most matches contradict the model."""
+    """Most matches of ``num_images`` images contradict the model."""
     GPS_MISFIT = ("gps-misfit", "num_inliers", "num_positions")
     UNKNOWN_FOCAL_LENGTH = ("unknown-focal-length", "num_images")
     """``num_images`` images have a guessed focal length that bundle adjustment did not refine."""

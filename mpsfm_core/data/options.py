@@ -44,7 +44,7 @@ class SettingProblem:
     path: SettingPath
     """Path of the setting, such as ``("depth", "options", "scale")``."""
     text: str
-    """What is wrong."""
+    """Violated rule of the setting."""
     missing: bool = False
     """True if a required setting is absent."""
 

@@ -14,10 +14,17 @@ from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.dense.view_selection import select_source_views
 from mpsfm_core.geometry import camera_center, pixel_centers, resize_map, unproject
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.support.jit import kernel
 from mpsfm_core.support.threads import parallel_map
 
+DEFAULT_MAX_POINTS = 2_000_000
+"""Default maximum number of points of a fused cloud, 32 bytes each in ``dense.ply`` [ours]."""
+_MAX_RELATIVE_STD = 0.1
+"""Maximum relative depth std of fused pixels, unless more than three quarters of the pixels exceed
+the maximum [twice the std of the weaker networks in paper C]."""
+_MAX_DIFFERENCE_STDS = 3.0
+"""Depth difference in standard deviations from which the depth map of another image contradicts a
+pixel [ours]."""
 _MAX_NEIGHBORS = 8
 """Maximum number of overlapping images whose depth confirms or contradicts an image's points."""
 _MIN_PIXEL_RATIO = 0.25
@@ -61,19 +68,19 @@ class FusedPointCloud(NamedTuple):
 def fuse_depth_maps(
     reconstruction: Reconstruction,
     view_of: Callable[[str], View],
-    options: ResultOptions,
+    max_points: int = DEFAULT_MAX_POINTS,
     seed: int = 0,
 ) -> FusedPointCloud:
     """Fuse depth maps into one point cloud; the point with the lowest std replaces duplicates.
 
     The point cloud omits pixels with large depth std, inconsistent pixels, and images without
-    confirmed pose. If the cloud exceeds `options.dense_max_points`, each map is subsampled
-    randomly.
+    confirmed pose.
 
     Args:
         reconstruction: Posed images with depth maps.
         view_of: Function that returns the undistorted view of an image name, for the colors.
-        options: Options of the results, such as the maximum number of points.
+        max_points: Maximum number of points. If more pixels remain, each depth map is subsampled
+            randomly.
         seed: Random seed of the subsampling of depth maps.
     """
     images = reconstruction.confirmed_images
@@ -82,9 +89,9 @@ def fuse_depth_maps(
         mask = votes.consistent & ~votes.duplicate
         return pixels[mask], votes.views[mask]
 
-    selected = _vote_on_images(images, options, select_unique)
+    selected = _vote_on_images(images, select_unique)
     total = sum(len(pixels) for pixels, _ in selected)
-    ratio = min(1.0, options.dense_max_points / max(1, total))
+    ratio = min(1.0, max_points / max(1, total))
     rng = np.random.default_rng(seed)
     for row, (pixels, views) in enumerate(selected):
         sampled = np.sort(rng.choice(len(pixels), int(ratio * len(pixels)), replace=False))
@@ -102,7 +109,7 @@ def fuse_depth_maps(
 
 
 def compute_consistent_masks(
-    images: Sequence[RegisteredImage], options: ResultOptions
+    images: Sequence[RegisteredImage],
 ) -> list[Bool]:
     """Compute for each image the mask (h, w) of pixels with low depth std and consistent depth."""
 
@@ -111,23 +118,21 @@ def compute_consistent_masks(
         mask.ravel()[pixels[votes.consistent]] = True
         return mask
 
-    return _vote_on_images(images, options, build_mask)
+    return _vote_on_images(images, build_mask)
 
 
 def _vote_on_images(
     images: Sequence[RegisteredImage],
-    options: ResultOptions,
     select: Callable[[int, Int64, _ConsistencyVotes], _T],
 ) -> list[_T]:
     """Compute the consistency votes on each image's points, and apply a selection function.
 
     Args:
         images: Images with confirmed poses.
-        options: Options of the results, such as the maximum number of points.
         select: Function that receives an image index, the flat indices of its pixels with low depth
             std, and the votes on these pixels.
     """
-    max_relative_std = max(options.dense_max_relative_std, _relative_std_of_best_pixels(images))
+    max_relative_std = max(_MAX_RELATIVE_STD, _relative_std_of_best_pixels(images))
     usable = [_certain_pixels(image, max_relative_std) for image in images]
     neighbors = select_source_views(images, _MAX_NEIGHBORS)
 
@@ -135,7 +140,7 @@ def _vote_on_images(
         pixels = np.flatnonzero(usable[row])
         points, variance = _unproject_pixels(images[row], pixels)
         voters = [(images[j], usable[j], j < row) for j in neighbors[row]]
-        votes = _vote_on_points(points, variance, voters, options.dense_consistency_sigmas)
+        votes = _vote_on_points(points, variance, voters, _MAX_DIFFERENCE_STDS)
         return select(row, pixels, votes)
 
     return parallel_map(vote_on_image, range(len(images)))

@@ -31,7 +31,6 @@ from mpsfm_core.geometry import (
     unproject,
 )
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.support.jit import kernel
 
 _BLOCK_SIZE = 64
@@ -133,7 +132,7 @@ def mesh_depth_maps(
     """
     marching_cubes, simplify = _import_libraries()
     images = reconstruction.confirmed_images
-    masks = compute_consistent_masks(images, ResultOptions())
+    masks = compute_consistent_masks(images)
     maps = [
         _weight_depth(image, mask) for image, mask in zip(images, masks, strict=True) if mask.any()
     ]

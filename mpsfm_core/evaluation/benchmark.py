@@ -259,8 +259,8 @@ class _SceneRuns:
         config = prepared.config
         if not config.dense.enabled or self._scene.depth is None:
             return None
-        settings = config.dense, config.results, self._scene, self._plan.distances
-        return DenseEvaluation(prepared.images, *settings)
+        max_points, distances = config.results.dense_max_points, self._plan.distances
+        return DenseEvaluation(prepared.images, config.dense, max_points, self._scene, distances)
 
     def _read_cached(
         self, image_set: EvaluationSet, label: str, key: str
@@ -316,8 +316,8 @@ def _content_key(run: MethodRun) -> str:
     if run.method == OURS:
         parts.append(run.options.model_dump(mode="json"))
     if run.dense is not None:
-        options = (run.dense.dense, run.dense.results)
-        parts += [[each.model_dump(mode="json") for each in options], run.dense.distances]
+        options = run.dense.dense.model_dump(mode="json")
+        parts += [options, run.dense.max_points, run.dense.distances]
     if run.method in PRIOR_METHODS:
         parts += [digest(image) for image in run.problem.images]
     else:

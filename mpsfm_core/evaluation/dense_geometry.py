@@ -18,7 +18,6 @@ from mpsfm_core.evaluation.scene_folder import SceneFolder
 from mpsfm_core.evaluation.true_surface import build_true_surface, true_depth_file
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
-from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.original_images import OriginalImages
 
 
@@ -30,8 +29,8 @@ class DenseEvaluation:
     """Image set that contains all images of the test set."""
     dense: DenseOptions
     """Options of densification."""
-    results: ResultOptions
-    """Options of the point cloud that is fused from the depth maps."""
+    max_points: int
+    """Maximum number of points of the fused cloud."""
     scene: SceneFolder
     """Scene folder with true depth maps."""
     distances: tuple[float, ...]
@@ -41,7 +40,7 @@ class DenseEvaluation:
         """Densify a reconstruction and compare the result with true depth."""
         photos = OriginalImages(self.images, problem)
         dense, _ = densify(model, photos.view, self.dense)
-        cloud = fuse_depth_maps(dense, photos.view, self.results).points
+        cloud = fuse_depth_maps(dense, photos.view, self.max_points).points
         cameras = {image.name: image.pinhole for image in self.images}
         return evaluate_dense_geometry(dense, cloud, self.scene, cameras, self.distances)
 

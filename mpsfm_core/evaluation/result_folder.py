@@ -118,7 +118,7 @@ def read_true_surface(
     """Sample the true surface of a scene with the cameras and poses of the true model."""
     true = read_model(model, photos)
     cameras = {
-        str(image.name): undistort_camera(true.cameras[image.camera_id], 0.0)
+        str(image.name): undistort_camera(true.cameras[image.camera_id])
         for image in true.images.values()
     }
     return build_true_surface(

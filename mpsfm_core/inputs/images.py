@@ -523,7 +523,7 @@ def _view_camera(camera: pycolmap.Camera, options: InputOptions) -> PinholeCamer
     original = camera.width, camera.height
     size = _reduced_size(original, options.max_image_size)
     reduced = camera if size == original else resize_camera(camera, size)
-    return undistort_camera(reduced, options.blank_pixels)
+    return undistort_camera(reduced)
 
 
 def _probe(path: Path, options: InputOptions) -> _ProbedImage:

@@ -55,8 +55,5 @@ class InputOptions(Options):
     default_focal_ratio: float = expert(1.2, gt=0)
     """Ratio of focal length to longer image side for images without a known focal length [COLMAP
     default_focal_length_factor]."""
-    blank_pixels: float = expert(0.0, ge=0, le=1)
-    """Amount of blank pixels in undistorted images, where 0 crops to valid pixels and 1 keeps all
-    original pixels and masks blank corners [COLMAP blank_pixels]."""
     video: VideoOptions = Field(default_factory=VideoOptions)
     """Options of the frame selection if the input is a video."""

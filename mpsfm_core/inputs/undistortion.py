@@ -26,17 +26,14 @@ def resize_camera(camera: pycolmap.Camera, size: tuple[int, int]) -> pycolmap.Ca
     return resized
 
 
-def undistort_camera(camera: pycolmap.Camera, blank_pixels: float) -> PinholeCamera:
-    """Return the pinhole camera of the undistorted image of a camera.
+def undistort_camera(camera: pycolmap.Camera) -> PinholeCamera:
+    """Return the pinhole camera of the undistorted image, cropped to valid pixels.
 
-    Args:
-        camera: original camera. A pinhole camera is returned unchanged.
-        blank_pixels: COLMAP's ``blank_pixels``, 0 to crop blank pixels, 1 to keep all original
-            pixels.
+    A pinhole camera is returned unchanged.
     """
     if not is_pinhole(camera):
         options = pycolmap.UndistortCameraOptions()
-        options.blank_pixels = blank_pixels
+        options.blank_pixels = 0.0
         camera = pycolmap.undistort_camera(options, camera)
     return pinhole_from_colmap(camera)
 

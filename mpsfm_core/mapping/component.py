@@ -125,7 +125,7 @@ class Component:
             False if the initialization is rejected; the scene is then empty.
         """
         before = self.scene.snapshot()
-        with self._event_log.timed("global start"):
+        with self._event_log.timed("global initialization"):
             poses = estimate_global_poses(self.scene, unregistered)
             if poses is None:
                 return False

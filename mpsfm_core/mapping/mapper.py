@@ -257,7 +257,7 @@ class Mapper:
         if self._initialize_globally():
             return True
         if self.pair_weights is None and self.options.checks_pairs:
-            with self.event_log.timed("pair check"):
+            with self.event_log.timed("pair consistency check"):
                 weights = self.component.compute_pair_weights(self.unregistered)
             self._set_pair_weights(weights)
             self.component = self._create_component()

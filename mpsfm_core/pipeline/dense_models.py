@@ -26,7 +26,6 @@ from mpsfm_core.results.colmap_model import write_model
 from mpsfm_core.results.depth_maps import read_depth_map, write_depth_maps
 from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.results.mesh import write_mesh
-from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.ply import write_cloud
 from mpsfm_core.support.disk_arrays import DiskArrays
 from mpsfm_core.support.files import lock_output_folder, replace_entries
@@ -104,7 +103,7 @@ def _densify_model(
     with replace_entries(output, (SPARSE, DENSE, DEPTH)) as folder:
         write_model(folder / SPARSE, colmap)
         write_depth_maps(folder / DEPTH, dense)
-        write_cloud(folder / DENSE, fuse_depth_maps(dense, view_of, ResultOptions()))
+        write_cloud(folder / DENSE, fuse_depth_maps(dense, view_of))
     return report
 
 

@@ -28,7 +28,6 @@ from mpsfm_core.mapping.options import InitializationOptions, MapperOptions
 from mpsfm_core.optimize.bundle_kernels import update_points
 from mpsfm_core.optimize.depth_integration import DepthIntegrator
 from mpsfm_core.providers.builtin.mutual_nearest import mutual_nearest
-from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -99,7 +98,7 @@ def compile_kernels(first: str) -> None:
         for image, pose in zip(problem.images, poses, strict=True)
     }
     dense, _ = densify(mapping.reconstructions[0], views.__getitem__, DenseOptions())
-    fuse_depth_maps(dense, views.__getitem__, ResultOptions())
+    fuse_depth_maps(dense, views.__getitem__)
     mutual_nearest(*np.ones((2, 1, 1), np.float32))
     gray, no_points = np.ones((1, 1), np.float32), np.zeros((0, 2))
     align_patches(gray, gray, no_points, no_points, np.zeros((0, 2, 2)), 3, 1.0)

@@ -158,7 +158,9 @@ def _write_dense(
 ) -> None:
     """Write the point cloud of the fused depth maps, and the depth maps if enabled."""
     if options.dense_cloud:
-        cloud = fuse_depth_maps(component.reconstruction, photos.view, options, seed)
+        cloud = fuse_depth_maps(
+            component.reconstruction, photos.view, options.dense_max_points, seed
+        )
         write_cloud(folder / DENSE, cloud)
     if options.depth_maps:
         write_depth_maps(folder / DEPTH, component.reconstruction)

@@ -112,7 +112,7 @@ class Example:
     @cached_property
     def partner(self) -> Example:
         """Synthetic view of the same surfaces from 0.3 m to the right, with the same camera."""
-        return replace(self, name=f"beside/{self.name}", pose=_step_aside(self.pose))
+        return replace(self, name=f"shifted/{self.name}", pose=_shift_right(self.pose))
 
     def mirror(self) -> Example:
         """Return the synthetic view with left and right swapped."""
@@ -193,7 +193,7 @@ def _rolled(pose: Float64, degrees: float) -> Float64:
     return rolled
 
 
-def _step_aside(pose: Float64) -> Float64:
+def _shift_right(pose: Float64) -> Float64:
     """Move a camera to the right by 0.3 m and rotate the camera back by 4 degrees.
 
     Every matcher can match two views with this small baseline.

@@ -117,7 +117,7 @@ def models() -> Table:
 def results() -> Table:
     """Return files of result folders, of the cache, and of interrupted replacements."""
 
-    def beside_golden(name: str, reader: Reader) -> tuple[str, tuple[bytes, Reader]]:
+    def with_golden_files(name: str, reader: Reader) -> tuple[str, tuple[bytes, Reader]]:
         def read(path: Path) -> None:
             data = path.read_bytes()
             folder = path.parents[name.count("/")]
@@ -159,20 +159,20 @@ def results() -> Table:
     page = ("views/matches.npz", "views/0.png.npz", "views/0.png.webp")
     return dict(
         [
-            *(beside_golden(f"out/{name}", reported) for name in (*out, *page)),
-            *(beside_golden(f"out/{name}", viewed) for name in ("summary.json", "dense.ply")),
-            *(beside_golden(f"out/{name}", exported_again) for name in out),
-            beside_golden("out/depth/0.png.npz", mapped),
-            beside_golden("calibration.yaml", calibrated),
-            beside_golden("cache/timings.json", timed),
-            beside_golden("exchange/.mpsfm-killed/ready.json", exchanged),
-            beside_golden("environment/providers.json", described),
-            beside_golden("frames/frames.json", framed),
+            *(with_golden_files(f"out/{name}", reported) for name in (*out, *page)),
+            *(with_golden_files(f"out/{name}", viewed) for name in ("summary.json", "dense.ply")),
+            *(with_golden_files(f"out/{name}", exported_again) for name in out),
+            with_golden_files("out/depth/0.png.npz", mapped),
+            with_golden_files("calibration.yaml", calibrated),
+            with_golden_files("cache/timings.json", timed),
+            with_golden_files("exchange/.mpsfm-killed/ready.json", exchanged),
+            with_golden_files("environment/providers.json", described),
+            with_golden_files("frames/frames.json", framed),
         ]
     )
 
 
-def photos_beside(path: Path) -> Path:
+def write_photos(path: Path) -> Path:
     """Create a folder of two photos next to the mutated file."""
     folder = path.parent / "photos"
     folder.mkdir(exist_ok=True)
@@ -219,25 +219,25 @@ def of_others() -> Table:
     """Return match files, videos and phone photos with their readers."""
 
     def from_database(path: Path) -> None:
-        matches_from_database(path, load_images(photos_beside(path)))
+        matches_from_database(path, load_images(write_photos(path)))
 
     def from_features(path: Path) -> None:
         hloc_matches(path.with_name("matches.h5"))
-        matches_from_hloc(path, path.with_name("matches.h5"), load_images(photos_beside(path)))
+        matches_from_hloc(path, path.with_name("matches.h5"), load_images(write_photos(path)))
 
     def from_matches(path: Path) -> None:
         hloc_features(path.with_name("features.h5"))
-        matches_from_hloc(path.with_name("features.h5"), path, load_images(photos_beside(path)))
+        matches_from_hloc(path.with_name("features.h5"), path, load_images(write_photos(path)))
 
     def frames(path: Path) -> None:
         video.choose_frames(path, VideoOptions())
 
     def masked(path: Path) -> None:
-        folder = photos_beside(path)
+        folder = write_photos(path)
         load_images(folder, options=InputOptions(masks=path.parent)).view(0)
 
     def photo(path: Path) -> None:
-        folder = photos_beside(path)
+        folder = write_photos(path)
         shutil.copy(path, folder)
         found = load_images(folder)
         found.view(len(found) - 1)

@@ -7,6 +7,7 @@ import pycolmap
 import pytest
 
 from mpsfm_core.geometry import pixel_centers, project
+from mpsfm_core.geometry.pycolmap_conversion import pinhole_from_colmap
 from mpsfm_core.inputs.undistortion import (
     UndistortionMap,
     distort_pixels,
@@ -42,7 +43,7 @@ def image() -> np.ndarray:
 @pytest.mark.parametrize("model", MODELS)
 def test_same_as_colmap(model: str, image: np.ndarray) -> None:
     original = camera(model)
-    pinhole = undistort_camera(original, 0.0)
+    pinhole = undistort_camera(original)
     options = pycolmap.UndistortCameraOptions()
     bitmap, colmap = pycolmap.undistort_image(options, pycolmap.Bitmap.from_array(image), original)
     assert pinhole.size == (colmap.width, colmap.height)
@@ -56,7 +57,7 @@ def test_same_as_colmap(model: str, image: np.ndarray) -> None:
 @pytest.mark.parametrize("model", MODELS)
 def test_to_original_follows_the_camera_model(model: str) -> None:
     original = camera(model)
-    pinhole = undistort_camera(original, 0.0)
+    pinhole = undistort_camera(original)
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-0.3, 0.3, (50, 2)), np.ones(50)])
     seen = distort_pixels(pinhole, original, project(pinhole, points))
@@ -66,18 +67,18 @@ def test_to_original_follows_the_camera_model(model: str) -> None:
 def test_pinhole_needs_no_warp() -> None:
     plain = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 505, 310, 245])
     assert is_pinhole(plain)
-    assert undistort_camera(plain, 0.0).params.tolist() == [500, 505, 310, 245]
+    assert undistort_camera(plain).params.tolist() == [500, 505, 310, 245]
     straight = pycolmap.Camera(
         model="SIMPLE_RADIAL", width=640, height=480, params=[500, 320, 240, 0.0]
     )
-    assert is_pinhole(straight) and undistort_camera(straight, 0.0).size == (640, 480)
+    assert is_pinhole(straight) and undistort_camera(straight).size == (640, 480)
     # Without distortion a fisheye is still no pinhole camera.
     assert not is_pinhole(camera("SIMPLE_FISHEYE"))
 
 
 def test_reduced_pinhole_maps_back() -> None:
     plain = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=[500, 505, 310, 245])
-    reduced = undistort_camera(resize_camera(plain, (320, 240)), 0.0)
+    reduced = undistort_camera(resize_camera(plain, (320, 240)))
     assert reduced.params.tolist() == [250, 252.5, 155, 122.5]
     xy = np.array([[0.5, 0.5], [320.0, 240.0]])
     assert distort_pixels(reduced, plain, xy).tolist() == [[1.0, 1.0], [640.0, 480.0]]
@@ -87,7 +88,7 @@ def test_reduced_pinhole_maps_back() -> None:
 def test_reduced_distorted_maps_back() -> None:
     original = camera("OPENCV")
     reduced = resize_camera(original, (80, 60))
-    pinhole = undistort_camera(reduced, 0.0)
+    pinhole = undistort_camera(reduced)
     xy = pixel_centers(*pinhole.size).reshape(-1, 2)
     scaled = distort_pixels(pinhole, reduced, xy) * 2
     assert np.allclose(distort_pixels(pinhole, original, xy), scaled, atol=1e-9)
@@ -96,18 +97,22 @@ def test_reduced_distorted_maps_back() -> None:
 def test_blank_pixels_are_masked(image: np.ndarray) -> None:
     original = camera("OPENCV")
     original.params = [130, 132, 79, 61, 0.25, 0.05, 0.0, 0.0]
-    full = UndistortionMap(original, undistort_camera(original, 1.0))
+    options = pycolmap.UndistortCameraOptions()
+    options.blank_pixels = 1.0
+    full = UndistortionMap(
+        original, pinhole_from_colmap(pycolmap.undistort_camera(options, original))
+    )
     assert 0.005 < 1 - full.valid.mean() < 0.5
     bright = np.full_like(image, 200)
     warped = full.image(bright)
     assert (warped[full.valid] == 200).all() and (warped[~full.valid] == 0).all()
-    cropped = UndistortionMap(original, undistort_camera(original, 0.0))
+    cropped = UndistortionMap(original, undistort_camera(original))
     assert cropped.valid.all()
 
 
 def test_mask_is_warped_with_the_image(image: np.ndarray) -> None:
     original = camera("OPENCV")
-    warp = UndistortionMap(original, undistort_camera(original, 0.0))
+    warp = UndistortionMap(original, undistort_camera(original))
     mask = np.zeros((HEIGHT, WIDTH), dtype=np.bool_)
     mask[:, WIDTH // 2 :] = True
     painted = np.repeat(mask[..., None], 3, axis=2).astype(np.uint8) * 255

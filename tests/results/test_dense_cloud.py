@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.geometry import camera_center, pixel_centers, unproject
-from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.testing.synthetic.scenes import project, room_scene
 
 
@@ -40,12 +39,12 @@ def assert_covers_every_map(solved, points: np.ndarray) -> None:
 
 
 def test_a_surface_that_several_images_see_is_there_once(solved) -> None:
-    cloud = fuse_depth_maps(solved.best, solved.views.__getitem__, ResultOptions())
+    cloud = fuse_depth_maps(solved.best, solved.views.__getitem__)
     total = sum(image.depth.valid.sum() for image in solved.best.images)
     assert 0.3 * total < len(cloud.points) < 0.7 * total
     first = solved.best.images[0]
     alone = replace(solved.best, images=(first,))
-    single = fuse_depth_maps(alone, solved.views.__getitem__, ResultOptions())
+    single = fuse_depth_maps(alone, solved.views.__getitem__)
     assert len(single.points) == first.depth.valid.sum()
     assert (single.views == 1).all() and cloud.views.max() == len(solved.best.images)
     np.testing.assert_allclose(single.std, 0.01, rtol=1e-4)
@@ -54,7 +53,7 @@ def test_a_surface_that_several_images_see_is_there_once(solved) -> None:
 def test_normals_face_the_camera_that_saw_the_point(solved) -> None:
     first = solved.best.images[0]
     alone = replace(solved.best, images=(first,))
-    cloud = fuse_depth_maps(alone, solved.views.__getitem__, ResultOptions())
+    cloud = fuse_depth_maps(alone, solved.views.__getitem__)
     length = np.linalg.norm(cloud.normals, axis=1)
     assert (np.abs(length[length > 0] - 1) < 1e-5).all() and (length > 0).mean() > 0.9
     center = camera_center(first.rotation, first.translation)
@@ -63,8 +62,7 @@ def test_normals_face_the_camera_that_saw_the_point(solved) -> None:
 
 
 def test_exact_maps_give_points_on_the_surfaces_in_their_colours(solved) -> None:
-    options = ResultOptions()
-    points, colors, *_ = fuse_depth_maps(solved.best, solved.views.__getitem__, options)
+    points, colors, *_ = fuse_depth_maps(solved.best, solved.views.__getitem__)
     assert_covers_every_map(solved, points)
     scene = room_scene()
     image = solved.best.images[0]
@@ -89,7 +87,7 @@ def test_uncertain_pixels_are_left_out(solved) -> None:
     variance[:30] = (0.2 * old.depth[:30]) ** 2
     uncertain = with_depth(solved, 1, old.depth, variance)
     alone = replace(uncertain, images=(uncertain.images[1],))
-    cloud = fuse_depth_maps(alone, solved.views.__getitem__, ResultOptions())
+    cloud = fuse_depth_maps(alone, solved.views.__getitem__)
     assert len(cloud.points) == old.valid[30:].sum()
 
 
@@ -100,7 +98,7 @@ def test_a_network_that_promises_little_gives_a_cloud_too(solved) -> None:
         if (old := image.depth)
     )
     vague = replace(solved.best, images=images)
-    points, *_ = fuse_depth_maps(vague, solved.views.__getitem__, ResultOptions())
+    points, *_ = fuse_depth_maps(vague, solved.views.__getitem__)
     assert_covers_every_map(solved, points)
 
 
@@ -111,7 +109,7 @@ def test_where_most_is_unsure_the_surest_quarter_stays(solved, sure: float, left
     spread.ravel()[: int(sure * old.depth.size)] = 0.01
     unsure = with_depth(solved, 1, old.depth, (spread * old.depth).astype(np.float32) ** 2)
     alone = replace(unsure, images=(unsure.images[1],))
-    cloud = fuse_depth_maps(alone, solved.views.__getitem__, ResultOptions())
+    cloud = fuse_depth_maps(alone, solved.views.__getitem__)
     assert old.valid.all()
     assert len(cloud.points) == pytest.approx(left * old.valid.sum(), abs=2)
 
@@ -120,7 +118,7 @@ def test_a_wall_in_free_space_is_left_out(solved) -> None:
     depth = solved.best.images[1].depth.depth.copy()
     depth[20:40, 30:50] = 1.0  # other images see right through
     walled = with_depth(solved, 1, depth)
-    points, *_ = fuse_depth_maps(walled, solved.views.__getitem__, ResultOptions())
+    points, *_ = fuse_depth_maps(walled, solved.views.__getitem__)
     image = solved.best.images[1]
     z = (points @ image.rotation.T + image.translation)[:, 2]
     assert ((z > 0.99) & (z < 1.01)).sum() < 0.1 * 400
@@ -131,16 +129,15 @@ def test_images_that_nothing_confirms_are_left_out(solved) -> None:
     guessed = replace(third, confirmed=False, translation=third.translation + 5.0)
     doubtful = replace(solved.best, images=(first, second, guessed))
     without = replace(solved.best, images=(first, second))
-    points, *_ = fuse_depth_maps(doubtful, solved.views.__getitem__, ResultOptions())
-    expected, *_ = fuse_depth_maps(without, solved.views.__getitem__, ResultOptions())
+    points, *_ = fuse_depth_maps(doubtful, solved.views.__getitem__)
+    expected, *_ = fuse_depth_maps(without, solved.views.__getitem__)
     np.testing.assert_array_equal(points, expected)
 
 
 @pytest.mark.parametrize("limit", [1, 500])
 def test_the_size_limit_holds_and_the_choice_is_repeatable(solved, limit: int) -> None:
-    options = ResultOptions(dense_max_points=limit)
-    points, colors, *_ = fuse_depth_maps(solved.best, solved.views.__getitem__, options, seed=3)
+    points, colors, *_ = fuse_depth_maps(solved.best, solved.views.__getitem__, limit, seed=3)
     assert len(points) == len(colors) <= limit
     assert len(points) > 0.8 * limit - 1
-    again, *_ = fuse_depth_maps(solved.best, solved.views.__getitem__, options, seed=3)
+    again, *_ = fuse_depth_maps(solved.best, solved.views.__getitem__, limit, seed=3)
     np.testing.assert_array_equal(points, again)

@@ -47,7 +47,7 @@ def photos_of(solved, folder: Path, camera: pycolmap.Camera, known: bool = True)
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), cv2.cvtColor(view.image, cv2.COLOR_RGB2BGR))
-        pinhole = undistort_camera(camera, 0.0)
+        pinhole = undistort_camera(camera)
         sources.append(SourceImage(name, path, camera, pinhole, source, "0"))
     return ImageSet(sources, InputOptions())
 
@@ -208,7 +208,7 @@ def test_views_show_what_the_mapper_was_given(solved, tmp_path: Path) -> None:
     given = solved.problem.images[3]  # not registered
     size = given.camera.size
     picture = cv2.imread(str(output / "views" / f"{given.name}.webp"))
-    assert picture.shape == (*undistort_camera(DISTORTED, 0.0).size[::-1], 3)
+    assert picture.shape == (*undistort_camera(DISTORTED).size[::-1], 3)
     with np.load(output / "views" / f"{given.name}.npz") as maps:
         assert maps["camera"].tolist() == [*size, *given.camera.params]
         np.testing.assert_array_equal(maps["depth"], given.depth.depth)

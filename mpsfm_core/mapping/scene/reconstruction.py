@@ -85,7 +85,7 @@ class MetricScale:
     num_images: int
     """Number of images that estimate the metric scale."""
     trusted: bool
-    """Whether the coordinates of the reconstruction are in meters."""
+    """True if the coordinates of the reconstruction are in meters."""
     by: str = "depth maps"
     """Source of the metric scale, for the report."""
 

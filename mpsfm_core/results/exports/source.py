@@ -141,7 +141,6 @@ class ExportSource:
         settings = self.summary.get("config", {}).get("inputs", {})
         options = InputOptions(
             max_image_size=settings.get("max_image_size"),
-            blank_pixels=settings.get("blank_pixels", 0.0),
             strict=True,
         )
         names = [files[name] for name in self.names]

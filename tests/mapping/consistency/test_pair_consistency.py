@@ -116,9 +116,9 @@ def test_globally_initialized_images_need_no_pair_check() -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(4, 10.0))
     result = reconstruct(problem)
     assert len(result.reconstructions[0].images) == 4
-    assert "pair check" not in result.report.counts
+    assert "pair consistency check" not in result.report.counts
     pair_alone = MapperOptions.model_validate(
         {"initialization": {"global_initialization": False}, "consistency": {"check_pairs": False}}
     )
     result = reconstruct(problem, pair_alone)
-    assert result.reconstructions and "pair check" not in result.report.counts
+    assert result.reconstructions and "pair consistency check" not in result.report.counts

@@ -162,7 +162,7 @@ def test_global_initialization_is_as_accurate_as_initial_pair(hall: HallProblem)
         poses = result.reconstructions[0].poses
         assert len(poses) == VIEWS
         errors[global_first] = np.median(pose_errors_deg(poses, hall.truth, CONVENTIONS["paper"]))
-        assert ("global start" in result.report.counts) == global_first
+        assert ("global initialization" in result.report.counts) == global_first
         assert ("local refinement" in result.report.counts) != global_first
     assert errors[True] < 1.1 * errors[False]
 

@@ -36,7 +36,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """``out`` with ``photos`` beside it; the last image is not confirmed. World as the room's."""
     folder = tmp_path_factory.mktemp("result")
     scene, poses = room_scene(), arc_poses(4, 12.0)
-    pinhole = undistort_camera(CAMERA, 0.0)
+    pinhole = undistort_camera(CAMERA)
     points = scene.sample(
         pinhole, poses[0], np.random.default_rng(0).uniform([50, 35], [110, 85], (60, 2))
     ).points
