@@ -26,7 +26,7 @@ import numpy as np
 import pycolmap
 
 from benchmarks._scenes import percent
-from mpsfm_core.api import reconstruct
+from mpsfm_core import reconstruct
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.data.errors import MpsfmError
 from mpsfm_core.evaluation.alignment import umeyama
