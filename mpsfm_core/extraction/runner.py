@@ -37,6 +37,7 @@ from mpsfm_core.extraction.matching.pair_matching import (
     assemble_matches,
     merge_matches,
 )
+from mpsfm_core.extraction.pairs.duplicates import find_duplicates
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.extraction.pairs.selection import PairSelection
 from mpsfm_core.extraction.priors.multiview import GroupPriors
@@ -195,7 +196,8 @@ def match_images(
         verified: Pairs that an earlier pass verified, which connect components.
     """
     located = [NO_FEATURES] * len(context.images) if source is None else source.extract()
-    selection = PairSelection(context, source, unconstrained)
+    duplicates = find_duplicates(located, [image.pinhole.size for image in context.images])
+    selection = PairSelection(context, source, unconstrained, duplicates)
     matcher, verifier = PairMatcher(context, source), PairVerifier(context, located)
     candidates = matcher.match(selection.choose() if pairs is None else pairs, located)
     geometries = verifier.verify(candidates)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -31,6 +31,8 @@ class PairSelection:
         table: Features of the images, or None without a feature provider.
         unconstrained: Images to match again after the fast first pass, of which each pair contains
             at least one; if None, all pairs are allowed.
+        duplicates: Original image by index of each image that shows the same view. A duplicate is
+            only matched with its original.
     """
 
     def __init__(
@@ -38,10 +40,12 @@ class PairSelection:
         context: ExtractionContext,
         table: FeatureSource | None,
         unconstrained: Collection[int] | None = None,
+        duplicates: Mapping[int, int] | None = None,
     ) -> None:
         self.proposed = 0
         """Number of selected image pairs before plugins filter the pairs."""
         self._unconstrained = unconstrained
+        self._duplicates = duplicates or {}
         self._context = context
         self._table = table
         self._similarity: Float64 | None = None
@@ -109,8 +113,11 @@ class PairSelection:
 
     def _select(self, chosen: Sequence[Pair]) -> list[Pair]:
         """Sort and record image pairs, and apply the pair filters of plugins."""
-        images = self._unconstrained
-        unique = sorted({(a, b) for a, b in chosen if images is None or a in images or b in images})
+        images, duplicates = self._unconstrained, self._duplicates
+        distinct = {(a, b) for a, b in chosen if a not in duplicates and b not in duplicates}
+        distinct |= {(original, image) for image, original in duplicates.items()}
+        distinct -= self._selected
+        unique = sorted((a, b) for a, b in distinct if images is None or a in images or b in images)
         self._selected.update(unique)
         self.proposed += len(unique)
         names = self._context.images.names

@@ -1,0 +1,70 @@
+"""Detection of images of the same view: copies, edited copies, brackets, a camera at rest.
+
+Images of the same view have most keypoints at the same pixels. An image that only shows the view of
+another image adds no parallax, so that matching it with all other images costs time for nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from mpsfm_core.data import Features, Float64
+
+MIN_SHARED_RATIO = 0.3
+"""Share of the keypoints at equal pixels, above chance, from which two images show the same view.
+Measured shares are 0.5 to 1 for edited copies, and below 0.1 for other images. [ours]"""
+MIN_KEYPOINTS = 50
+"""Minimum number of keypoints of images that are compared."""
+
+
+def find_duplicates(
+    features: Sequence[Features], sizes: Sequence[tuple[int, int]]
+) -> dict[int, int]:
+    """Find images that show the same view as an earlier image of the same size.
+
+    Args:
+        features: Features of the images, with keypoints in pixels.
+        sizes: (width, height) of the images in pixels.
+
+    Returns:
+        Index of the earlier image, by index of the duplicate. The earlier image is no duplicate.
+    """
+    shared = np.zeros((len(sizes), len(sizes)))
+    for size in set(sizes):
+        images = np.array([row for row, other in enumerate(sizes) if other == size])
+        shared[np.ix_(images, images)] = _measure_shared_ratios(
+            [features[image].keypoints for image in images], size
+        )
+    duplicates: dict[int, int] = {}
+    for image in range(len(sizes)):
+        for original in range(image):
+            if original not in duplicates and shared[original, image] >= MIN_SHARED_RATIO:
+                duplicates[image] = original
+                break
+    return duplicates
+
+
+def _measure_shared_ratios(keypoints: Sequence[Float64], size: tuple[int, int]) -> Float64:
+    """Return the share of equal pixels (n, n) among the keypoints of two images, above chance.
+
+    Keypoints are rounded to pixels. Random keypoints of the density of the second image have the
+    share 0.
+    """
+    width, height = size
+    rows, columns = [], []
+    for number, xy in enumerate(keypoints):
+        pixels = np.clip(np.floor(xy).astype(np.int64), 0, [width - 1, height - 1])
+        cells = np.unique(pixels[:, 1] * width + pixels[:, 0])
+        rows.append(np.full(len(cells), number))
+        columns.append(cells)
+    row, column = np.concatenate(rows), np.concatenate(columns)
+    occupied = csr_array((np.ones(len(row)), (row, column)), shape=(len(keypoints), width * height))
+    counts = np.bincount(row, minlength=len(keypoints)).astype(np.float64)
+    common = (occupied @ occupied.T).toarray()
+    ratio = common / np.maximum(np.minimum(counts[:, None], counts), MIN_KEYPOINTS)
+    chance = np.maximum(counts[:, None], counts) / (width * height)
+    shared: Float64 = (ratio - chance) / np.maximum(1 - chance, 1e-9)
+    return shared
