@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -37,7 +37,7 @@ from mpsfm_core.extraction.matching.pair_matching import (
     assemble_matches,
     merge_matches,
 )
-from mpsfm_core.extraction.pairs.duplicates import find_duplicates
+from mpsfm_core.extraction.pairs.duplicates import find_duplicates, restrict_matches
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.extraction.pairs.selection import PairSelection
 from mpsfm_core.extraction.priors.multiview import GroupPriors
@@ -208,6 +208,9 @@ def match_images(
         candidates += matcher.match(further_pairs, located)
         geometries += verifier.verify(candidates[len(geometries) :])
     assembled = adjust_assembled(context, assemble_matches(candidates, geometries, located))
+    min_inliers = context.config.verification.min_inliers
+    restricted = restrict_matches(assembled.pairs, duplicates, min_inliers)
+    assembled = replace(assembled, pairs=restricted)
     names = context.images.names
     features = {} if source is None else FeatureSet(names, source, context.config.features)
     proposed = selection.proposed if pairs is None else len(pairs)
@@ -217,7 +220,7 @@ def match_images(
         assembled,
         tuple(candidates),
         tuple(geometries),
-        context.config.verification.min_inliers,
+        min_inliers,
         proposed,
         matcher,
     )

@@ -6,12 +6,13 @@ another image adds no parallax, so that matching it with all other images costs 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from mpsfm_core.data import Features, Float64
+from mpsfm_core.data import Features, Float64, Int64, VerifiedPair
 
 MIN_SHARED_RATIO = 0.3
 """Share of the keypoints at equal pixels, above chance, from which two images show the same view.
@@ -45,6 +46,34 @@ def find_duplicates(
                 duplicates[image] = original
                 break
     return duplicates
+
+
+def restrict_matches(
+    pairs: Sequence[VerifiedPair], duplicates: Mapping[int, int], min_matches: int
+) -> tuple[VerifiedPair, ...]:
+    """Remove the matches of duplicates that no other image can triangulate.
+
+    A pair of an original and its duplicate has no parallax. Its matches are kept if another pair
+    also matches the keypoint of the original.
+
+    Args:
+        pairs: Verified pairs of all images.
+        duplicates: Original image by index of the duplicate.
+        min_matches: Number of matches below which a pair keeps all its matches.
+    """
+    matched: dict[int, list[Int64]] = {}
+    for pair in pairs:
+        if duplicates.get(pair.image_b) != pair.image_a:
+            matched.setdefault(pair.image_a, []).append(pair.matches[:, 0])
+            matched.setdefault(pair.image_b, []).append(pair.matches[:, 1])
+    restricted = []
+    for pair in pairs:
+        if duplicates.get(pair.image_b) == pair.image_a and pair.image_a in matched:
+            is_kept = np.isin(pair.matches[:, 0], np.concatenate(matched[pair.image_a]))
+            if is_kept.sum() >= min_matches:
+                pair = replace(pair, matches=pair.matches[is_kept], scores=pair.scores[is_kept])
+        restricted.append(pair)
+    return tuple(restricted)
 
 
 def _measure_shared_ratios(keypoints: Sequence[Float64], size: tuple[int, int]) -> Float64:
