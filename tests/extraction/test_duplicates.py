@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 import mpsfm_core as mpsfm
 from mpsfm_core.data import Features, Float64, VerifiedPair
@@ -66,6 +67,7 @@ def test_restrict_matches_keeps_keypoints_that_other_images_match() -> None:
     assert restrict_matches(pairs, {}, 2) == pairs
 
 
+@pytest.mark.slow
 def test_match_images_matches_a_brightened_copy_with_its_original_only() -> None:
     camera = mpsfm.PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
     views = [room_scene().render(camera, pose).rgb for pose in arc_poses(3, 10.0)]
