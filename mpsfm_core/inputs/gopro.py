@@ -13,7 +13,8 @@ from typing import BinaryIO
 
 from mpsfm_core.inputs.gps import GpsPosition
 
-_MAX_MOOV_BYTES = 256 << 20
+_MAX_BYTES = 256 << 20
+"""Maximum number of bytes of the description of the tracks and of a telemetry sample."""
 _MAX_DOP = 10.0
 """Dilution of precision above which GPS positions are ignored."""
 _MIN_FIX = 2
@@ -84,7 +85,7 @@ def _read_moov(file: BinaryIO) -> bytes | None:
             return None
         if kind == b"moov":
             file.seek(start + header)
-            return file.read(min(size - header, _MAX_MOOV_BYTES))
+            return file.read(min(size - header, _MAX_BYTES))
         start += size
     return None
 
@@ -104,7 +105,7 @@ def _telemetry_samples(file: BinaryIO) -> Iterator[tuple[float, float, bytes]]:
         samples = zip(_sample_places(dict(_boxes(table))), _durations(table), strict=False)
         for (offset, size), duration in samples:
             file.seek(offset)
-            yield ticks / timescale, duration / timescale, file.read(size)
+            yield ticks / timescale, duration / timescale, file.read(min(size, _MAX_BYTES))
             ticks += duration
 
 
