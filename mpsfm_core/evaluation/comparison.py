@@ -1,4 +1,4 @@
-"""Statistical comparison of two benchmarks by differences of pose AUC.
+"""Statistical comparison of two benchmark runs by differences of pose AUC.
 
 Two benchmarks are compared on their common test sets. Confidence intervals come from a paired
 bootstrap over test sets. P-values come from a randomization test that swaps the two benchmarks in

@@ -32,7 +32,7 @@ class EventLog:
         self._counts: dict[str, int] = defaultdict(int)
 
     def registered(self, image: int, count: int) -> None:
-        """Forward the registration of an image as the ``count``-th image of its component."""
+        """Tell the event receiver that the ``count``-th image of a component is registered."""
         images = self._problem.images
         self._events.image_registered(images[image].name, count, len(images))
 

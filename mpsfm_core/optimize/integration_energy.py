@@ -132,7 +132,7 @@ def build_normal_terms(
 
 
 def compute_mean_point_energy(z: Float64, points: PointTerms, scale: float) -> float:
-    """Compute the mean energy of sparse points for a map of log depth (h, w), or 0."""
+    """Compute the mean robust cost of log depth (h, w) at sparse points, or 0 without points."""
     offset = z[points.rows, points.columns] - points.log_depth
     energies = scale**2 * np.log1p(points.precision * offset**2 / scale**2)
     return float(energies.mean()) if len(energies) else 0.0

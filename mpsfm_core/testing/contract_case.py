@@ -138,7 +138,7 @@ class ContractCase:
         """Skip the check unless the ground truth comes from one of the given sources.
 
         Raises:
-            CheckSkipped: the provider derives the ground truth from another source or not at all.
+            CheckSkipped: the ground truth does not exist, or comes from another source.
         """
         if self.truth_source == "none":
             raise CheckSkipped(

@@ -13,8 +13,8 @@ occluded. A contradiction of depth maps has one of two causes.
   shifts the pixel laterally in the other image. The likelihood is the expectation over ``e``
   instead of the maximum, because some error nearly always shifts the pixel past a depth edge.
 
-* In the second case, the pose of an image is wrong. A wrong pose makes the surface in the other
-  image independent of the pixel.
+* In the second case, the pose of an image is wrong. A wrong pose makes the depth that the other
+  image has along the pixel's ray independent of the pixel's depth.
 
 A pixel is a violation if its likelihood ``L`` is below that of a depth error of ``max_deviation``
 standard deviations. The violation ratio (beta in the paper) is the share of violating pixels,

@@ -31,7 +31,8 @@ MIN_SUPPORT_RATIO = 1.2
 """Ratio of the supports with own and shared focal length from which an image gets its own camera.
 [tuned: benchmarks.verdicts]"""
 MIN_OTHER_IMAGES = 2
-"""Number of other images that must observe a point, which the image then did not triangulate."""
+"""Minimum number of other images that observe a point. The position of the point then does not
+depend on the tested image. [ours]"""
 
 
 def find_deviating_focals(

@@ -1,9 +1,9 @@
 """Measurement of the noise of depth priors from the agreement of image pairs.
 
 A depth prior declares a variance for each pixel. The depth of a matched keypoint is projected into
-the other image of the pair, and compared with the depth prior of that image. The differences show
-whether the declared variance is too large or too small, and how much errors of neighboring pixels
-correlate.
+the other image of the pair, and compared with the depth prior of that image. The
+differences between projected and prior depth show whether the declared variance is too large or too
+small, and how much errors of neighboring pixels correlate.
 
 Bundle adjustment treats observations as independent, so correlated observations need a larger
 variance.

@@ -51,7 +51,7 @@ MAX_FOCAL_CORRESPONDENCES = 200
 [ours]"""
 FOCAL_STEP = 1.2
 """Largest ratio of consecutive focal lengths to try. PnP tolerates focal length errors of half of
-this step. [ours]"""
+this ratio on a logarithmic scale. [ours]"""
 
 
 class PoseHypothesis(NamedTuple):

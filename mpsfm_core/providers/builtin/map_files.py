@@ -50,7 +50,8 @@ def find_file(options: FileOptions, view: View, what: str) -> Path:
         return path
     wanted = f"{bases[1]}{suffixes[0] if len(suffixes) == 1 else '{' + ','.join(suffixes) + '}'}"
     raise InputError(
-        f"{what} of image {view.name!r}: there is no file {wanted}; check the options of the files"
+        f"{what} of image {view.name!r}: there is no file {wanted}; check the options `directory` "
+        "and `suffix`"
     )
 
 

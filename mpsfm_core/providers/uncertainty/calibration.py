@@ -43,8 +43,8 @@ class DepthCalibration(Options):
     use_network_variance: bool = True
     """False ignores the depth variance that the network predicts."""
     shift: float = 0.0
-    """Offset added to depth or inverse depth, in multiples of its median over the depth map. The
-    offset is 0 for metric networks."""
+    """Offset of predicted depth or inverse depth, in multiples of its median over the depth map.
+    Metric networks predict depth with the offset 0."""
     shift_space: Literal["depth", "disparity"] = "depth"
     """Quantity to which the offset ``shift`` is added, either depth or, for networks that predict
     inverse depth up to scale and shift, disparity."""
