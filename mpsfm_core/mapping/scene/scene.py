@@ -223,9 +223,16 @@ class Scene:
         """Set the radial distortion of one image, and undistort its keypoints."""
         self.radial[image] = radial
         rows = self.graph.keypoints_of(image)
+        given = self.problem.images[image]
         focal_px, center = self.intrinsics[image, :2], self.intrinsics[image, 2:]
-        distorted = (self.distorted_keypoints[rows] - center) / focal_px
-        self.keypoints[rows] = center + focal_px * undistort_rays(distorted, radial)
+        # exact copies, because a resumed mapper starts from the keypoints of the problem
+        if radial == given.radial and (self.intrinsics[image] == given.camera.params).all():
+            self.keypoints[rows] = given.keypoints
+        elif radial == 0.0:
+            self.keypoints[rows] = self.distorted_keypoints[rows]
+        else:
+            distorted = (self.distorted_keypoints[rows] - center) / focal_px
+            self.keypoints[rows] = center + focal_px * undistort_rays(distorted, radial)
 
     def set_shared_radial(self, image: int, radial: float) -> None:
         """Set the radial distortion of all images that share the camera of an image."""

@@ -1,11 +1,15 @@
-"""Scene: rollback of focal lengths."""
+"""Scene: rollback of focal lengths and distortion, and state of a checkpoint."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import pytest
 
 from mpsfm_core.mapping.scene.calibration_outcome import CalibrationOutcome
 from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.mapping.state import flatten_state, unflatten_state
 from tests.mapping.focal_scenes import CAMERA, guess_focals, make_room
 
 
@@ -18,3 +22,25 @@ def test_restore_undoes_focal_lengths_and_outcomes() -> None:
     assert (scene.intrinsics[:, 0] == 1.1 * CAMERA.fx).all()
     assert not scene.focal_outcome.any()
     assert np.isnan(scene.focal_log_std).all() and np.isnan(scene.focal_estimate_px).all()
+
+
+@pytest.mark.parametrize("radial", [0.0, 0.05])
+@pytest.mark.parametrize("focal", [1.0, 1.2])
+def test_scene_restored_from_checkpoint_has_identical_keypoints(
+    radial: float, focal: float
+) -> None:
+    """The distortion of the first scene changed and was rolled back before the checkpoint."""
+    problem = guess_focals(make_room(), [1.1] * 5)
+    problem = replace(problem, images=tuple(replace(i, radial=radial) for i in problem.images))
+    scene, restored = Scene(problem), Scene(problem)
+    scene.set_shared_focal(0, focal * CAMERA.fx, focal * CAMERA.fy)
+    before = scene.snapshot()
+    scene.set_shared_radial(0, -0.1)
+    scene.set_shared_focal(0, 400.0, 400.0)
+    scene.restore(before)
+    restored.load_state_dict(unflatten_state(flatten_state(scene.state_dict())))
+    assert restored.keypoints.tobytes() == scene.keypoints.tobytes()
+    assert restored.intrinsics.tobytes() == scene.intrinsics.tobytes()
+    scene.set_shared_radial(0, 0.02)
+    restored.load_state_dict(unflatten_state(flatten_state(scene.state_dict())))
+    assert restored.keypoints.tobytes() == scene.keypoints.tobytes()
