@@ -15,7 +15,11 @@ from typing import NamedTuple
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.mapping.consistency.depth_agreement import measure_depth_agreement
 from mpsfm_core.mapping.options import ConsistencyOptions
-from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
+from mpsfm_core.mapping.scene.reconstruction import (
+    MappingReport,
+    Reconstruction,
+    find_explained_matches,
+)
 from mpsfm_core.mapping.state import StateDict
 
 MAX_RATIO_DIFFERENCE = 0.01
@@ -113,15 +117,8 @@ def compute_explained_ratios(
 
 def compute_explained_score(model: Reconstruction, problem: MappingProblem) -> float:
     """Sum the scores of the matches whose keypoints observe the same 3D point of a model."""
-    point_ids = {image.index: image.point_ids for image in model.images}
-    total = 0.0
-    for pair in problem.pairs:
-        if pair.image_a in point_ids and pair.image_b in point_ids:
-            points_a = point_ids[pair.image_a][pair.matches[:, 0]]
-            points_b = point_ids[pair.image_b][pair.matches[:, 1]]
-            is_explained = (points_a >= 0) & (points_a == points_b)
-            total += float(pair.scores[is_explained].sum(dtype=float))
-    return total
+    explained_matches = find_explained_matches(model.images, problem)
+    return sum(float(pair.scores[mask].sum(dtype=float)) for pair, mask in explained_matches)
 
 
 def compute_total_score(problem: MappingProblem) -> float:

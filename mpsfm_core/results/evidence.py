@@ -13,7 +13,11 @@ from scipy.sparse.csgraph import connected_components
 
 from mpsfm_core.data import Float64, Int64, MappingProblem
 from mpsfm_core.geometry import camera_center
-from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.mapping.scene.reconstruction import (
+    Reconstruction,
+    RegisteredImage,
+    find_explained_matches,
+)
 
 MIN_SHARED_POINTS = 3
 """Minimum number of common 3D points of connected images [minimal sample of PnP]."""
@@ -31,15 +35,11 @@ def count_explained_matches(
     Returns:
         Number of explained matches by pair of image names.
     """
-    point_ids = {image.index: image.point_ids for image in reconstruction.confirmed_images}
-    counts = {}
-    for pair in problem.pairs:
-        if pair.image_a in point_ids and pair.image_b in point_ids:
-            rows_a = point_ids[pair.image_a][pair.matches[:, 0]]
-            rows_b = point_ids[pair.image_b][pair.matches[:, 1]]
-            names = problem.images[pair.image_a].name, problem.images[pair.image_b].name
-            counts[names] = int(((rows_a >= 0) & (rows_a == rows_b)).sum())
-    return counts
+    images = problem.images
+    return {
+        (images[pair.image_a].name, images[pair.image_b].name): int(mask.sum())
+        for pair, mask in find_explained_matches(reconstruction.confirmed_images, problem)
+    }
 
 
 def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -> dict[str, Any]:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from mpsfm_core.data import DepthPrior, Float64, Int64, PinholeCamera, Pose
+from mpsfm_core.data import (
+    Bool,
+    DepthPrior,
+    Float64,
+    Int64,
+    MappingProblem,
+    PinholeCamera,
+    Pose,
+    VerifiedPair,
+)
 from mpsfm_core.data.decisions import CameraReason, Reason, reason_from_json
 from mpsfm_core.mapping.state import StateDict, reasons_from_json, reasons_to_json
 
@@ -167,6 +176,28 @@ class MappingResult:
     """Disconnected components, the largest first, or an empty tuple if no initialization
     succeeded."""
     report: MappingReport
+
+
+def find_explained_matches(
+    images: Sequence[RegisteredImage], problem: MappingProblem
+) -> Iterator[tuple[VerifiedPair, Bool]]:
+    """Yield each pair of registered images with a mask of its explained matches.
+
+    A match is explained if both keypoints observe the same 3D point.
+
+    Args:
+        images: Registered images of a reconstruction of the problem.
+        problem: Mapping problem with images and verified pairs.
+
+    Yields:
+        The pair, and a (m,) bool mask of its matches.
+    """
+    point_ids = {image.index: image.point_ids for image in images}
+    for pair in problem.pairs:
+        if pair.image_a in point_ids and pair.image_b in point_ids:
+            points_a = point_ids[pair.image_a][pair.matches[:, 0]]
+            points_b = point_ids[pair.image_b][pair.matches[:, 1]]
+            yield pair, (points_a >= 0) & (points_a == points_b)
 
 
 def transform_reconstruction(
