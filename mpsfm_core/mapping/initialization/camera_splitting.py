@@ -29,7 +29,10 @@ MIN_FOCAL_RATIO = 1.05
 """Ratio of own and shared focal length from which an image gets its own camera. [ours]"""
 MIN_SUPPORT_RATIO = 1.2
 """Ratio of the supports with own and shared focal length from which an image gets its own camera.
-[tuned: benchmarks.verdicts]"""
+[ours]"""
+MAX_ERROR_PX = 4.0
+"""Largest reprojection error of a supporting match, in standard deviations of the keypoint position.
+A wrong focal length only causes errors of a few pixels. [COLMAP filter_max_reproj_error]"""
 MIN_OTHER_IMAGES = 2
 """Minimum number of other images that observe a point. The position of the point then does not
 depend on the tested image. [ours]"""
@@ -66,7 +69,7 @@ def find_deviating_focals(
         xy, xyz = image.keypoints[keypoints[::step]], model.points[points[::step]]
         radial = radials.get(image.shared_camera, image.radial)
         xy = change_distortion(xy, (image.camera, image.radial), (camera, radial))
-        max_error_px = options.max_error_px
+        max_error_px = MAX_ERROR_PX * image.keypoint_std_px
         shared = estimate_absolute_pose(camera, xy, xyz, options, seed)
         support = _measure_support(camera, shared[:2], xy, xyz, max_error_px) if shared else 0.0
         if MIN_SUPPORT_RATIO * support >= len(xy):  # no pose has more support than matches
