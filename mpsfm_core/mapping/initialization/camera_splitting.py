@@ -31,8 +31,9 @@ MIN_SUPPORT_RATIO = 1.2
 """Ratio of the supports with own and shared focal length from which an image gets its own camera.
 [ours]"""
 MAX_ERROR_PX = 4.0
-"""Largest reprojection error of a supporting match, in standard deviations of the keypoint position.
-A wrong focal length only causes errors of a few pixels. [COLMAP filter_max_reproj_error]"""
+"""Largest reprojection error of a supporting match, in standard deviations of the keypoint
+position. A wrong focal length only causes errors of a few pixels. [COLMAP
+filter_max_reproj_error]"""
 MIN_OTHER_IMAGES = 2
 """Minimum number of other images that observe a point. The position of the point then does not
 depend on the tested image. [ours]"""
