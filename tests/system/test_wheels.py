@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 import shutil
@@ -63,6 +64,25 @@ def install(wheels: dict[str, Path], folder: Path) -> Path:
     return scripts
 
 
+def check_metadata(wheels: dict[str, Path], folder: Path) -> None:
+    """Check the wheels with twine and check-wheel-contents, if they are installed."""
+    if importlib.util.find_spec("twine") is not None:
+        run(sys.executable, "-m", "twine", "check", "--strict", *wheels.values(), folder=folder)
+    if importlib.util.find_spec("check_wheel_contents") is not None:
+        for name, wheel in wheels.items():
+            source = ROOT if name == "mpsfm-core" else ROOT / "plugins" / name
+            config = (ROOT / "meta" if name == "mpsfm" else source) / "pyproject.toml"
+            run(
+                sys.executable,
+                "-m",
+                "check_wheel_contents",
+                "--config",
+                config,
+                wheel,
+                folder=folder,
+            )
+
+
 @pytest.mark.slow
 def test_wheels_of_all_packages_run_the_demo(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -76,11 +96,19 @@ def test_wheels_of_all_packages_run_the_demo(
         files = [path for path in package.rglob("*") if path.is_file()]
         names = {path.relative_to(folder).as_posix() for path in files}
         assert {name for name in names if "__pycache__" not in name} <= packed, folder.name
+        assert f"{package.name}/py.typed" in packed, folder.name
+    for name, wheel in wheels.items():
+        packed = set(zipfile.ZipFile(wheel).namelist())
+        assert any(entry.endswith(".dist-info/licenses/LICENSE") for entry in packed), name
     core = zipfile.ZipFile(wheels["mpsfm-core"]).namelist()
+    assert "mpsfm_core/py.typed" in core
+    check_metadata(wheels, tmp_path)
     assert [name for name in core if "make_scene" in name] == []
 
     scripts = install(wheels, tmp_path / "environment")
     code = "import mpsfm_core; print(mpsfm_core.__file__)"
+    resolve = (*PIP, "--python", scripts / "python", "install", "--no-index", "--find-links")
+    run(*resolve, wheels["mpsfm"].parent, "mpsfm[torch]", folder=tmp_path)
     file = run(scripts / "python", "-c", code, folder=tmp_path).strip()
     assert file.startswith(str(tmp_path / "environment"))
     listed = json.loads(run(scripts / "mpsfm", "plugins", "list", "--json", folder=tmp_path))
