@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -61,11 +62,15 @@ def check(
         typer.Option("--only", metavar="CHECK", help="Run only this check; may be repeated."),
     ] = None,
     device: Annotated[str, typer.Option(help="Run on cpu or cuda.")] = "cpu",
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Fail also if a check could not measure the provider.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """Check that providers pass the contract tests; exit code 1 if a provider fails."""
     if _CHECKING not in os.environ:
         arguments = [name, "--device", device, *(["--json"] if as_json else [])]
+        arguments += ["--strict"] if strict else []
         arguments += [part for value in options or () for part in ("--set", value)]
         arguments += [part for value in only or () for part in ("--only", value)]
         raise typer.Exit(_check_in_subprocess(name, arguments))
@@ -102,9 +107,9 @@ def check(
     if as_json:
         typer.echo(json.dumps([asdict(result) for result in results], indent=2))
     else:
-        counts = Counter(result.status for result in results)
-        typer.echo(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
-    if any(result.status == "fail" for result in results):
+        _print_summary(results)
+    failing = ("fail", "unmeasured") if strict else ("fail",)
+    if any(result.status in failing for result in results):
         raise typer.Exit(1)
 
 
@@ -157,6 +162,16 @@ def _print_result(result: CheckResult) -> None:
     around = f" around {result.around}" if result.around else ""
     line = f"{result.status:5} {result.provider}{around}: {result.id}, {result.seconds:.2f} s"
     typer.echo(f"{line}: {result.message}" if result.message else line)
+
+
+def _print_summary(results: Sequence[CheckResult]) -> None:
+    """Print how many checks had each outcome, and why checks were skipped or not measured."""
+    for status in ("skip", "unmeasured"):
+        reasons = Counter(result.message for result in results if result.status == status)
+        for reason, count in reasons.most_common():
+            typer.echo(f"{count} {status}: {reason}")
+    counts = Counter(result.status for result in results)
+    typer.echo(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
 
 
 def _print_table(status: tuple[ProviderStatus, ...]) -> None:

@@ -237,6 +237,11 @@ class Registry:
     def spec(self, kind: Kind, name: str) -> ProviderSpec:
         """Return the specification of an available provider.
 
+        Args:
+            kind: Kind of the provider, such as ``depth``.
+            name: Name of the provider, or ``DISTRIBUTION:NAME`` if several pip packages contain
+                providers of the same name.
+
         Raises:
             ProviderError: No provider has that kind and name, or the provider is unavailable. The
                 error message has the reason, the most similar provider name, or the package to
@@ -357,7 +362,10 @@ class Registry:
         for chosen, block in (*wrappers, (kind, config)):
             options = self.validate_options(chosen, block.use, block.options)
             answers = self.call_hook(
-                "mpsfm_calibration", kind=chosen, provider=block.use, options=options
+                "mpsfm_calibration",
+                kind=chosen,
+                provider=self.spec(chosen, block.use).name,
+                options=options,
             )
             for answer in (*answers, self.spec(chosen, block.use).calibration):
                 if isinstance(answer, model):
@@ -469,12 +477,19 @@ class Registry:
             self._plugins.append(replace(status, summary="hooks only"))
 
     def _entry(self, kind: Kind, name: str) -> _Entry:
-        matching = [e for e in self._entries if (e.spec.kind, e.spec.name) == (kind, name)]
-        for entry in matching:
-            if not self._fault(entry)[0]:
+        distribution, _, plain = str(name).rpartition(":")
+        matching = [
+            e
+            for e in self._entries
+            if (e.spec.kind, str(e.spec.name)) == (kind, plain)
+            and (not distribution or e.distribution == distribution)
+        ]
+        faults = [(e.fault, e.hint) if distribution else self._fault(e) for e in matching]
+        for entry, (fault, _) in zip(matching, faults, strict=True):
+            if not fault:
                 return entry
         if matching:
-            raise ProviderError(_sentence(matching[0].label, *self._fault(matching[0])))
+            raise ProviderError(_sentence(matching[0].label, *faults[0]))
         raise ProviderError(self._unknown(kind, name))
 
     def _fault(self, entry: _Entry) -> tuple[str, str]:
@@ -484,16 +499,25 @@ class Registry:
         same_name = [e for e in self._entries if _key(e) == _key(entry) and not e.fault]
         distributions = list(dict.fromkeys(e.distribution for e in same_name))
         if len(distributions) > 1 and CORE not in distributions:
-            return f"is brought by {' and '.join(distributions)}", "uninstall all but one of them"
+            names = " or ".join(f"'{d}:{entry.spec.name}'" for d in distributions)
+            return (
+                f"is brought by {' and '.join(distributions)}",
+                f"choose {names} in the 'use' key",
+            )
         if entry is not same_name[0]:
             owner = f"{same_name[0].distribution} {same_name[0].version}"
-            return f"has a name that belongs to {owner}", f"tell the author of {entry.distribution}"
+            hint = f"choose '{entry.distribution}:{entry.spec.name}' in the 'use' key"
+            return f"has a name that belongs to {owner}", hint
         return "", ""
 
     def _unknown(self, kind: Kind, name: str) -> str:
         if requirement := requirement_for(kind, name):
             return f"{kind} provider {name!r} comes with a plugin: pip install '{requirement}'"
         known = self.names(kind)
+        if ":" in name:
+            known = [
+                f"{e.distribution}:{e.spec.name}" for e in self._entries if e.spec.kind == kind
+            ]
         base, _, environment = name.partition("@")
         if environment and not any(n.endswith(f"@{environment}") for n in known):
             return (

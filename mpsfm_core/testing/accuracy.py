@@ -6,16 +6,18 @@ several times smaller than the error of the mistakes to detect.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from mpsfm_core.data import DenseMatches, Features, Float64, PairMatches
+from mpsfm_core.data import Bool, DenseMatches, Features, Float64, PairMatches
 from mpsfm_core.testing import map_errors
+from mpsfm_core.testing.checks.maps import require_depth_std, require_normals_std
 from mpsfm_core.testing.contract_case import ContractCase, first_depth
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.map_errors import MapShift
-from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUndecided
 
 DEPTH_TOLERANCE = 0.05
 """Tolerance for the 80 % quantile of the relative depth error. Correct providers have a relative
@@ -28,6 +30,11 @@ depth by 1 degree."""
 MASK_TOLERANCE = 0.05
 """Largest accepted ratio of wrong mask pixels, among pixels at least two pixels away from the
 border of a surface."""
+_MASK_SHIFT_PX = 6
+"""Largest shift of a mask in pixels that is measured."""
+_MASK_GAIN = 0.7
+"""Ratio of wrong pixels after and before shifting the true mask, below which a mask is shifted."""
+_MIN_HOLE_PIXELS = 100
 MATCH_TOLERANCE_STD = 3.0
 """Largest accepted median distance of matches from their true positions, in multiples of the
 keypoint std ``std_px`` or of one pixel, whichever is larger."""
@@ -63,11 +70,15 @@ def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str
         quantile = map_errors.error_quantile(errors)
         error = _require_at_most("relative error", quantile, DEPTH_TOLERANCE)
         shift = map_errors.estimate_depth_shift(answer, example)
+        if case.spec.kind != "wrapper" and case.truth_source in ("painted", "prepared"):
+            require_depth_std(answer, example)
         return f"{error}, {_describe_shift(case, example, shift, answer)}"
     if case.kind == "normals":
         quantile = map_errors.error_quantile(map_errors.angle_errors_deg(answer, example))
         error = _require_at_most("angle in degrees", quantile, NORMALS_TOLERANCE_DEG)
         shift = map_errors.estimate_normals_shift(answer, example)
+        if case.spec.kind != "wrapper" and case.truth_source in ("painted", "prepared"):
+            require_normals_std(answer, example)
         return f"{error}, {_describe_shift(case, example, shift, answer)}"
     if case.kind == "mask":
         truth = example.truth()
@@ -75,6 +86,7 @@ def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str
         wrong_ratio = float(wrong.mean()) if wrong.size else 0.0
         if wrong_ratio > MASK_TOLERANCE:
             raise CheckFailed(f"in the mask {wrong_ratio:.0%} of the pixels have the wrong value")
+        _require_mask_not_shifted(answer, example)
         return f"{wrong_ratio:.1%} of the pixels have the wrong value"
     return _compare_matches(case, example, answer)
 
@@ -117,10 +129,15 @@ def require_small_shift(
 
 def match_points(case: ContractCase, a: Example, b: Example, answer: PairMatches) -> DenseMatches:
     """Return matches as pixel coordinates: dense matches, or the keypoints of sparse matches."""
+    features = None if answer.dense is not None else case.extract_features(a.view, b.view)
+    return point_matches(answer, features)
+
+
+def point_matches(answer: PairMatches, features: tuple[Features, Features] | None) -> DenseMatches:
+    """Return matches as pixel coordinates: dense matches, or the keypoints of sparse matches."""
     if answer.dense is not None:
         return answer.dense
-    assert answer.sparse is not None
-    features: tuple[Features, Features] = case.extract_features(a.view, b.view)
+    assert answer.sparse is not None and features is not None
     rows = answer.sparse.indices
     return DenseMatches(
         features[0].keypoints[rows[:, 0]],
@@ -145,10 +162,39 @@ def _compare_matches(case: ContractCase, example: Example, answer: PairMatches) 
     partner = example.partner
     matches = match_points(case, example, partner, answer)
     if len(matches) < MIN_MATCHES:
-        return f"only {len(matches)} matches, too few to compare with the truth"
+        raise CheckUndecided(f"only {len(matches)} matches, too few to compare with the truth")
     limit = MATCH_TOLERANCE_STD * max(1.0, matches.std_px)
     median = float(np.median(match_errors_px(example, partner, matches)))
     return _require_at_most("median distance in pixels", median, limit)
+
+
+def _require_mask_not_shifted(mask: Bool, example: Example) -> None:
+    """Require that no shifted copy of the true mask fits the mask much better at the holes.
+
+    A mask that excludes a margin around each hole fits the true mask best, and a mask of a coarse
+    network fits the true and the shifted masks about equally well.
+    """
+    truth = example.truth().valid
+    hole = replace(example, holes=False).truth().valid & ~truth
+    num_pixels = int(hole.sum())
+    steps = range(-_MASK_SHIFT_PX, _MASK_SHIFT_PX + 1)
+    if num_pixels < _MIN_HOLE_PIXELS:
+        return
+    near = np.zeros_like(hole)
+    for y in steps:
+        for x in steps:
+            near |= np.roll(hole, (y, x), axis=(0, 1))
+    # The sky next to a hole would move with a shifted copy of the mask.
+    near &= replace(example, holes=False).truth().edge_free
+    wrong = {
+        (x, y): int((mask != np.roll(truth, (y, x), axis=(0, 1)))[near].sum())
+        for x in steps
+        for y in steps
+    }
+    x, y = min(wrong, key=lambda step: (wrong[step], abs(step[0]) + abs(step[1])))
+    gain = wrong[0, 0] - wrong[x, y]
+    if wrong[x, y] < _MASK_GAIN * wrong[0, 0] and gain > np.sqrt(num_pixels):
+        raise CheckFailed(f"the mask is shifted by ({x:+d}, {y:+d}) px")
 
 
 def _describe_shift(case: ContractCase, example: Example, shift: MapShift, answer: Any) -> str:

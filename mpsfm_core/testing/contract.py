@@ -30,13 +30,13 @@ from mpsfm_core.testing.checks.common import (
     check_specification,
 )
 from mpsfm_core.testing.contract_case import ContractCase, ContractSetup, load_setup
-from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUnmeasured
 
 Check = Callable[[ContractCase], str | None]
 """Type of a contract check, a function that returns nothing or a remark if the provider passes.
 A check that fails or does not apply raises ``CheckFailed`` or ``CheckSkipped``."""
 
-Status = Literal["pass", "fail", "skip", "xfail"]
+Status = Literal["pass", "fail", "skip", "unmeasured", "xfail"]
 SetupSource = ContractSetup | Callable[[Path], ContractSetup] | None
 
 CHECKS_BY_KIND: Mapping[Kind, tuple[Check, ...]] = MappingProxyType(
@@ -68,8 +68,9 @@ class CheckResult:
     id: str
     """Id of the check, such as ``depth-is-z``."""
     status: Status
-    """Outcome of the contract check, where ``xfail`` is a failure that the plugin declares as
-    expected."""
+    """Outcome of the contract check. A check is skipped (``skip``) if it does not apply, and
+    ``unmeasured`` if it applies but the ground truth is unknown. A failure that the plugin declares
+    as expected is ``xfail``."""
     message: str
     """Reason why the check failed or was skipped, or the remark of a check that passed."""
     seconds: float
@@ -107,7 +108,7 @@ class Contract:
         Args:
             registry: Registry of the installed providers.
             kind: Kind of the provider, such as ``depth``.
-            name: Name of the provider under test.
+            name: Name of the provider under test, or ``DISTRIBUTION:NAME``.
             folder: Folder for the weights files of test networks.
             setup: ContractSetup, or a function that returns one; by default that of the
                 specification.
@@ -117,6 +118,7 @@ class Contract:
             ProviderError: the provider does not exist or is unavailable.
         """
         self.spec = registry.spec(kind, name)
+        self._name = name
         self._registry = registry
         self._folder = folder
         self._setup = setup
@@ -159,7 +161,8 @@ class Contract:
         try:
             return "pass", check(case) or ""
         except CheckSkipped as skipped:
-            return "skip", str(skipped)
+            is_unmeasured = isinstance(skipped, CheckUnmeasured)
+            return ("unmeasured" if is_unmeasured else "skip"), str(skipped)
         except (CheckFailed, MpsfmError) as failed:
             return "fail", str(failed)
         # A provider that the check calls directly raised the exception.
@@ -190,6 +193,7 @@ class Contract:
                 self.spec,
                 setup,
                 self._folder,
+                name=self._name,
                 behaves_as=behaves_as,
                 device=self._device,
             )
@@ -240,11 +244,13 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
 
     Args:
         registry: Registry to search.
-        name: Name of a provider (``onnx``), kind and name (``depth/onnx``), or distribution
-            (``mpsfm-onnx``, which denotes all of its providers).
+        name: Name of a provider (``onnx``), kind and name (``depth/onnx``), distribution and name
+            (``mpsfm-onnx:onnx``), or distribution (``mpsfm-onnx``, which denotes all of its
+            providers).
 
     Returns:
-        Kind and name of each provider that the name denotes.
+        Kind and name of each provider that the name denotes. The name has the form
+        ``DISTRIBUTION:NAME`` if another distribution has a provider of the same name.
 
     Raises:
         InputError: the name denotes no provider, plugin or distribution.
@@ -253,9 +259,15 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
     """
     lines = [line for line in registry.status() if line.kind != "plugin"]
     matching = [
-        (line.kind, line.name)
+        line
         for line in lines
-        if name in (line.name, f"{line.kind}/{line.name}", line.distribution)
+        if name
+        in (
+            line.name,
+            f"{line.kind}/{line.name}",
+            line.distribution,
+            f"{line.distribution}:{line.name}",
+        )
     ]
     if not matching:
         plugin = find_plugin(registry, name)
@@ -265,12 +277,18 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
             raise ProviderError(f"{name} {plugin.reason}; {plugin.install_hint}")
         candidates = {n for line in registry.status() for n in (line.name, line.distribution)}
         raise InputError(f"no provider or plugin {name!r}{did_you_mean(name, candidates)}")
-    for line in lines:
-        # A look-up by kind and name alone would return the provider of another distribution.
-        if line.distribution == name and not line.available:
-            hint = f"; {line.install_hint}" if line.install_hint else ""
-            raise ProviderError(f"{line.kind} provider {line.name!r} of {name} {line.reason}{hint}")
-    return [(kind, name) for kind, name in matching if kind != "plugin"]
+    providers: list[tuple[Kind, str]] = []
+    for line in matching:
+        assert line.kind != "plugin"
+        is_named = line.name in (name, name.rpartition("/")[2])
+        if line.available or is_named:
+            providers.append((line.kind, line.name))
+        else:
+            # Raises ProviderError with the reason unless only the name clashes.
+            qualified = f"{line.distribution}:{line.name}"
+            registry.spec(line.kind, qualified)
+            providers.append((line.kind, qualified))
+    return list(dict.fromkeys(providers))
 
 
 def find_plugin(registry: Registry, name: str) -> ProviderStatus | None:

@@ -20,8 +20,13 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.testing.examples import Appearance, Example, indoor_example, outdoor_example
-from mpsfm_core.testing.ground_truth_provider import GROUND_TRUTH_SPECS, GroundTruth
-from mpsfm_core.testing.outcome import CheckSkipped
+from mpsfm_core.testing.ground_truth_provider import (
+    GROUND_TRUTH_SPECS,
+    GroundTruth,
+    GroundTruthOptions,
+)
+from mpsfm_core.testing.outcome import CheckSkipped, CheckUnmeasured
+from mpsfm_core.testing.process_state import read_process_settings
 
 TruthSource = Literal["painted", "prepared", "image", "none"]
 """Source from which a provider under test can derive the ground truth, see
@@ -95,6 +100,7 @@ class ContractCase:
         setup: ContractSetup,
         folder: Path,
         *,
+        name: str | None = None,
         behaves_as: Kind | None = None,
         device: str = "cpu",
     ) -> None:
@@ -105,6 +111,7 @@ class ContractCase:
             spec: Specification of the provider.
             setup: ContractSetup of the provider under test.
             folder: Folder for the files of helper providers, such as a detector for a matcher.
+            name: Name of the provider in the registry, by default that of the specification.
             behaves_as: Kind of the provider inside a wrapper, or None if the provider under test is
                 not a wrapper.
             device: ``"cpu"`` or ``"cuda"``.
@@ -113,6 +120,8 @@ class ContractCase:
         self.spec = spec
         self.kind: Kind = behaves_as or spec.kind
         self.setup = setup
+        self.name = name or spec.name
+        """Name of the provider in the registry, which may be ``DISTRIBUTION:NAME``."""
         self._folder = folder
         self._device = device
         self._ground_truth = GroundTruth() if spec.kind == "wrapper" else None
@@ -121,6 +130,8 @@ class ContractCase:
         self._detector: Any = None
         self._features: WeakKeyDictionary[View, Features] = WeakKeyDictionary()
         self._example: Example | None = None
+        self.process_before = read_process_settings()
+        """Settings of this process before the first instance of the provider was created."""
 
     @property
     def truth_source(self) -> TruthSource:
@@ -138,10 +149,11 @@ class ContractCase:
         """Skip the check unless the ground truth comes from one of the given sources.
 
         Raises:
-            CheckSkipped: the ground truth does not exist, or comes from another source.
+            CheckSkipped: the ground truth comes from another source.
+            CheckUnmeasured: the ground truth is unknown.
         """
         if self.truth_source == "none":
-            raise CheckSkipped(
+            raise CheckUnmeasured(
                 "the ground truth is unknown: declare a truth_source in the ContractSetup "
                 "(docs/contract.md)"
             )
@@ -155,7 +167,13 @@ class ContractCase:
             is_painted = self.truth_source == "painted" or self._ground_truth is not None
             appearance: Appearance = "painted" if is_painted else "textured"
             outdoor = self.kind in ("depth", "normals", "multiview", "mask")
-            self._example = outdoor_example(appearance) if outdoor else indoor_example(appearance)
+            # The holes of a mask are visible in painted views only.
+            has_holes = outdoor and (self.kind != "mask" or self.truth_source != "image")
+            self._example = (
+                outdoor_example(appearance, holes=has_holes)
+                if outdoor
+                else indoor_example(appearance)
+            )
         return self._example
 
     def create_provider(self, **inner_options: Any) -> Any:
@@ -166,7 +184,7 @@ class ContractCase:
                 :class:`~mpsfm_core.testing.ground_truth_provider.GroundTruthOptions`.
         """
         if self._ground_truth is None:
-            return self._create(self.registry, self.kind, self.spec.name, self.setup.options)
+            return self._create(self.registry, self.kind, self.name, self.setup.options)
         registry = Registry()
         inner = GROUND_TRUTH_SPECS[self.kind]
         registry.add(self.spec, replace(inner, factory=self._ground_truth.factory(self.kind)))
@@ -261,12 +279,33 @@ class ContractCase:
         """Return the depth priors that a wrapper passed to its normals provider, one per call."""
         return [] if self._ground_truth is None else self._ground_truth.received_depth
 
+    def run_inner(self, view: View) -> Any:
+        """Return the output of the provider inside a wrapper."""
+        assert self._ground_truth is not None
+        make = self._ground_truth.factory(self.kind)
+        provider: Any = make(GroundTruthOptions(), ProviderContext(WeightStore().resolve))
+        return provider.predict(view)
+
+    def to_pickle(self) -> tuple[Any, ...]:
+        """Return what :func:`restore_case` needs in another process.
+
+        The files that the function ``prepare`` of the ContractSetup wrote exist there as well.
+        """
+        spec = replace(self.spec, contract=None, weights=())
+        source = "none" if self.truth_source == "prepared" else self.truth_source
+        setup = ContractSetup(self.setup.options, source)
+        return spec, setup, self._folder, self.kind, self._device
+
+    def wrong_inputs(self) -> list[str]:
+        """Return what was wrong in the views and depth that a wrapper passed to its provider."""
+        return [] if self._ground_truth is None else self._ground_truth.wrong_inputs
+
     def calibration(self) -> Any:
         """Return the uncertainty model that a run would apply to the provider's output."""
         options = dict(self.setup.options)
         if self._ground_truth is None:
             return self.registry.calibration(
-                self.kind, ProviderConfig(use=self.spec.name, options=options)
+                self.kind, ProviderConfig(use=self.name, options=options)
             )
         wrapper = ProviderConfig(use=self.spec.name, options=options)
         registry = Registry()
@@ -297,7 +336,7 @@ class ContractCase:
     def _choose_detector(self) -> ProviderSpec:
         """Choose a detector of the matcher's family and plugin, or SIFT without a family."""
         family = set(self.spec.tags)
-        plugin = self.registry.version(self.spec.kind, self.spec.name)
+        plugin = self.registry.version(self.spec.kind, self.name)
 
         def is_second_choice(name: str) -> bool:
             version = self.registry.version("features", name)
@@ -320,6 +359,16 @@ class ContractCase:
     ) -> Any:
         context = ProviderContext(WeightStore().resolve, device=self._device)
         return registry.create(kind, name, options, context, wrap)
+
+
+def restore_case(
+    spec: ProviderSpec, setup: ContractSetup, folder: Path, kind: Kind, device: str
+) -> ContractCase:
+    """Create a contract case from the values of :meth:`ContractCase.to_pickle`."""
+    registry = Registry()
+    registry.add(spec)
+    behaves_as = kind if spec.kind == "wrapper" else None
+    return ContractCase(registry, spec, setup, folder, behaves_as=behaves_as, device=device)
 
 
 def load_setup(spec: ProviderSpec, folder: Path) -> ContractSetup:

@@ -28,8 +28,15 @@ Appearance = Literal["painted", "textured"]
 :mod:`mpsfm_core.testing.painted_views`) or show a random texture with corners to match
 (``textured``)."""
 
+FOCAL_RATIO = 0.75
+"""Ratio of the mean of ``fx`` and ``fy`` to the image width of the outdoor views. A small test
+network that estimates the focal length returns this ratio times the longer side."""
+_FY_RATIO = 0.75
+"""Ratio ``fy / fx``, far from 1 so that a mix-up of both is measurable."""
 _SKY = ((120, 170, 235), (200, 220, 245))
 """RGB of the sky at the upper and lower border of a textured synthetic view."""
+_HOLES = ((-0.42, -0.05, -0.28, 0.12), (0.33, 0.21, 0.52, 0.34), (-0.1, 0.38, 0.04, 0.47))
+"""Rectangles (left, top, right, bottom) without ground truth, as slopes x / z and y / z."""
 _COS_MAX_CREASE = np.cos(np.deg2rad(20.0))
 """Smallest cosine between neighboring normals on a smooth surface, that of 20 degrees."""
 
@@ -65,6 +72,9 @@ class Example:
     """Colors of the view, painted or textured."""
     mirrored: bool = False
     """True if left and right are swapped in the image and in the ground truth."""
+    holes: bool = False
+    """True if the ground truth has no value in some rectangles on the surfaces, like the depth of
+    glass and mirrors."""
 
     @cached_property
     def view(self) -> View:
@@ -93,12 +103,13 @@ class Example:
         offset = (-offset_px[0] if self.mirrored else offset_px[0], offset_px[1])
         xy = pixel_centers(columns, rows) * scale + offset
         seen = self.scene.sample(self._unmirrored_camera, self.pose, xy)
-        valid = seen.valid.reshape(rows, columns)
+        valid = seen.valid.reshape(rows, columns) & ~self._is_hole(xy).reshape(rows, columns)
         surface = np.where(valid, seen.surface.reshape(rows, columns), -1)
         normals = seen.normals.reshape(rows, columns, 3)
         steep = np.abs(normals[..., :2]).max(axis=-1) > 0.9 * MAX_SLOPE * -normals[..., 2]
         smooth = valid & _is_smooth(surface, normals) & ~steep
-        depth, normals = seen.depth.reshape(rows, columns), np.where(valid[..., None], normals, 0)
+        depth = np.where(valid, seen.depth.reshape(rows, columns), 0.0)
+        normals = np.where(valid[..., None], normals, 0)
         edge_free = _is_smooth(valid.astype(np.int64), np.zeros_like(normals))
         if self.mirrored:
             normals = normals * (-1.0, 1.0, 1.0)
@@ -123,16 +134,60 @@ class Example:
     def sized(self, width: int, height: int) -> Example:
         """Return the synthetic view with another image size.
 
-        The pose and the ratio of focal length to image height stay the same, so the resized view
-        may show more or less of the scene.
+        The pose, the ratio of focal length to image height and the relative position of the
+        principal point stay the same, so the resized view may show more or less of the scene.
 
         Args:
             width: Width in pixels.
             height: Height in pixels.
         """
-        focal = self.camera.fy * height / self.camera.height
+        camera, scale = self.camera, height / self.camera.height
+        cx, cy = camera.cx / camera.width * width, camera.cy * scale
+        sized = PinholeCamera(width, height, scale * camera.fx, scale * camera.fy, cx, cy)
+        return replace(self, name=f"{width}x{height}/{self.name}", camera=sized)
+
+    def turned(self) -> Example:
+        """Return the synthetic view of the same camera in portrait format."""
+        camera = self.camera
+        turned = PinholeCamera(
+            camera.height, camera.width, camera.fy, camera.fx, camera.cy, camera.cx
+        )
+        return replace(self, name=f"turned/{self.name}", camera=turned)
+
+    def with_common_camera(self) -> Example:
+        """Return the synthetic view with a centered principal point and square pixels.
+
+        Networks that estimate a focal length predict one value for such cameras.
+        """
+        width, height = self.camera.size
+        focal = (self.camera.fx + self.camera.fy) / 2
         camera = PinholeCamera(width, height, focal, focal, width / 2, height / 2)
-        return replace(self, name=f"{width}x{height}/{self.name}", camera=camera)
+        return replace(self, name=f"common/{self.name}", camera=camera)
+
+    def crop(self, left: int, top: int, width: int, height: int) -> Example:
+        """Return a rectangle of the synthetic view, which shows the scene at the same scale.
+
+        Args:
+            left: First column of the rectangle in pixels.
+            top: First row of the rectangle in pixels.
+            width: Width in pixels.
+            height: Height in pixels.
+        """
+        camera = self.camera
+        cropped = PinholeCamera(
+            width, height, camera.fx, camera.fy, camera.cx - left, camera.cy - top
+        )
+        return replace(self, name=f"{left}-{top}-{width}x{height}/{self.name}", camera=cropped)
+
+    def _is_hole(self, xy: Float64) -> Bool:
+        """Return which pixels (n, 2) lie in one of the rectangles without ground truth."""
+        camera = self._unmirrored_camera
+        slopes = (xy.reshape(-1, 2) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
+        inside = [
+            ((slopes >= (left, top)) & (slopes < (right, bottom))).all(axis=1)
+            for left, top, right, bottom in (_HOLES if self.holes else ())
+        ]
+        return np.any(inside, axis=0) if inside else np.zeros(len(slopes), np.bool_)
 
     @property
     def _unmirrored_camera(self) -> PinholeCamera:
@@ -145,16 +200,19 @@ class Example:
         return values[:, ::-1] if self.mirrored else values
 
 
-def outdoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Example:
+def outdoor_example(
+    look: Appearance, size: tuple[int, int] = (192, 144), *, holes: bool = False
+) -> Example:
     """Return a synthetic view of ground, a slanted wall and two balls below an open sky.
 
     The camera is pitched, turned and rolled, so that no camera axis is parallel to a world axis and
     the image has no symmetry. The field of view is so wide that the ray length is 1.3 times z at
-    the corners.
+    the corners. The principal point is off-centre, and ``fx`` differs from ``fy``.
 
     Args:
         look: Colors of the view, painted or textured.
         size: Width and height in pixels.
+        holes: True removes the ground truth in some rectangles on the surfaces.
     """
     scene = AnalyticScene(
         (
@@ -165,11 +223,30 @@ def outdoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Exa
         ),
         Texture(waves_per_octave=8),
     )
-    width, height = size
-    focal = 0.75 * width
-    camera = PinholeCamera(width, height, focal, focal, width / 2, height / 2)
     pose = look_at((0.0, 0.0, 1.6), (4.0, 0.3, 1.6 - 4.0 * np.tan(np.deg2rad(20.0))))
-    return Example("outdoor.png", scene, camera, _rolled(pose, 15.0), look)
+    camera = _off_centre_camera(size, FOCAL_RATIO)
+    return Example("outdoor.png", scene, camera, _rolled(pose, 15.0), look, holes=holes)
+
+
+def distant_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Example:
+    """Return a synthetic view with depth from 0.2 to 80 m: two balls before a wall far away.
+
+    Args:
+        look: Colors of the view; painted colors encode depth up to 10 m only.
+        size: Width and height in pixels.
+    """
+    scene = AnalyticScene(
+        (
+            Plane((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+            Box((66.0, 0.0, 25.0), (1.0, 200.0, 25.0), yaw_deg=-11.0),
+            Sphere((0.42, 0.12, 1.55), 0.16),
+            Sphere((14.0, -4.0, 2.5), 2.5),
+        ),
+        Texture(waves_per_octave=8),
+    )
+    pose = look_at((0.0, 0.0, 1.6), (10.0, 0.4, 1.2))
+    camera = _off_centre_camera(size, FOCAL_RATIO)
+    return Example("distant.png", scene, camera, _rolled(pose, 8.0), look)
 
 
 def indoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Example:
@@ -179,11 +256,16 @@ def indoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Exam
         look: Colors of the view, painted or textured.
         size: Width and height in pixels.
     """
-    width, height = size
-    focal = 0.9 * width
-    camera = PinholeCamera(width, height, focal, focal, width / 2, height / 2)
     scene = replace(room_scene(), texture=Texture(waves_per_octave=8))
+    camera = _off_centre_camera(size, 0.9)
     return Example("indoor.png", scene, camera, arc_poses(1, 0.0)[0], look)
+
+
+def _off_centre_camera(size: tuple[int, int], focal_ratio: float) -> PinholeCamera:
+    """Return a camera whose principal point is not the image center, with fx != fy."""
+    width, height = size
+    fx = 2 * focal_ratio * width / (1 + _FY_RATIO)
+    return PinholeCamera(width, height, fx, _FY_RATIO * fx, 0.45 * width, 0.54 * height)
 
 
 def _rolled(pose: Float64, degrees: float) -> Float64:

@@ -9,9 +9,10 @@ import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float64, NormalPrior, View
 from mpsfm_core.data.options import Options
+from mpsfm_core.geometry import pixel_centers
 from mpsfm_core.providers import Kind, ProviderContext, ProviderSpec
 from mpsfm_core.testing.examples import Example
-from mpsfm_core.testing.painted_views import NORMALS_STD, RELATIVE_STD, read_depth, read_normals
+from mpsfm_core.testing.painted_views import RELATIVE_STD, read_depth, read_normals
 
 
 class GroundTruthOptions(Options):
@@ -23,6 +24,8 @@ class GroundTruthOptions(Options):
     """True if the returned depth has the flag ``metric``."""
     scale: float = 1.0
     """Factor by which the true depth is multiplied."""
+    reduction: int = 1
+    """Factor by which the returned map is smaller than the view."""
 
 
 class GroundTruth:
@@ -36,6 +39,8 @@ class GroundTruth:
     def __init__(self) -> None:
         self.received_depth: list[DepthPrior | None] = []
         """Depth prior that each call of the normals provider received."""
+        self.wrong_inputs: list[str] = []
+        """What was wrong in the cameras and depth priors that the wrapper passed on."""
         self._examples: list[Example] = []
 
     def add_example(self, example: Example) -> None:
@@ -47,14 +52,32 @@ class GroundTruth:
         make = GroundTruthDepth if kind == "depth" else GroundTruthNormals
         return lambda options, context: make(self, options)
 
-    def predict(self, view: View) -> tuple[Float64, Float64, Bool]:
-        """Return depth (H, W), normals (H, W, 3) and validity (H, W) of a view."""
+    def predict(self, view: View, reduction: int = 1) -> tuple[Float64, Float64, Bool, Float64]:
+        """Return depth (h, w), normals (h, w, 3), validity and relative std (h, w) of a view."""
         example = self._recognize(view)
         if example is not None:
-            truth = example.truth()
-            return truth.depth, truth.normals, truth.valid
+            if example.camera != view.camera:
+                self.wrong_inputs.append(
+                    f"the camera of {example.name!r}: {view.camera} instead of {example.camera}"
+                )
+            shape = tuple(-(-side // reduction) for side in view.image.shape[:2])
+            truth = example.truth((shape[0], shape[1]))
+            spread = relative_std(truth.valid.shape, mirrored=example.mirrored)
+            return truth.depth, truth.normals, truth.valid, spread
         depth = read_depth(view.image)
-        return depth, read_normals(view.image), depth > 0
+        spread = np.full(depth.shape, RELATIVE_STD)
+        return depth, read_normals(view.image), depth > 0, spread
+
+    def receive_depth(self, view: View, depth: DepthPrior | None) -> None:
+        """Record the depth prior that a wrapper passes to its normals provider."""
+        self.received_depth.append(depth)
+        example = self._recognize(view)
+        if depth is None or example is None:
+            return
+        truth = example.truth(depth.shape)
+        where = truth.smooth & depth.valid
+        if where.any() and np.median(abs(depth.depth[where] / truth.depth[where] - 1)) > 0.02:
+            self.wrong_inputs.append(f"the depth of another view for {example.name!r}")
 
     def _recognize(self, view: View) -> Example | None:
         for example in reversed(self._examples):
@@ -67,6 +90,14 @@ class GroundTruth:
         return None
 
 
+def relative_std(shape: tuple[int, int], *, mirrored: bool = False) -> Float64:
+    """Return relative standard deviations (h, w) from 0.02 to 0.1 without any symmetry."""
+    x, y = np.moveaxis(pixel_centers(shape[1], shape[0]) / (shape[1], shape[0]), -1, 0)
+    x = 1 - x if mirrored else x
+    spread: Float64 = 0.02 + 0.08 * np.clip(0.75 * x + 0.25 * y, 0, 1)
+    return spread
+
+
 class GroundTruthDepth:
     """Depth provider that returns the ground truth on the pixel grid of the view."""
 
@@ -76,9 +107,9 @@ class GroundTruthDepth:
 
     def predict(self, view: View) -> DepthPrior:
         """Return the true depth of a view."""
-        depth, _, valid = self._ground_truth.predict(view)
+        depth, _, valid, spread = self._ground_truth.predict(view, self._options.reduction)
         depth = self._options.scale * depth
-        variance = (RELATIVE_STD * depth) ** 2 if self._options.variance else None
+        variance = (spread * depth) ** 2 if self._options.variance else None
         return DepthPrior.from_arrays(depth, variance, valid, metric=self._options.metric)
 
 
@@ -91,9 +122,9 @@ class GroundTruthNormals:
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         """Return the true normals of a view and record the received depth prior."""
-        self._ground_truth.received_depth.append(depth)
-        _, normals, valid = self._ground_truth.predict(view)
-        variance = np.full(valid.shape, NORMALS_STD**2) if self._options.variance else None
+        self._ground_truth.receive_depth(view, depth)
+        _, normals, valid, spread = self._ground_truth.predict(view, self._options.reduction)
+        variance = (2 * spread) ** 2 if self._options.variance else None
         return NormalPrior.from_arrays(normals, variance, valid, camera=view.camera)
 
 

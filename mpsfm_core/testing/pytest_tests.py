@@ -59,7 +59,7 @@ def report(result: CheckResult) -> None:
     import pytest
 
     __tracebackhide__ = True
-    if result.status == "skip":
+    if result.status in ("skip", "unmeasured"):
         pytest.skip(result.message)
     if result.status == "xfail":
         pytest.xfail(result.message)

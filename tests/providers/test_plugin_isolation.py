@@ -71,8 +71,14 @@ EXPECTED = {
     "mpsfm-newer-room": ("'mpsfm_core.next_year'", "pip install --upgrade mpsfm-core, or"),
     "mpsfm-newer-field": ("argument 'next_year'", "pip install --upgrade mpsfm-core, or uninstall"),
     "mpsfm-twice": ("is a second entry point", "tell the author of mpsfm-twice"),
-    "mpsfm-twin-a": ("is brought by mpsfm-twin-a and mpsfm-twin-b", "uninstall all but one"),
-    "mpsfm-twin-b": ("is brought by mpsfm-twin-a and mpsfm-twin-b", "uninstall all but one"),
+    "mpsfm-twin-a": (
+        "is brought by mpsfm-twin-a and mpsfm-twin-b",
+        "choose 'mpsfm-twin-a:twin' or",
+    ),
+    "mpsfm-twin-b": (
+        "is brought by mpsfm-twin-a and mpsfm-twin-b",
+        "choose 'mpsfm-twin-a:twin' or",
+    ),
     "mpsfm-imports": ("No module named 'a_library_that_nobody_has'", "pip install the package of"),
 }
 
@@ -149,7 +155,7 @@ def test_the_others_work_and_the_broken_ones_raise_only_when_chosen(
     for name, message in (
         ("missing", "pip install no-such-library"),
         ("newer", "pip install --upgrade mpsfm-core"),
-        ("twin", "uninstall all but one of them"),
+        ("twin", "choose 'mpsfm-twin-a:twin' or 'mpsfm-twin-b:twin'"),
     ):
         with pytest.raises(ProviderError, match=message):
             registry.create("depth", name, None, context)

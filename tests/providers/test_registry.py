@@ -341,6 +341,18 @@ class TestSpecifications:
         assert registry.version("depth", "flat").startswith(CORE)
         assert "belongs to mpsfm-core" in only(registry, "mpsfm-greedy").reason
 
+    def test_a_distribution_before_the_name_resolves_a_clash(self) -> None:
+        registry = Registry()
+        for name in ("mpsfm-a", "mpsfm-b"):
+            registry.add(FLAT, distribution=name)
+        with pytest.raises(ProviderError, match="choose 'mpsfm-a:flat' or 'mpsfm-b:flat'"):
+            registry.spec("depth", "flat")
+        assert registry.version("depth", "mpsfm-b:flat").startswith("mpsfm-b")
+        config = ProviderConfig(use="mpsfm-b:flat")
+        assert registry.calibration("depth", config) == DepthCalibration()
+        with pytest.raises(ProviderError, match="did you mean 'mpsfm-.:flat'"):
+            registry.spec("depth", "mpsfm-c:flat")
+
     def test_unknown_names_are_answered_with_the_nearest(self) -> None:
         registry = Registry()
         registry.add(FLAT, DOUBLING)

@@ -54,7 +54,7 @@ class PaintedDepth:
 
     def estimate_focal(self, view: View) -> float:
         """Return the focal length of the painted views, independent of the camera of the view."""
-        return 0.75 * view.camera.width
+        return 0.75 * max(view.camera.size)
 
 
 class PaintedNormals:

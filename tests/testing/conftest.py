@@ -19,11 +19,14 @@ Caught = Callable[..., None]
 
 @pytest.fixture
 def named() -> Callable[..., set[str]]:
-    """Return the checks that the cases of parametrized tests name in their second column."""
+    """Return the checks that the cases of parametrized tests name in the column ``check``."""
 
     def checks(*tests: Any) -> set[str]:
         marks = [mark for test in tests for mark in test.pytestmark if mark.name == "parametrize"]
-        return {case[1] for mark in marks for case in mark.args[1]}
+        columns = [
+            (mark.args[0].index("check"), mark.args[1]) for mark in marks if "check" in mark.args[0]
+        ]
+        return {case[column] for column, cases in columns for case in cases}
 
     return checks
 

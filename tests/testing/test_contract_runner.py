@@ -80,7 +80,7 @@ def test_without_a_known_answer_accuracy_is_skipped_not_passed() -> None:
     found = outcomes(PaintedDepth, None)
     needing = {"depth-is-z", "depth-scale", "depth-channel-order", "depth-pixel-convention"}
     needing |= {"depth-orientation", "depth-validity", "depth-variance"}
-    assert {found[name][0] for name in needing} == {"skip"}
+    assert {found[name][0] for name in needing} == {"unmeasured"}
     assert all("ground truth is unknown" in found[name][1] for name in needing)
     assert found["odd-size"] == (
         "pass",
@@ -173,6 +173,10 @@ def test_ids_are_unique_and_every_check_says_what_it_is_about() -> None:
 def test_find_providers_of_a_distribution_never_returns_another_ones_provider() -> None:
     registry = Registry.discover(environments=False)
     registry.add(ProviderSpec("depth", "flat", PaintedDepth), distribution="mpsfm-other")
-    with pytest.raises(ProviderError, match="'flat' of mpsfm-other has a name that belongs to"):
-        find_providers(registry, "mpsfm-other")
+    assert find_providers(registry, "mpsfm-other") == [("depth", "mpsfm-other:flat")]
+    (result,) = run_checks(registry, "depth", "mpsfm-other:flat", PAINTED, only={"depth-variance"})
+    assert result.status == "pass"  # The built-in provider ``flat`` has no variance.
+    registry.add(ProviderSpec("depth", "needy", PaintedDepth, requires=("no_such_pkg",)))
+    with pytest.raises(ProviderError, match="needs no_such_pkg"):
+        find_providers(registry, "this process")
     assert ("depth", "flat") in find_providers(registry, "mpsfm-core")

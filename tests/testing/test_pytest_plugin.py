@@ -146,7 +146,7 @@ def test_the_command_line(site: Path) -> None:
     assert (result["id"], result["status"]) == ("flat", "fail")
 
     code, output = check("here", "--set", "factor=2", "--only", "depth-scale", "--json")
-    assert (code, json.loads(output)[0]["status"]) == (0, "skip")
+    assert (code, json.loads(output)[0]["status"]) == (0, "unmeasured")
 
     for wrong, message in (
         (("hear",), "did you mean 'here'"),

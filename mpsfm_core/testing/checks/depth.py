@@ -14,15 +14,17 @@ from mpsfm_core.providers import validation
 from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.accuracy import DEPTH_TOLERANCE, NORMALS_TOLERANCE_DEG, require_small_shift
 from mpsfm_core.testing.checks.maps import (
+    STD_FACTOR,
+    require_depth_std,
     require_monotonic_calibration,
-    require_reported_std,
+    require_normals_std,
     require_true_validity,
     swap_painted_channels,
 )
 from mpsfm_core.testing.contract_case import ContractCase, describe_difference, first_depth
-from mpsfm_core.testing.examples import Example
+from mpsfm_core.testing.examples import Example, distant_example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
-from mpsfm_core.testing.painted_views import RELATIVE_STD, read_depth
+from mpsfm_core.testing.painted_views import read_depth
 
 RAY_TOLERANCE = 0.25
 """Largest accepted exponent p in ``depth = z * (ray length / z) ** p``, which is 0 for z-depth and
@@ -37,6 +39,14 @@ _FOCAL_RANGE = (1.2, 1.9)
 """Accepted range of the depth ratio between two cameras whose focal lengths have the ratio 1.5. A
 network with a canonical camera model has a depth ratio of 1.5. A depth ratio of 1 means that the
 network ignores the focal length, and 0.67 that depth shrinks instead of growing."""
+
+_FOCAL_GROWTH = (1.5, 2.7)
+"""Accepted range of the ratio of the focal lengths that are estimated for a view of twice the size
+and for the view."""
+_MAX_FOCAL_FACTOR = 1.2
+"""Largest accepted ratio between the estimated and the true focal length."""
+_ANGLE_RANGE_DEG = (1.0, 170.0)
+"""Range of plausible horizontal angles of view in degrees, from telephoto to ultra-wide lenses."""
 
 _ORIENTATIONS: Mapping[str, Callable[[Any], Any]] = MappingProxyType(
     {
@@ -136,6 +146,8 @@ def check_depth_flip(case: ContractCase) -> str:
     if not both.any():
         raise CheckFailed("no pixel is valid in both the view and the mirrored view")
     ratio = np.log(prior.depth[both] / mirrored.depth[:, ::-1][both].astype(np.float64))
+    if not (prior.metric and mirrored.metric):
+        ratio -= np.median(ratio)  # Each depth map that is not metric has its own unit.
     found = map_errors.error_quantile(ratio)
     limit = FLIP_TOLERANCE if case.truth_source == "none" else DEPTH_TOLERANCE
     if found > limit:
@@ -154,6 +166,8 @@ def check_depth_same_in_larger_view(case: ContractCase) -> str:
     width, height = case.example.camera.size
     large = case.example.sized(2 * width, 2 * height)
     small, prior = _run(case), first_depth(case.run(large))
+    if not (small.metric and prior.metric):
+        raise CheckSkipped("depth that is not metric has another unit in every map")
     medians = [
         float(np.median(map_errors.log_errors(p, e, any_scale=False)))
         for p, e in ((small, case.example), (prior, large))
@@ -185,6 +199,12 @@ def check_depth_intrinsics(case: ContractCase) -> str:
         raise CheckFailed(
             f"depth changes {factor:.2f} times if the focal length grows {FOCAL_FACTOR} times"
         )
+    if prior.variance is not None and changed.variance is not None:
+        std = float(np.sqrt(np.median(changed.variance[both] / prior.variance[both])))
+        if not 1 / STD_FACTOR < std / factor < STD_FACTOR:
+            raise CheckFailed(
+                f"depth grows {factor:.2f} times with the focal length, but its std {std:.2f} times"
+            )
     return f"factor {factor:.2f} for {FOCAL_FACTOR} times the focal length"
 
 
@@ -196,10 +216,10 @@ def check_depth_variance(case: ContractCase) -> str:
     prior = _run(case)
     if prior.variance is None:
         raise CheckSkipped("has no variance")
-    truth = case.example.truth(prior.shape)
-    where = map_errors.select_comparable(prior.valid, truth)
-    expected = RELATIVE_STD * prior.depth[where].astype(np.float64)
-    return require_reported_std(prior.variance[where], expected)
+    text = require_depth_std(prior, case.example)
+    mirrored = case.example.mirror()
+    require_depth_std(first_depth(case.run(mirrored)), mirrored)
+    return text
 
 
 def check_depth_calibration(case: ContractCase) -> None:
@@ -208,6 +228,32 @@ def check_depth_calibration(case: ContractCase) -> None:
     The calibrated variance has to grow with ``std_scale`` and with the variance of the network.
     """
     require_monotonic_calibration(case, _run(case))
+
+
+def check_depth_range(case: ContractCase) -> str:
+    """Require the usual accuracy for near and distant surfaces, from 0.3 to 75 m.
+
+    This check detects clipped, saturated and quantized depth. Colors encode depth up to 10 m only,
+    so the check does not apply to ``truth_source="painted"``.
+    """
+    case.require_truth("prepared", "image")
+    example = distant_example("textured")
+    prior = first_depth(case.run(example))
+    truth = example.truth(prior.shape)
+    where = map_errors.select_comparable(prior.valid, truth)
+    errors = np.log(prior.depth[where].astype(np.float64) / truth.depth[where])
+    if not prior.metric:
+        errors -= np.median(errors)
+    depth = truth.depth[where]
+    for name, near, far in (("near", 0, 1), ("middle", 1, 30), ("distant", 30, np.inf)):
+        part = errors[(depth >= near) & (depth < far)]
+        total = (truth.smooth & (truth.depth >= near) & (truth.depth < far)).sum()
+        if len(part) < 0.5 * total:
+            raise CheckFailed(f"only {len(part)} of {total} {name} pixels are valid")
+        error = map_errors.error_quantile(part)
+        if error > DEPTH_TOLERANCE:
+            raise CheckFailed(f"the relative error of {name} depth is {error:.2g}")
+    return f"relative error {map_errors.error_quantile(errors):.2g}"
 
 
 def check_depth_joint(case: ContractCase) -> str:
@@ -230,7 +276,8 @@ def check_depth_focal(case: ContractCase) -> str:
     if not case.declares("estimates-focal"):
         raise CheckSkipped("the provider does not declare 'estimates-focal'")
     width, height = case.example.camera.size
-    examples = (case.example, case.example.sized(2 * width, 2 * height))
+    common = case.example.with_common_camera()
+    examples = (common, common.sized(2 * width, 2 * height), common.turned())
     found = []
     for example in examples:
         case.prepare(example)
@@ -238,12 +285,26 @@ def check_depth_focal(case: ContractCase) -> str:
         if focal is None:
             raise CheckSkipped("the provider estimates no focal length with these options")
         found.append(focal)
-    if not 1.5 < found[1] / found[0] < 2.7:
+    if not _FOCAL_GROWTH[0] < found[1] / found[0] < _FOCAL_GROWTH[1]:
         raise CheckFailed(
             f"the estimated focal length is {found[0]:.0f} px, and {found[1]:.0f} px at twice the "
             f"image size"
         )
-    return f"{found[0]:.0f} px, the truth is {case.example.camera.fx:.0f} px"
+    angle = float(np.rad2deg(2 * np.arctan(width / 2 / found[0])))
+    if not _ANGLE_RANGE_DEG[0] < angle < _ANGLE_RANGE_DEG[1]:
+        raise CheckFailed(
+            f"the estimated focal length of {found[0]:.0f} px is an angle of view of {angle:.0f} "
+            f"degrees"
+        )
+    text = f"{found[0]:.0f} px, the truth is {examples[0].camera.fx:.0f} px"
+    for focal, example in zip(found, examples, strict=True) if case.truth_source != "none" else ():
+        if abs(np.log(focal / example.camera.fx)) > np.log(_MAX_FOCAL_FACTOR):
+            size = "{} x {}".format(*example.camera.size)
+            raise CheckFailed(
+                f"the estimated focal length of a {size} view is {focal:.0f} px, the truth is "
+                f"{example.camera.fx:.0f} px"
+            )
+    return text
 
 
 MAP_CHECKS = (
@@ -258,6 +319,7 @@ MAP_CHECKS = (
     check_depth_intrinsics,
     check_depth_variance,
     check_depth_calibration,
+    check_depth_range,
 )
 """Contract checks of depth maps, which both depth providers and multi-view providers have to
 pass."""
@@ -277,6 +339,8 @@ def _compare_joint_normals(case: ContractCase, normals: NormalPrior) -> str:
     angle = map_errors.error_quantile(map_errors.angle_errors_deg(normals, case.example))
     if angle > NORMALS_TOLERANCE_DEG:
         raise CheckFailed(f"the normals of predict_joint are {angle:.0f} degrees off")
+    if case.truth_source in ("painted", "prepared"):
+        require_normals_std(normals, case.example)
     return f"normals off by {angle:.2g} degrees"
 
 

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpsfm_core.data import Features, Float64, Int64, View
+from mpsfm_core.data import Features, Float32, Float64, Int64, View
 from mpsfm_core.testing.contract_case import ContractCase
-from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+from mpsfm_core.testing.examples import Example
+from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUndecided
 
 PIXEL_TOLERANCE = 0.25
 """Largest accepted shift of keypoints in pixels, or in multiples of the keypoint std if ``std_px``
@@ -26,6 +27,23 @@ _MIN_COUNT = 8
 _MIN_INSIDE_RATIO = 0.8
 """Smallest accepted ratio of keypoints on the textured part of a view. Some keypoints are outside
 of the textured part because detectors respond to its border."""
+_MIN_LARGE_RATIO = 0.1
+"""Smallest accepted ratio of keypoints in each textured corner of the large view."""
+_MIN_COVERING = 40
+"""Number of keypoints above which the coverage of a view is checked."""
+_MIN_COVERED_CELLS = 7
+_MIN_SIDE_RATIO = 0.05
+"""Smallest accepted ratio of keypoints in the outer third of each side of a textured view. The
+ratio is 0.33 for keypoints that are spread evenly, and 0.2 for SIFT."""
+_MIN_ORDER = 0.4
+"""Smallest accepted probability that a keypoint with contrast has a higher score than one without.
+The probability is 0.5 for meaningless scores and 0 for inverted scores."""
+_SCALE_RANGE = (1.4, 2.8)
+"""Accepted growth of keypoint scales in a view of twice the size."""
+_MAX_STD_FACTOR = 3.0
+"""Largest accepted ratio of the measured keypoint error and ``std_px``; 0.03 for SIFT."""
+_MAX_ERROR_PX = 6.0
+"""Distance in pixels above which a descriptor match is wrong and not inaccurate."""
 _MIN_CORRECT_RATIO = 0.3
 """Smallest accepted ratio of correct descriptor matches (mutual nearest neighbors within three
 standard deviations of the true position). The ratio of correct matches is 0.6 for SIFT and 0.01 for
@@ -33,29 +51,125 @@ shuffled descriptors."""
 
 
 def check_features_axes(case: ContractCase) -> str:
-    """Require keypoints (x, y) in the textured part of the view.
+    """Require keypoints (x, y) in the textured part of landscape, portrait and odd-sized views.
 
-    The textured part is a low and wide area in the upper right corner, so that keypoints with
-    swapped x and y are outside.
+    The textured part is a low and wide area in the upper right or lower left corner, so that
+    keypoints with swapped x and y are outside. Keypoints of a resized, padded, cropped or rotated
+    image that are not mapped back are outside as well.
+    """
+    case.require_truth("image", "prepared")
+    width, height = case.example.camera.size
+    ratios = []
+    for size, is_upper_right in (
+        ((width, height), True),
+        ((height, width), False),
+        ((211, 149), True),
+        ((149, 211), False),
+    ):
+        example = case.example.sized(*size)
+        view, part = _blank_outside(example.view, upper_right=is_upper_right)
+        ratios.append(_require_in_part(case, example, view, part))
+    return f"{min(ratios):.0%} of the keypoints are on the textured part"
+
+
+def check_features_coverage(case: ContractCase) -> str:
+    """Require keypoints in all parts of a fully textured view.
+
+    Keypoints that are limited to the first rows, to the center or to one tile leave the rest of
+    every image without matches.
+    """
+    case.require_truth("image", "prepared")
+    features: Features = case.run(case.example)
+    _require_enough(features)
+    cells = (features.keypoints / case.example.camera.size * 3).astype(int).clip(0, 2)
+    counts = np.zeros((3, 3), dtype=int)
+    np.add.at(counts, (cells[:, 1], cells[:, 0]), 1)
+    covered = int((counts > 0).sum())
+    halves = [counts[:, 0], counts[:, 2], counts[0], counts[2]]
+    smallest = min(float(part.sum()) for part in halves) / len(features)
+    if len(features) < _MIN_COVERING:
+        raise CheckSkipped(f"{len(features)} keypoints are too few to cover a view")
+    if covered < _MIN_COVERED_CELLS or smallest < _MIN_SIDE_RATIO:
+        raise CheckFailed(
+            f"keypoints cover {covered} of 9 parts of a fully textured view, and only "
+            f"{smallest:.0%} are in an outer third"
+        )
+    return f"keypoints cover {covered} of 9 parts"
+
+
+def check_features_scores(case: ContractCase) -> str:
+    """Require higher scores where the texture has more contrast.
+
+    A limit on the number of features keeps those with the highest scores.
     """
     case.require_truth("image", "prepared")
     view = case.example.view
-    height, width = view.image.shape[:2]
-    left, bottom = int(0.45 * width), int(0.45 * height)
-    image = np.full_like(view.image, 128)
-    image[:bottom, left:] = view.image[:bottom, left:]
-    found = case.run_on_view(replace(view, image=image), case.example)
-    _require_enough(found)
-    margin = 3 * found.std_px
-    x, y = found.keypoints.T
-    inside = float(((x >= left - margin) & (y <= bottom + margin)).mean())
-    if inside < _MIN_INSIDE_RATIO:
-        swapped = float(((y >= left - margin) & (x <= bottom + margin)).mean())
-        reason = ": x and y are swapped" if swapped > inside else ""
+    half = view.camera.width // 2
+    image = view.image.astype(np.float64)
+    image[:, :half] = 128 + 0.25 * (image[:, :half] - 128)
+    view = replace(view, image=image.round().astype(np.uint8))
+    features: Features = case.run_on_view(view, case.example)
+    if features.scores is None:
+        raise CheckSkipped("the features have no scores")
+    x = features.keypoints[:, 0]
+    weak, strong = features.scores[x < half - 8], features.scores[x > half + 8]
+    if min(len(weak), len(strong)) < _MIN_COUNT:
+        return f"{len(strong)} keypoints with, {len(weak)} without contrast"
+    better = order_probability(strong, weak)
+    if better < _MIN_ORDER:
         raise CheckFailed(
-            f"only {inside:.0%} of the keypoints are on the textured part of the view{reason}"
+            f"keypoints without contrast have higher scores: mean {weak.mean():.3g}, "
+            f"{strong.mean():.3g} with contrast"
         )
-    return f"{inside:.0%} of the keypoints are on the textured part"
+    return f"score {weak.mean():.3g} without, {strong.mean():.3g} with contrast"
+
+
+def check_features_scales(case: ContractCase) -> str:
+    """Require scales in pixels of the view, which double in a view of twice the size."""
+    case.require_truth("image")
+    width, height = case.example.camera.size
+    large = case.example.sized(2 * width, 2 * height)
+    small_features, features = case.run(case.example), case.run(large)
+    if small_features.scales is None or features.scales is None:
+        raise CheckSkipped("the features have no scales")
+    if np.ptp(small_features.scales) < 0.01 * small_features.scales.mean():
+        raise CheckSkipped("all features have the same scale")
+    distance = np.linalg.norm(
+        2 * small_features.keypoints[:, None] - features.keypoints[None], axis=2
+    )
+    pairs = []
+    for row in np.flatnonzero(distance.min(axis=1) < _SAME_KEYPOINT_PX):
+        near = np.flatnonzero(distance[row] < _SAME_KEYPOINT_PX)
+        pairs.append(features.scales[near] / small_features.scales[row])
+    if len(pairs) < _MIN_COUNT:
+        raise CheckSkipped(f"only {len(pairs)} keypoints repeat in a view of twice the size")
+    # A point can have features of several scales, of which one must be twice as large.
+    best = np.array([ratio[np.abs(np.log(ratio / 2)).argmin()] for ratio in pairs])
+    factor = float(np.median(best))
+    if not _SCALE_RANGE[0] < factor < _SCALE_RANGE[1]:
+        raise CheckFailed(f"scales grow {factor:.2g} times in a view of twice the size")
+    return f"scales grow {factor:.2g} times"
+
+
+def check_features_std(case: ContractCase) -> str:
+    """Require a ``std_px`` that is not far smaller than the measured error of matched keypoints.
+
+    A ``std_px`` in pixels of a reduced image is too small.
+    """
+    case.require_truth("image")
+    first, second = case.run(case.example), case.run(case.example.partner)
+    rows, columns = _mutual_nearest(first, second)
+    true = case.example.correspondences(case.example.partner, first.keypoints[rows])
+    offset = (second.keypoints[columns] - true.xy_b)[true.visible]
+    offset = offset[np.linalg.norm(offset, axis=1) < _MAX_ERROR_PX * max(1.0, first.std_px)]
+    if len(offset) < 2 * _MIN_COUNT:
+        raise CheckUndecided(f"only {len(offset)} keypoints match")
+    # The median absolute deviation of a normal distribution is 0.67 of its std.
+    error = float(np.median(np.abs(offset)) / 0.6745)
+    factor = error / float(np.hypot(first.std_px, second.std_px))
+    if factor > _MAX_STD_FACTOR:
+        raise CheckFailed(f"keypoint errors are {factor:.2g} times the declared std_px")
+    return f"errors are {factor:.2g} times std_px"
 
 
 def check_features_pixel_convention(case: ContractCase) -> str:
@@ -63,7 +177,7 @@ def check_features_pixel_convention(case: ContractCase) -> str:
 
     If the view is rotated by 180 degrees, a keypoint (x, y) has to be found at (width - x, height -
     y). A wrong pixel convention shifts x and y of all keypoints by the same amount. Some networks
-    shift keypoints only in x or only in y; for such networks the check is skipped.
+    shift keypoints only in x or only in y; for such networks the check cannot tell.
     """
     case.require_truth("image")
     view = case.example.view
@@ -75,9 +189,7 @@ def check_features_pixel_convention(case: ContractCase) -> str:
     offsets = _offsets_to_nearest(found.keypoints, back, radius) / 2
     if len(offsets) < max(_MIN_COUNT, _MIN_REPEATED_RATIO * len(found)):
         text = f"{len(offsets)} of {len(found)} keypoints"
-        raise CheckSkipped(
-            f"the detector repeats only {text} in the rotated view, too few for this check"
-        )
+        raise CheckUndecided(f"the detector repeats only {text} in the rotated view")
     x, y = offsets.mean(axis=0)
     text = f"shifted by ({x:+.2f}, {y:+.2f}) px"
     limit = PIXEL_TOLERANCE * max(1.0, found.std_px)
@@ -87,38 +199,41 @@ def check_features_pixel_convention(case: ContractCase) -> str:
         raise CheckFailed(
             f"keypoints are {text}: the center of the first pixel has to be (0.5, 0.5)"
         )
-    raise CheckSkipped(f"the detector is not symmetric, keypoints are {text}")
+    raise CheckUndecided(f"the detector is not symmetric, keypoints are {text}")
 
 
 def check_features_large_view(case: ContractCase) -> str:
     """Require keypoints in pixels of a large view, even if the provider reduces the image.
 
-    Only the lower right corner of the view with 12.6 megapixels has texture.
-    Keypoints of a reduced image that are not scaled back are outside of the textured corner.
+    Only two opposite corners of the view with 12.6 megapixels have texture. Keypoints of a reduced
+    image that are not scaled back, or of the first tiles only, miss one of the corners.
     """
     case.require_truth("image")
     import cv2  # The import is local, because pytest loads this module when it collects tests.
 
     width, height = LARGE_SIZE
-    left, top = 3 * width // 4, 3 * height // 4
+    part_width, part_height = width // 6, height // 6
     tile = cv2.resize(case.example.view.image, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
-    num_rows, num_columns = -(-(height - top) // tile.shape[0]), -(-(width - left) // tile.shape[1])
-    texture = np.tile(tile, (num_rows, num_columns, 1))
     image = np.full((height, width, 3), 128, np.uint8)
-    image[top:, left:] = texture[: height - top, : width - left]
+    image[:part_height, :part_width] = tile[:part_height, :part_width]
+    image[-part_height:, -part_width:] = tile[-part_height:, -part_width:]
     view = View("large.png", image, case.example.camera.resized(width, height))
     features = case.run_on_view(view, case.example)
     _require_enough(features)
     margin = 3 * features.std_px
-    x, y = features.keypoints.T
-    inside = float(((x >= left - margin) & (y >= top - margin)).mean())
-    if inside < _MIN_INSIDE_RATIO:
+    keypoints = features.keypoints
+    size = np.array([part_width, part_height]) + margin
+    first = (keypoints <= size).all(axis=1)
+    last = (keypoints >= np.array(LARGE_SIZE) - size).all(axis=1)
+    ratios = [float(part.mean()) for part in (first, last)]
+    if min(ratios) < _MIN_LARGE_RATIO or sum(ratios) < _MIN_INSIDE_RATIO:
+        x, y = keypoints.max(axis=0)
         raise CheckFailed(
-            f"only {inside:.0%} of the keypoints of a {width} x {height} view are on the textured "
-            f"part, the largest are x = {x.max():.0f}, y = {y.max():.0f}: scale the keypoints of a "
-            f"reduced image back"
+            f"the textured corners of a {width} x {height} view have {ratios[0]:.0%} and "
+            f"{ratios[1]:.0%} of the keypoints, the largest are x = {x:.0f}, y = {y:.0f}: scale "
+            f"the keypoints of a reduced image back"
         )
-    return f"{inside:.0%} of {len(features)} keypoints are on the textured part"
+    return f"{sum(ratios):.0%} of {len(features)} keypoints are on the textured corners"
 
 
 def check_features_descriptors(case: ContractCase) -> str:
@@ -127,19 +242,10 @@ def check_features_descriptors(case: ContractCase) -> str:
     Mutual nearest neighbors between two views of a scene have to be the same surface points.
     """
     case.require_truth("image", "prepared")
-    a: Features = case.run(case.example)
-    b: Features = case.run(case.example.partner)
-    _require_enough(a)
-    _require_enough(b)
-    rows, columns = _mutual_nearest(a, b)
-    true = case.example.correspondences(case.example.partner, a.keypoints[rows])
-    distance = np.linalg.norm(b.keypoints[columns] - true.xy_b, axis=1)
-    right = (distance < 3 * max(1.0, a.std_px, b.std_px))[true.visible]
-    if len(right) < _MIN_COUNT:
-        raise CheckSkipped(f"the descriptors have only {len(right)} mutual nearest neighbors")
-    if right.mean() < _MIN_CORRECT_RATIO:
-        raise CheckFailed(f"only {right.mean():.0%} of the nearest descriptors are the same point")
-    return f"{right.mean():.0%} of the nearest descriptors are the same point"
+    width, height = case.example.camera.size
+    portrait = case.example.partner.crop(width // 5, 0, 3 * width // 5, height)
+    texts = [_require_same_points(case, b) for b in (case.example.partner, portrait)]
+    return texts[0]
 
 
 def check_features_dimension(case: ContractCase) -> str:
@@ -158,10 +264,73 @@ def check_features_dimension(case: ContractCase) -> str:
 CHECKS = (
     check_features_axes,
     check_features_pixel_convention,
+    check_features_coverage,
     check_features_large_view,
     check_features_descriptors,
     check_features_dimension,
+    check_features_scores,
+    check_features_scales,
+    check_features_std,
 )
+
+
+def _require_same_points(case: ContractCase, other: Example) -> str:
+    """Require that descriptors which are mutual nearest neighbors show the same points."""
+    a: Features = case.run(case.example)
+    b: Features = case.run(other)
+    _require_enough(a)
+    _require_enough(b)
+    rows, columns = _mutual_nearest(a, b)
+    true = case.example.correspondences(other, a.keypoints[rows])
+    distance = np.linalg.norm(b.keypoints[columns] - true.xy_b, axis=1)
+    right = (distance < 3 * max(1.0, a.std_px, b.std_px))[true.visible]
+    if len(right) < _MIN_COUNT:
+        raise CheckUndecided(f"the descriptors have only {len(right)} mutual nearest neighbors")
+    if right.mean() < _MIN_CORRECT_RATIO:
+        raise CheckFailed(f"only {right.mean():.0%} of the nearest descriptors are the same point")
+    return f"{right.mean():.0%} of the nearest descriptors are the same point"
+
+
+def _blank_outside(view: View, *, upper_right: bool) -> tuple[View, tuple[int, int, int, int]]:
+    """Blank a view outside of one corner; return it and (left, top, right, bottom)."""
+    width, height = view.camera.size
+    left, top, right, bottom = int(0.45 * width), 0, width, int(0.45 * height)
+    if not upper_right:
+        left, top, right, bottom = 0, height - bottom, width - left, height
+    image = np.full_like(view.image, 128)
+    image[top:bottom, left:right] = view.image[top:bottom, left:right]
+    return replace(view, image=image), (left, top, right, bottom)
+
+
+def _require_in_part(
+    case: ContractCase, example: Example, view: View, part: tuple[int, int, int, int]
+) -> float:
+    """Require that keypoints are in a part (left, top, right, bottom) of the view."""
+    features = case.run_on_view(view, example)
+    _require_enough(features)
+    margin = 3 * features.std_px
+
+    def ratio(keypoints: Float64) -> float:
+        inside = (keypoints >= np.array(part[:2]) - margin) & (
+            keypoints <= np.array(part[2:]) + margin
+        )
+        return float(inside.all(axis=1).mean())
+
+    found = ratio(features.keypoints)
+    if found < _MIN_INSIDE_RATIO:
+        reason = ": x and y are swapped" if ratio(features.keypoints[:, ::-1]) > found else ""
+        width, height = view.camera.size
+        raise CheckFailed(
+            f"only {found:.0%} of the keypoints are on the textured part of a {width} x {height} "
+            f"view{reason}"
+        )
+    return found
+
+
+def order_probability(high: Float32, low: Float32) -> float:
+    """Return the probability that a value of the first sample exceeds one of the second sample."""
+    difference = high[:, None].astype(np.float64) - low[None]
+    return float((difference > 0).mean() + 0.5 * (difference == 0).mean())
 
 
 def _require_enough(features: Features) -> None:

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpsfm_core.data import DepthPrior, Features
+from mpsfm_core.data import DenseMatches, DepthPrior, Features, Float64, Int64, PinholeCamera, View
 from mpsfm_core.providers import validation
 from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.accuracy import (
@@ -15,17 +15,26 @@ from mpsfm_core.testing.accuracy import (
     MIN_MATCHES,
     match_errors_px,
     match_points,
+    point_matches,
 )
 from mpsfm_core.testing.checks.depth import RAY_TOLERANCE
+from mpsfm_core.testing.checks.features import order_probability
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.examples import Example
-from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUndecided, CheckUnmeasured
 
-SHIFT_TOLERANCE = 0.2
-"""Largest accepted shift of matches in pixels of the larger view, or in multiples of the keypoint
-std if ``std_px`` exceeds one. Integer pixel centers shift matches by 0.5 pixels."""
 NUM_MANY_FEATURES = 4096
 """Number of features per view that every sparse matcher has to accept."""
+LARGE_SIZE = (1200, 900)
+"""Width and height in pixels of the views with many features."""
+MIN_COVERING = 40
+"""Number of matches above which their coverage is checked."""
+_MIN_COVERED_CELLS = 6
+_MIN_USED_RATIO = 0.9
+"""Smallest accepted ratio of the largest matched feature index and the number of features."""
+_MIN_ORDER = 0.4
+"""Smallest accepted probability that a reliable match has a higher score than an unreliable one.
+The probability is 0.5 for random scores and near 0 for inverted scores."""
 _MIN_CORRECT_RATIO = 0.5
 """Smallest accepted ratio of correct matches for an image pair with a small baseline. The ratio of
 correct matches is 0.99 for nearest neighbors of SIFT and 0.96 for LighterGlue."""
@@ -43,12 +52,46 @@ def check_matcher_order(case: ContractCase) -> str:
     return _require_correct(case, case.example.partner, case.example)
 
 
+def check_matcher_sizes(case: ContractCase) -> str:
+    """Require correct matches of views with different sizes, in both orders.
+
+    The second view is a portrait rectangle of a neighboring view, or a larger rectangle around it,
+    at the same scale.
+    """
+    case.require_truth("image")
+    width, height = case.example.camera.size
+    neighbor = case.example.partner
+    portrait = neighbor.crop(width // 4, 0, height // 2 + 13, height)
+    larger = neighbor.crop(-3 * width // 4, -height // 4, 2 * width, 5 * height // 4)
+    texts = [
+        _require_correct(case, *pair)
+        for other in (portrait, larger)
+        for pair in ((case.example, other), (other, case.example))
+    ]
+    return texts[0]
+
+
+def check_matcher_coverage(case: ContractCase) -> str:
+    """Require matches in all parts of the views that overlap."""
+    case.require_truth("image", "prepared")
+    a, b = case.example, case.example.partner
+    matches = match_points(case, a, b, case.run(a))
+    if len(matches) < MIN_COVERING:
+        raise CheckSkipped(f"{len(matches)} matches are too few to cover a view")
+    cells = (matches.points_a / a.camera.size * 3).astype(int).clip(0, 2)
+    covered = len(np.unique(cells, axis=0))
+    if covered < _MIN_COVERED_CELLS:
+        raise CheckFailed(f"matches cover only {covered} of 9 parts of views that overlap by 90 %")
+    return f"matches cover {covered} of 9 parts"
+
+
 def check_matcher_pixel_convention(case: ContractCase) -> str:
     """Require dense matches in COLMAP's pixel convention.
 
     If a view is matched with its copy at half the size, the matched coordinates in the copy are
     exactly half as large. Matched coordinates with integer pixel centers differ from half the
-    coordinates.
+    coordinates. A matcher that is not invariant to scale is checked with copies of three quarters
+    of the size, and with a copy that is rotated by 180 degrees.
     """
     if not case.declares("dense"):
         raise CheckSkipped(
@@ -56,21 +99,36 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
         )
     case.require_truth("image", "prepared")
     width, height = case.example.camera.size
-    small, large = case.example.sized(width // 2, height // 2), case.example
-    matches = match_points(case, small, large, case.run_on_pair(small, large))
-    _require_enough(len(matches))
-    residual = matches.points_b - 2 * matches.points_a
-    near = np.abs(residual).max(axis=1) < 4 * max(1.0, matches.std_px)
-    if near.sum() < MIN_MATCHES:
-        raise CheckSkipped(
-            f"only {near.sum()} matches between a view and its copy at half the size"
+    counts: list[int] = []
+    for numerator, denominator in ((1, 2), (3, 4)):
+        ratio = denominator / numerator
+        small = case.example.sized(
+            width * numerator // denominator, height * numerator // denominator
         )
-    shift = np.median(residual[near], axis=0)
-    limit = SHIFT_TOLERANCE * max(1.0, matches.std_px)
-    text = f"shifted by ({shift[0]:+.2f}, {shift[1]:+.2f}) px"
-    if np.abs(shift).max() > limit:
-        raise CheckFailed(f"matches between a view and its copy at half the size are {text}")
-    return text
+        matches = match_points(case, small, case.example, case.run_on_pair(small, case.example))
+        residual = matches.points_b - ratio * matches.points_a
+        # Integer pixel centers in both views shift the residual by this length.
+        expected = 0.5 * (ratio - 1)
+        where = f"between a view and its copy at {numerator}/{denominator} of the size"
+        text = _describe_residual(residual, matches.std_px, expected, where, counts)
+        if text:
+            return text
+    if case.setup.prepare is None:
+        matches = _match_rotated(case)
+        residual = case.example.camera.size - matches.points_b - matches.points_a
+        text = _describe_residual(
+            residual,
+            matches.std_px,
+            1.0,
+            "between a view and its copy rotated by 180 degrees",
+            counts,
+        )
+        if text:
+            return text
+    raise CheckUnmeasured(
+        f"the matcher is not invariant to scale: only {max(counts)} correct matches between a view "
+        "and its scaled or rotated copies"
+    )
 
 
 def check_matcher_no_features(case: ContractCase) -> None:
@@ -100,39 +158,65 @@ def check_matcher_few_features(case: ContractCase) -> None:
 
 
 def check_matcher_many_features(case: ContractCase) -> str:
-    """Require valid output for 4096 features per view.
+    """Require correct matches of 4096 and 5000 features in views of 1200 x 900 pixels.
 
     Real images have about 4096 features. A fixed buffer or a size limit of the matching network
-    must not end a run.
+    must not end a run, and must not leave the last features without matches.
     """
     if not case.declares("sparse"):
         raise CheckSkipped("the matcher needs no features")
-    a, b = case.example, case.example.partner
-    features = case.extract_features(a.view, b.view)
-    if not (len(features[0]) and len(features[1])):
+    shift = np.array([31.0, 17.0])
+    views = _noise_views(shift)
+    is_known = case.truth_source == "image"
+    if is_known:
+        counts = NUM_MANY_FEATURES, NUM_MANY_FEATURES + 904
+        given = [
+            _pad(f, n, v)
+            for f, n, v in zip(case.extract_features(*views), counts, views, strict=True)
+        ]
+    else:
+        found = case.extract_features(case.example.view, case.example.partner.view)
+        given = [_pad(f, NUM_MANY_FEATURES, v) for f, v in zip(found, views, strict=True)]
+    if not (len(given[0]) and len(given[1])):
         raise CheckSkipped("the detector finds no features to repeat")
-    many = _repeat(features[0], a), _repeat(features[1], b)
-    answer = validation.run_matcher(case.spec, case.provider, (a.view, b.view), many)
-    num_matches = 0 if answer.sparse is None else len(answer.sparse)
-    return f"{num_matches} matches of {NUM_MANY_FEATURES} features"
+    features = given[0], given[1]
+    answer = validation.run_matcher(case.spec, case.provider, views, features)
+    rows = np.empty((0, 2), np.int64) if answer.sparse is None else answer.sparse.indices
+    text = f"{len(rows)} matches of {len(given[0])} and {len(given[1])} features"
+    if is_known:
+        _require_many_correct(rows, features, shift)
+    return text
 
 
 def check_matcher_scores(case: ContractCase) -> str:
-    """Require a higher mean score of correct matches than of wrong ones.
+    """Require higher scores of reliable matches than of unreliable ones.
 
-    This check is skipped unless the matcher returns enough correct and wrong matches.
+    One half of the second view has strong noise. Scores of matches there, and of wrong matches,
+    must not be higher. Equal scores of all matches are allowed.
     """
-    case.require_truth("image", "prepared")
+    case.require_truth("image")
     a, b = case.example, case.example.partner
-    matches = match_points(case, a, b, case.run(a))
-    _require_enough(len(matches))
-    right = match_errors_px(a, b, matches) < MATCH_TOLERANCE_STD * max(1.0, matches.std_px)
-    if min(right.sum(), (~right).sum()) < MIN_MATCHES:
-        return f"{right.sum()} right and {(~right).sum()} wrong matches: too few to compare"
-    means = matches.scores[right].mean(), matches.scores[~right].mean()
-    if means[0] < means[1]:
-        raise CheckFailed(f"correct matches score {means[0]:.2f}, wrong matches {means[1]:.2f}")
-    return f"correct matches score {means[0]:.2f}, wrong matches {means[1]:.2f}"
+    samples = []
+    for amplitude in (20, 40, 70):
+        matches = _match_with_noise(case, a, b, amplitude)
+        _require_enough(len(matches))
+        if len(matches) and np.ptp(matches.scores) < 1e-3:
+            return f"all matches have the score {matches.scores[0]:.2f}"
+        errors = match_errors_px(a, b, matches)
+        right = errors < MATCH_TOLERANCE_STD * max(1.0, matches.std_px)
+        noisy = matches.points_b[:, 0] < b.camera.width // 2
+        clean, bad = right & ~noisy, ~right | noisy
+        if min(clean.sum(), bad.sum()) >= MIN_MATCHES:
+            samples.append((matches.scores[clean], matches.scores[bad]))
+    if not samples:
+        raise CheckUndecided("too few matches of reliable and unreliable points to compare scores")
+    order = [order_probability(*pair) for pair in samples]
+    better = float(np.mean(order))
+    means = [float(np.mean([part[i].mean() for part in samples])) for i in (0, 1)]
+    text = f"reliable matches score {means[0]:.2f}, unreliable matches {means[1]:.2f}"
+    if better < _MIN_ORDER:
+        raise CheckFailed(text)
+    return text
 
 
 def check_matcher_pair_depth(case: ContractCase) -> str:
@@ -142,13 +226,13 @@ def check_matcher_pair_depth(case: ContractCase) -> str:
     case.require_truth("painted", "prepared")
     a, b = case.example, case.example.partner
     depth = case.run(a).depth
+    error = max(_depth_error(depth.depth_a, a), _depth_error(depth.depth_b, b))
+    if max(_depth_error(depth.depth_a, b), _depth_error(depth.depth_b, a)) < 0.5 * error:
+        raise CheckFailed("depth_a and depth_b are swapped")
     for prior, example in ((depth.depth_a, a), (depth.depth_b, b)):
         power = map_errors.estimate_ray_exponent(prior, example)
         if abs(power) > RAY_TOLERANCE:
             raise CheckFailed(f"depth is proportional to z * (ray length / z) ** {power:.2f}")
-    error = max(_depth_error(depth.depth_a, a), _depth_error(depth.depth_b, b))
-    if max(_depth_error(depth.depth_a, b), _depth_error(depth.depth_b, a)) < 0.5 * error:
-        raise CheckFailed("depth_a and depth_b are swapped")
     if error > DEPTH_TOLERANCE:
         raise CheckFailed(f"the depth of the image pair has a relative error of {error:.2g}")
     return f"relative error {error:.2g}"
@@ -157,6 +241,8 @@ def check_matcher_pair_depth(case: ContractCase) -> str:
 CHECKS = (
     check_matcher_sides,
     check_matcher_order,
+    check_matcher_sizes,
+    check_matcher_coverage,
     check_matcher_pixel_convention,
     check_matcher_no_features,
     check_matcher_few_features,
@@ -206,15 +292,86 @@ def _take_first(features: Features, count: int) -> Features:
     )
 
 
-def _repeat(features: Features, example: Example) -> Features:
-    """Repeat features with small random changes until there are NUM_MANY_FEATURES."""
-    rows = np.arange(NUM_MANY_FEATURES) % len(features)
+def _describe_residual(
+    residual: Float64, std_px: float, expected: float, where: str, counts: list[int]
+) -> str:
+    """Require a small median residual (n, 2) in pixels, or return "" if there are few matches."""
+    near = np.abs(residual).max(axis=1) < 4 * max(1.0, std_px)
+    counts.append(int(near.sum()))
+    if near.sum() < MIN_MATCHES:
+        return ""
+    shift = np.median(residual[near], axis=0)
+    noise = 3 * float(np.median(np.abs(residual[near] - shift))) / np.sqrt(near.sum())
+    limit = max(0.4 * expected * max(1.0, std_px), noise)
+    text = f"shifted by ({shift[0]:+.2f}, {shift[1]:+.2f}) px"
+    if np.abs(shift).max() > limit:
+        raise CheckFailed(f"matches {where} are {text}")
+    return text
+
+
+def _match_rotated(case: ContractCase) -> DenseMatches:
+    """Match the example with itself, rotated by 180 degrees."""
+    view = case.example.view
+    rotated = replace(view, name="rotated.png", image=np.ascontiguousarray(view.image[::-1, ::-1]))
+    answer = validation.run_matcher(case.spec, case.provider, (view, rotated), None)
+    assert answer.dense is not None  # The validator guarantees that the field is present.
+    return answer.dense
+
+
+def _match_with_noise(case: ContractCase, a: Example, b: Example, amplitude: int) -> DenseMatches:
+    """Match two views, the second with noise in its left half."""
+    noise = np.random.default_rng(0).normal(0, amplitude, b.view.image.shape)
+    noise[:, b.camera.width // 2 :] = 0
+    image = np.clip(b.view.image + noise, 0, 255).astype(np.uint8)
+    views = a.view, replace(b.view, name=f"noise-{amplitude}.png", image=image)
+    features = case.extract_features(*views)
+    answer = validation.run_matcher(case.spec, case.provider, views, features)
+    return point_matches(answer, features)
+
+
+def _noise_views(shift: Float64) -> tuple[View, View]:
+    """Return two rectangles (1200 x 900) of one random texture, the second moved by ``shift``."""
+    import cv2  # The import is local, because pytest loads this module when it collects tests.
+
+    width, height = LARGE_SIZE
+    x, y = map(int, shift)
+    noise = np.random.default_rng(0).normal(size=(height + y, width + x, 3))
+    fine, coarse = (cv2.GaussianBlur(noise, (0, 0), sigma) * sigma for sigma in (1.5, 5.0))
+    image = np.clip(128 + 90 * (fine + coarse), 0, 255).astype(np.uint8)
+    camera = PinholeCamera(width, height, 1000.0, 900.0, 560.0, 470.0)
+    return (
+        View("many/a.png", np.ascontiguousarray(image[:height, :width]), camera),
+        View("many/b.png", np.ascontiguousarray(image[y:, x:]), camera),
+    )
+
+
+def _require_many_correct(rows: Int64, features: tuple[Features, Features], shift: Float64) -> None:
+    """Require that matches of two translated views are correct and use all features."""
+    _require_enough(len(rows))
+    a, b = (f.keypoints[rows[:, column]] for column, f in enumerate(features))
+    limit = MATCH_TOLERANCE_STD * max(1.0, *(f.std_px for f in features))
+    right = float((np.linalg.norm(a - shift - b, axis=1) < limit).mean())
+    if right < _MIN_CORRECT_RATIO:
+        raise CheckFailed(f"only {right:.0%} of {len(rows)} matches of many features are correct")
+    for column, name in enumerate(("first", "second")):
+        used = float((rows[:, column].max() + 1) / len(features[column]))
+        if len(rows) >= MIN_COVERING and used < _MIN_USED_RATIO:
+            raise CheckFailed(f"the matches use only the first {used:.0%} of the {name} features")
+
+
+def _pad(features: Features, count: int, view: View) -> Features:
+    """Repeat features with small random changes, or drop some, so that there are ``count``."""
+    if not len(features):
+        return features
     rng = np.random.default_rng(0)
-    keypoints = features.keypoints[rows] + rng.uniform(-1, 1, (len(rows), 2))
+    extra = np.arange(max(count - len(features), 0)) % len(features)
+    # In random order, so that matches of any rows are equally likely.
+    rows = rng.permutation(np.concatenate([np.arange(len(features)), extra]))[:count]
+    keypoints = features.keypoints[rows] + rng.uniform(-0.5, 0.5, (len(rows), 2))
     descriptors = features.descriptors[rows]
     noise = 0.01 * descriptors.std() * rng.normal(size=descriptors.shape)
     return Features(
-        np.clip(keypoints, 0, example.camera.size),
+        np.clip(keypoints, 0, view.camera.size),
         (descriptors + noise).astype(np.float32),
         None if features.scores is None else features.scores[rows],
         None if features.scales is None else features.scales[rows],

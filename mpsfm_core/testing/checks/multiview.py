@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, Float64, MultiViewPrior
@@ -17,6 +19,7 @@ from mpsfm_core.geometry import (
 from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.accuracy import DEPTH_TOLERANCE, require_small_shift
 from mpsfm_core.testing.checks import depth as checks_depth
+from mpsfm_core.testing.checks.maps import require_depth_std
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
@@ -30,6 +33,8 @@ BASELINE_TOLERANCE = 0.1
 FOCAL_TOLERANCE = 0.1
 """Largest accepted relative error of a focal length or principal point whose ground truth is known.
 A wrong pixel grid or swapped axes cause a relative error of at least 0.25."""
+_GROUP_SIZES = (2, 5, 9)
+"""Numbers of views in the tested groups."""
 _FOCAL_RATIO_RANGE = (1.5, 2.7)
 """Accepted range for the ratio of the focal lengths that a provider estimates for a view of twice
 the size and for the original view."""
@@ -105,9 +110,11 @@ def check_multiview_pose_unit(case: ContractCase) -> str:
     """Require that predicted translations have the unit of the predicted depth."""
     poses, examples = _predict_poses(case)
     unit = float(np.exp(np.median(_log_factors(case.run_on_group(*examples), examples))))
-    true = _relative(_true_poses(examples), len(examples) - 1)[1]
-    found = _relative(poses, len(examples) - 1)[1]
-    factor = float(np.linalg.norm(found) / np.linalg.norm(true)) / unit
+    factors = []
+    for index in range(1, len(examples)):
+        found, true = (_relative(p, index)[1] for p in (poses, _true_poses(examples)))
+        factors.append(float(np.linalg.norm(found) / np.linalg.norm(true)) / unit)
+    factor = max(factors, key=lambda value: abs(np.log(value)))
     if abs(np.log(factor)) > BASELINE_TOLERANCE:
         raise CheckFailed(
             f"predicted translations are {factor:.3g} times as long as the unit of depth implies"
@@ -123,7 +130,9 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
     if not case.declares("proposes-intrinsics"):
         raise CheckSkipped("the provider does not declare 'proposes-intrinsics'")
     width, height = case.example.camera.size
-    examples = (case.example, case.example.sized(2 * width, 2 * height))
+    common = case.example.with_common_camera()
+    sizes = ((2 * width, 2 * height), (height, width))
+    examples = (common, *(case.example.sized(*size).with_common_camera() for size in sizes))
     found = case.run_on_group(*examples).intrinsics
     assert found is not None  # The validator guarantees that the field is present.
     if case.truth_source == "none":
@@ -137,6 +146,37 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
         if error > FOCAL_TOLERANCE:
             raise CheckFailed(f"the predicted {name} is {np.expm1(error):.0%} off")
     return f"off by {np.expm1(off.max()):.1%}"
+
+
+def check_multiview_group_sizes(case: ContractCase) -> str:
+    """Require the usual accuracy for groups of 2, 5 and 9 views of different sizes.
+
+    A run calls the multi-view network with as many views as overlap.
+    """
+    views, width, height = [case.example], *case.example.camera.size
+    for index in range(1, max(_GROUP_SIZES)):
+        neighbor = views[-1].partner if index % 4 else case.example
+        cropped = neighbor.crop(8 * (index % 3), 6 * (index % 2), width - 24, height - 6)
+        views.append(replace(cropped if index % 2 else neighbor, name=f"{index}/{neighbor.name}"))
+    worst = 0.0
+    for size in _GROUP_SIZES:
+        examples = tuple(views[:size])
+        group = case.run_on_group(*examples)
+        if case.truth_source == "none":
+            continue
+        for index, (prior, example) in enumerate(_pairs(group, examples)):
+            error = _scale_free_error(prior, example)
+            worst = max(worst, error)
+            if error > DEPTH_TOLERANCE:
+                raise CheckFailed(
+                    f"view {index + 1} of a group of {size} has a relative error of {error:.2g}"
+                )
+            if case.truth_source in ("painted", "prepared"):
+                require_depth_std(prior, example)
+        spread = float(np.ptp(_log_factors(group, examples)))
+        if spread > DEPTH_TOLERANCE:
+            raise CheckFailed(f"the units of the maps in a group of {size} differ")
+    return f"relative error {worst:.2g}" if worst else "the truth is unknown"
 
 
 def check_multiview_alone(case: ContractCase) -> None:
@@ -179,6 +219,7 @@ CHECKS = (
     check_multiview_poses,
     check_multiview_pose_unit,
     check_multiview_intrinsics,
+    check_multiview_group_sizes,
     check_multiview_alone,
     check_multiview_sizes,
 )

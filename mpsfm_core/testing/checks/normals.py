@@ -14,13 +14,13 @@ from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.accuracy import NORMALS_TOLERANCE_DEG, require_small_shift
 from mpsfm_core.testing.checks.maps import (
     require_monotonic_calibration,
-    require_reported_std,
+    require_normals_std,
     require_true_validity,
     swap_painted_channels,
 )
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
-from mpsfm_core.testing.painted_views import NORMALS_STD, read_normals
+from mpsfm_core.testing.painted_views import read_normals
 
 FLIP_TOLERANCE_DEG = 15.0
 """Largest accepted angle in degrees between normals of a view and of the mirrored view if the
@@ -127,8 +127,7 @@ def check_normals_variance(case: ContractCase) -> str:
     prior = _run(case)
     if prior.variance is None:
         raise CheckSkipped("has no variance")
-    where = map_errors.select_comparable(prior.valid, case.example.truth(prior.shape))
-    return require_reported_std(prior.variance[where], np.full(int(where.sum()), NORMALS_STD))
+    return require_normals_std(prior, case.example)
 
 
 def check_normals_calibration(case: ContractCase) -> None:

@@ -62,8 +62,34 @@ def check_retrieval_overlap(case: ContractCase) -> str:
     return f"similarity {neighbor:.3f} to a neighboring view, {unrelated:.3f} to another scene"
 
 
+def check_retrieval_sizes(case: ContractCase) -> str:
+    """Require a higher similarity to a smaller, larger or cropped copy than to another scene.
+
+    Photos of one scene have different sizes, and portrait format.
+    """
+    case.require_truth("image", "prepared")
+    width, height = case.example.camera.size
+    example, other = case.example, outdoor_example("textured", (width, height))
+    copies = {
+        "smaller": example.sized(2 * width // 3, 2 * height // 3),
+        "larger": example.sized(2 * width, 2 * height),
+        "portrait": example.crop(width // 4, 0, 2 * width // 3, height),
+    }
+    vector = case.run(example).astype(np.float64)
+    unrelated = max(float(vector @ case.run(e)) for e in (other, other.sized(height, width)))
+    similarity = {name: float(vector @ case.run(copy)) for name, copy in copies.items()}
+    for name, value in similarity.items():
+        if value <= unrelated:
+            raise CheckFailed(
+                f"the similarity is {value:.3f} to a {name} copy of the view, but {unrelated:.3f} "
+                f"to another scene"
+            )
+    return f"similarity at least {min(similarity.values()):.3f} to copies of other sizes"
+
+
 CHECKS = (
     check_retrieval_dimension,
     check_retrieval_self_similarity,
     check_retrieval_overlap,
+    check_retrieval_sizes,
 )

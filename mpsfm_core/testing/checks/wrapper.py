@@ -5,10 +5,22 @@ A wrapper has to pass the checks of this module and all checks of the provider k
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from mpsfm_core.testing.accuracy import compare_with_truth
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+
+_STD_RANGE = (0.5, 4.0)
+"""Accepted range of the ratio between the std of the wrapper and of the wrapped provider. The mean
+of two predictions can halve the variance, and their difference increases it."""
+_MAX_STD_SPREAD = 1.7
+"""Largest accepted ratio between the 90 % and 10 % quantiles of these ratios. The wrapped std
+varies by a factor of 3."""
+_MAX_FILLED_RATIO = 0.05
+"""Largest accepted ratio of pixels without a value that a wrapper makes valid."""
 
 
 def check_wrapper_keeps_variance(case: ContractCase) -> None:
@@ -68,10 +80,72 @@ def check_wrapper_hands_on_depth(case: ContractCase) -> None:
         raise CheckFailed("the wrapper does not pass the depth prior to the wrapped provider")
 
 
+def check_wrapper_variance(case: ContractCase) -> str:
+    """Require a variance in the unit and at the pixels of the wrapped provider's variance.
+
+    A wrapper may increase the variance, but the std of the wrapped provider has to remain visible.
+    """
+    inner, answer = _run_inner(case), case.run(case.example)
+    if answer.variance is None or answer.shape != inner.shape:
+        raise CheckSkipped("the wrapper returns no variance of the wrapped map's size")
+    both = answer.valid & inner.valid & case.example.truth(inner.shape).smooth
+    ratio = np.sqrt(answer.variance[both].astype(np.float64) / inner.variance[both])
+    low, factor, high = map(float, np.quantile(ratio, (0.1, 0.5, 0.9)))
+    if not _STD_RANGE[0] < factor < _STD_RANGE[1]:
+        raise CheckFailed(f"the std is {factor:.2g} times the std of the wrapped provider")
+    if high > _MAX_STD_SPREAD * low:
+        raise CheckFailed(
+            f"the std is {low:.2g} to {high:.2g} times the std of the wrapped provider: the "
+            "variance belongs to other pixels or is averaged"
+        )
+    return f"std {factor:.2f} times that of the wrapped provider"
+
+
+def check_wrapper_low_resolution(case: ContractCase) -> str:
+    """Require the usual accuracy if the wrapped provider returns maps of half the size."""
+    return compare_with_truth(
+        case, case.example, case.run(case.example, case.create_provider(reduction=2))
+    )
+
+
+def check_wrapper_validity(case: ContractCase) -> str:
+    """Require invalid pixels where the wrapped provider has no value."""
+    inner, answer = _run_inner(case), case.run(case.example)
+    if answer.shape != inner.shape:
+        raise CheckSkipped("the map of the wrapper has another size")
+    wrong = float(answer.valid[~inner.valid].mean())
+    if wrong > _MAX_FILLED_RATIO:
+        raise CheckFailed(f"{wrong:.0%} of the invalid pixels of the wrapped provider are valid")
+    return f"{wrong:.1%} of the invalid pixels are valid"
+
+
+def check_wrapper_inputs(case: ContractCase) -> None:
+    """Require that the wrapped provider receives camera and depth of the view that it receives.
+
+    If a wrapper mirrors the view, the principal point and the depth prior have to be mirrored.
+    """
+    provider = case.create_provider()
+    case.wrong_inputs().clear()
+    case.run(case.example, provider)
+    wrong = case.wrong_inputs()
+    if wrong:
+        raise CheckFailed(f"the wrapped provider receives a wrong input: {wrong[0]}")
+
+
 CHECKS = (
     check_wrapper_keeps_variance,
     check_wrapper_without_variance,
     check_wrapper_keeps_unit,
     check_wrapper_uses_the_provider,
     check_wrapper_hands_on_depth,
+    check_wrapper_variance,
+    check_wrapper_low_resolution,
+    check_wrapper_validity,
+    check_wrapper_inputs,
 )
+
+
+def _run_inner(case: ContractCase) -> Any:
+    """Return the output of the wrapped provider itself."""
+    case.prepare(case.example)
+    return case.run_inner(case.example.view)

@@ -1,0 +1,146 @@
+"""Global state of this process, which providers must not change."""
+
+from __future__ import annotations
+
+import logging
+import os
+import pickle
+import random
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mpsfm_core.providers import ProviderContext
+
+_SEED = 271828
+"""Seed of the global random numbers during a check, which no provider's own seed reproduces."""
+_ENVIRONMENT = "environment variables"
+_THREADS = ("the threads of OpenCV", "the threads of torch")
+"""Numbers of threads, which a provider may set to that of its context."""
+_NUM_THREADS = 3
+_TORCH_NUMBERS = "the random numbers of torch"
+
+
+@dataclass(frozen=True)
+class ProcessSettings:
+    """Values of global state by the name that messages use."""
+
+    values: dict[str, Any]
+    environment: dict[str, str]
+    """Environment variables of the process."""
+
+    def changes(self, later: ProcessSettings, *, without_torch_numbers: bool = False) -> str:
+        """Describe the first value that differs later, or return an empty text.
+
+        Args:
+            later: Values that were read later.
+            without_torch_numbers: True ignores torch's random numbers, because the constructors of
+                torch's layers draw random weights.
+        """
+        for name, value in self.values.items():
+            if without_torch_numbers and name == _TORCH_NUMBERS:
+                continue
+            now = later.values.get(name, value)
+            if now != value and not (name in _THREADS and now == ProviderContext.threads):
+                return name
+        if _ENVIRONMENT in self.values:
+            old, new = self.environment, later.environment
+            names = [key for key in {**old, **new} if old.get(key) != new.get(key)]
+            if names:
+                return f"the environment variables {', '.join(sorted(names))}"
+        return ""
+
+
+def read_process_settings() -> ProcessSettings:
+    """Read settings that importing a library does not change."""
+    torch: Any = sys.modules.get("torch")
+    is_loaded = torch is not None and hasattr(torch, "is_grad_enabled")
+    root = logging.getLogger()
+    return ProcessSettings(
+        {
+            "the error handling of numpy": np.geterr(),
+            "the print options of numpy": np.get_printoptions(),
+            "the recursion limit": sys.getrecursionlimit(),
+            "the working directory": str(Path.cwd()),
+            "the level of the root logger": root.level,
+            "the handlers of the root logger": list(map(id, root.handlers)),
+            "the warning filters": [f for f in warnings.filters if _is_blanket(f)],
+            "the gradient mode of torch": torch.is_grad_enabled() if is_loaded else True,
+            "the default type of torch": (
+                str(torch.get_default_dtype()) if is_loaded else "torch.float32"
+            ),
+            "standard output": id(sys.stdout),
+        },
+        dict(os.environ),
+    )
+
+
+def read_process_state() -> ProcessSettings:
+    """Read all global state, including random numbers, environment variables and files."""
+    torch: Any = sys.modules.get("torch")
+    cv2: Any = sys.modules.get("cv2")
+    settings = read_process_settings()
+    values = settings.values | {
+        "the random numbers of numpy": pickle.dumps(np.random.get_state()),
+        "the random numbers of Python": random.getstate(),
+        "the files of the working directory": sorted(p.name for p in Path.cwd().iterdir()),
+        "the module search path": list(sys.path),
+        _ENVIRONMENT: None,
+    }
+    if cv2 is not None:
+        values["the threads of OpenCV"] = cv2.getNumThreads()
+    if torch is not None and hasattr(torch, "get_rng_state"):
+        values["the seed of torch"] = torch.initial_seed()
+        values["the threads of torch"] = torch.get_num_threads()
+        values[_TORCH_NUMBERS] = torch.get_rng_state().numpy().tobytes()
+    return ProcessSettings(values, settings.environment)
+
+
+@contextmanager
+def known_process_state(before: ProcessSettings) -> Iterator[None]:
+    """Undo earlier changes of environment and random numbers, and restore them afterwards.
+
+    A change that a provider makes again in each call is visible in the block. The working directory
+    is an empty folder.
+
+    Args:
+        before: Settings before the provider was created.
+    """
+    environment, folder = dict(os.environ), Path.cwd()
+    cv2: Any = sys.modules.get("cv2")
+    numbers, python_numbers = np.random.get_state(), random.getstate()
+    torch: Any = sys.modules.get("torch")
+    with ExitStack() as stack:
+        if torch is not None and hasattr(torch, "random"):
+            stack.enter_context(torch.random.fork_rng(devices=[]))
+            torch.manual_seed(_SEED)
+            stack.callback(torch.set_num_threads, torch.get_num_threads())
+            torch.set_num_threads(_NUM_THREADS)
+        if cv2 is not None:
+            stack.callback(cv2.setNumThreads, cv2.getNumThreads())
+            cv2.setNumThreads(_NUM_THREADS)
+        os.chdir(stack.enter_context(tempfile.TemporaryDirectory(prefix="mpsfm-state-")))
+        for key in set(environment) - set(before.environment):
+            del os.environ[key]
+        np.random.seed(_SEED)
+        random.seed(_SEED)
+        try:
+            yield
+        finally:
+            os.chdir(folder)
+            os.environ.update(environment)
+            np.random.set_state(numbers)
+            random.setstate(python_numbers)
+
+
+def _is_blanket(rule: Any) -> bool:
+    """Return whether a warning filter applies to all warnings of all modules."""
+    _, message, category, module, _ = rule
+    return message is None and module is None and category is Warning
