@@ -275,8 +275,8 @@ class ContractCase:
             return None
         return tuple(self._detect(view) for view in views)
 
-    def received_depth(self) -> list[DepthPrior | None]:
-        """Return the depth priors that a wrapper passed to its normals provider, one per call."""
+    def received_depth(self) -> list[bool]:
+        """Return whether each call of a wrapped normals provider received a depth prior."""
         return [] if self._ground_truth is None else self._ground_truth.received_depth
 
     def run_inner(self, view: View) -> Any:

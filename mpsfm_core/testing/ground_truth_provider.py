@@ -37,8 +37,8 @@ class GroundTruth:
     """
 
     def __init__(self) -> None:
-        self.received_depth: list[DepthPrior | None] = []
-        """Depth prior that each call of the normals provider received."""
+        self.received_depth: list[bool] = []
+        """True for each call of the normals provider that received a depth prior."""
         self.wrong_inputs: list[str] = []
         """What was wrong in the cameras and depth priors that the wrapper passed on."""
         self._examples: list[Example] = []
@@ -70,7 +70,7 @@ class GroundTruth:
 
     def receive_depth(self, view: View, depth: DepthPrior | None) -> None:
         """Record the depth prior that a wrapper passes to its normals provider."""
-        self.received_depth.append(depth)
+        self.received_depth.append(depth is not None)
         example = self._recognize(view)
         if depth is None or example is None:
             return

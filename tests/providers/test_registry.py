@@ -350,7 +350,7 @@ class TestSpecifications:
         assert registry.version("depth", "mpsfm-b:flat").startswith("mpsfm-b")
         config = ProviderConfig(use="mpsfm-b:flat")
         assert registry.calibration("depth", config) == DepthCalibration()
-        with pytest.raises(ProviderError, match="did you mean 'mpsfm-.:flat'"):
+        with pytest.raises(ProviderError, match=r"did you mean 'mpsfm-.:flat'"):
             registry.spec("depth", "mpsfm-c:flat")
 
     def test_unknown_names_are_answered_with_the_nearest(self) -> None:

@@ -126,7 +126,7 @@ def check_deterministic(case: ContractCase) -> None:
 
 
 def check_no_state(case: ContractCase) -> None:
-    """Require that the output does not depend on earlier calls, nor earlier output on later calls.
+    """Require that the output does not depend on other calls, earlier or later.
 
     A run calls a provider for the images in any order. An output that shares memory with a buffer
     of the provider changes in later calls.

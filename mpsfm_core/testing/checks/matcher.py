@@ -32,9 +32,9 @@ MIN_COVERING = 40
 _MIN_COVERED_CELLS = 6
 _MIN_USED_RATIO = 0.9
 """Smallest accepted ratio of the largest matched feature index and the number of features."""
-_MIN_ORDER = 0.4
+_MIN_ORDER = 0.55
 """Smallest accepted probability that a reliable match has a higher score than an unreliable one.
-The probability is 0.5 for random scores and near 0 for inverted scores."""
+The probability is 0.5 for random scores, near 0 for inverted ones and 0.8 for nearest neighbors."""
 _MIN_CORRECT_RATIO = 0.5
 """Smallest accepted ratio of correct matches for an image pair with a small baseline. The ratio of
 correct matches is 0.99 for nearest neighbors of SIFT and 0.96 for LighterGlue."""
@@ -55,19 +55,25 @@ def check_matcher_order(case: ContractCase) -> str:
 def check_matcher_sizes(case: ContractCase) -> str:
     """Require correct matches of views with different sizes, in both orders.
 
-    The second view is a portrait rectangle of a neighboring view, or a larger rectangle around it,
-    at the same scale.
+    The second view is a wide, a portrait or a larger rectangle of a neighboring view, at the same
+    scale. A dense matcher that resizes each view to one size and is not invariant to scale has to
+    match one of these pairs.
     """
     case.require_truth("image")
     width, height = case.example.camera.size
     neighbor = case.example.partner
+    wide = neighbor.crop(0, height // 8, width, 3 * height // 4)
     portrait = neighbor.crop(width // 4, 0, height // 2 + 13, height)
     larger = neighbor.crop(-3 * width // 4, -height // 4, 2 * width, 5 * height // 4)
-    texts = [
-        _require_correct(case, *pair)
-        for other in (portrait, larger)
-        for pair in ((case.example, other), (other, case.example))
-    ]
+    texts, failures = [], []
+    for other in (wide, portrait, larger):
+        try:
+            for pair in ((case.example, other), (other, case.example)):
+                texts.append(_require_correct(case, *pair))
+        except CheckFailed as failed:
+            failures.append(str(failed))
+    if failures and (len(failures) == 3 or not case.declares("dense")):
+        raise CheckFailed(f"views of different sizes: {failures[0]}")
     return texts[0]
 
 

@@ -76,7 +76,7 @@ def check_wrapper_hands_on_depth(case: ContractCase) -> None:
         raise CheckSkipped("the check applies to normals only")
     case.run(case.example, case.create_provider())
     given = case.received_depth()
-    if not given or any(depth is None for depth in given):
+    if not (given and all(given)):
         raise CheckFailed("the wrapper does not pass the depth prior to the wrapped provider")
 
 
