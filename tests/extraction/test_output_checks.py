@@ -1,0 +1,49 @@
+"""Tests of the warnings about providers that are wrong for every image of a run."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera
+from mpsfm_core.data.mapping_problem import MappingImage
+from mpsfm_core.extraction.output_checks import find_partial_coverage
+
+CAMERA = PinholeCamera(2000, 1500, 1600.0, 1600.0, 1000.0, 750.0)
+
+
+def images_with_keypoints(
+    low: tuple[float, float], high: tuple[float, float], count: int = 4
+) -> list[MappingImage]:
+    """Return images whose keypoints lie between two corners, as ratios of the image size."""
+    rng = np.random.default_rng(0)
+    depth = DepthPrior.from_arrays(np.ones((2, 2)), np.full((2, 2), 0.01))
+    facing = np.broadcast_to((0.0, 0.0, -1.0), (2, 2, 3))
+    normals = NormalPrior.from_arrays(facing, np.full((2, 2), 0.01))
+    return [
+        MappingImage(
+            f"{i}.jpg", CAMERA, rng.uniform(low, high, (200, 2)) * CAMERA.size, depth, normals
+        )
+        for i in range(count)
+    ]
+
+
+def test_find_partial_coverage_of_reduced_image_names_provider() -> None:
+    warning = find_partial_coverage(images_with_keypoints((0, 0), (0.32, 0.32)), "my-features")
+    assert "'my-features' finds keypoints only in the upper left 32% x 32% of all 4" in warning
+    assert "mpsfm plugins check my-features" in warning
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "count"),
+    [
+        ((0.0, 0.0), (1.0, 1.0), 4),
+        ((0.0, 0.4), (1.0, 1.0), 4),  # sky
+        ((0.3, 0.2), (0.7, 0.75), 4),  # an object in the center
+        ((0.0, 0.0), (0.3, 0.3), 2),
+    ],
+)
+def test_find_partial_coverage_of_usual_images_is_silent(
+    low: tuple[float, float], high: tuple[float, float], count: int
+) -> None:
+    assert find_partial_coverage(images_with_keypoints(low, high, count), "sift") == ""
