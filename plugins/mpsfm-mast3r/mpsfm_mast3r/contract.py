@@ -36,7 +36,11 @@ def dense(folder: Path) -> ContractSetup:
 
 def sparse(folder: Path) -> ContractSetup:
     """Write MASt3R's replacement network for matching the keypoints of any detector."""
-    return ContractSetup(options=_stand_in(folder), truth_source="image")
+    return ContractSetup(
+        options=_stand_in(folder),
+        truth_source="image",
+        expected_failures={"matcher-sizes": "comparing patches is not invariant to scale"},
+    )
 
 
 def _stand_in(folder: Path) -> dict[str, Any]:

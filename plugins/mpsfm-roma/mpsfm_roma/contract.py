@@ -58,7 +58,9 @@ def dense(folder: Path) -> ContractSetup:
 def sparse(folder: Path) -> ContractSetup:
     """Write RoMa's replacement network, and match keypoints within 3 pixels of the warp."""
     return ContractSetup(
-        options={**_stand_in(folder), "snap_px": 3.0, "min_certainty": 0.5}, truth_source="image"
+        options={**_stand_in(folder), "snap_px": 3.0, "min_certainty": 0.5},
+        truth_source="image",
+        expected_failures={"matcher-sizes": "comparing patches is not invariant to scale"},
     )
 
 
