@@ -13,11 +13,11 @@ import numpy as np
 
 from mpsfm_core.data import Bool, DenseMatches, Features, Float64, PairMatches
 from mpsfm_core.testing import map_errors
-from mpsfm_core.testing.checks.maps import require_depth_std, require_normals_std
 from mpsfm_core.testing.contract_case import ContractCase, first_depth
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.map_errors import MapShift
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUndecided
+from mpsfm_core.testing.std_errors import require_depth_std, require_normals_std
 
 DEPTH_TOLERANCE = 0.05
 """Tolerance for the 80 % quantile of the relative depth error. Correct providers have a relative

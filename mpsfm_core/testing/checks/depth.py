@@ -14,10 +14,7 @@ from mpsfm_core.providers import validation
 from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.accuracy import DEPTH_TOLERANCE, NORMALS_TOLERANCE_DEG, require_small_shift
 from mpsfm_core.testing.checks.maps import (
-    STD_FACTOR,
-    require_depth_std,
     require_monotonic_calibration,
-    require_normals_std,
     require_true_validity,
     swap_painted_channels,
 )
@@ -25,6 +22,7 @@ from mpsfm_core.testing.contract_case import ContractCase, describe_difference, 
 from mpsfm_core.testing.examples import Example, distant_example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.painted_views import read_depth
+from mpsfm_core.testing.std_errors import STD_FACTOR, require_depth_std, require_normals_std
 
 RAY_TOLERANCE = 0.25
 """Largest accepted exponent p in ``depth = z * (ray length / z) ** p``, which is 0 for z-depth and

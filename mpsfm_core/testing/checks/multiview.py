@@ -19,10 +19,10 @@ from mpsfm_core.geometry import (
 from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.accuracy import DEPTH_TOLERANCE, require_small_shift
 from mpsfm_core.testing.checks import depth as checks_depth
-from mpsfm_core.testing.checks.maps import require_depth_std
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+from mpsfm_core.testing.std_errors import require_depth_std
 
 ROTATION_TOLERANCE_DEG = 1.0
 """Largest accepted error of a predicted relative rotation in degrees. The views of the test are

@@ -14,13 +14,13 @@ from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.accuracy import NORMALS_TOLERANCE_DEG, require_small_shift
 from mpsfm_core.testing.checks.maps import (
     require_monotonic_calibration,
-    require_normals_std,
     require_true_validity,
     swap_painted_channels,
 )
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.painted_views import read_normals
+from mpsfm_core.testing.std_errors import require_normals_std
 
 FLIP_TOLERANCE_DEG = 15.0
 """Largest accepted angle in degrees between normals of a view and of the mirrored view if the
