@@ -68,7 +68,7 @@ class ActiveProvider:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Names, code, versions, options, seed and file hashes of the provider and wrappers."""
+        """Names, code hashes, versions, options, seed and file hashes of provider and wrappers."""
         with self._lock:
             if self._identity is None:
                 self._identity = self._identify()
@@ -76,7 +76,7 @@ class ActiveProvider:
 
     @property
     def is_reusable(self) -> bool:
-        """True if later runs may reuse results, because the code of the provider is known."""
+        """True if the provider's code can be hashed, so that later runs may reuse its results."""
         return all(block["code"] is not None for block in self.identity["providers"])
 
     @property
@@ -90,7 +90,7 @@ class ActiveProvider:
 
     @property
     def workers(self) -> int:
-        """Number of threads that run the provider in parallel; 1 on a GPU or for one object."""
+        """Number of threads that run the provider, 1 on a GPU or for an object of the caller."""
         if isinstance(self.spec.factory, ProviderInstance):
             return 1
         return 1 if _device(self._runtime, self.spec) == "cuda" else worker_count(self._runtime)

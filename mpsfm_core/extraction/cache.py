@@ -104,10 +104,10 @@ def content_key(*parts: object) -> str:
 
 
 def digest(value: object) -> str:
-    """Return the SHA-256 of the arrays of a data object, whatever their memory layout.
+    """Return the SHA-256 of the arrays of a data object, independent of their memory layout.
 
     Raises:
-        TypeError: The object contains something that is no array, number or text.
+        TypeError: The data object contains a value that is no array, number or text.
     """
     sha256 = hashlib.sha256()
     for name, array in pack(value).items():

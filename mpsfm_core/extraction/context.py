@@ -141,7 +141,7 @@ class ExtractionContext:
 
     @cached_property
     def _run_cache(self) -> Cache:
-        """Cache that is deleted with the context, for providers whose code is unknown."""
+        """Temporary cache of this run, for results of providers whose code cannot be hashed."""
         parent = self.cache.folder.parent / RUNS
         parent.mkdir(parents=True, exist_ok=True)
         folder = mkdtemp(dir=parent)

@@ -26,7 +26,7 @@ class FeatureSource(Protocol):
     """Features of the images of a run, by image index."""
 
     def extract(self) -> list[Features]:
-        """Return the features of all images; the descriptors may be missing."""
+        """Return the features of all images, possibly without descriptors to save memory."""
 
     def __getitem__(self, index: int) -> Features:
         """Return the features of an image with descriptors."""
@@ -36,7 +36,7 @@ class FeatureSource(Protocol):
 
 
 class FeatureTable:
-    """Features of each image outside of masks, in an LRU cache in front of the disk cache."""
+    """Features of each image without masked areas, in an LRU cache in front of the disk cache."""
 
     def __init__(self, context: ExtractionContext, backend: ProviderConfig) -> None:
         self._context = context
@@ -80,11 +80,12 @@ class FeatureTable:
 
 
 class FeatureSet(Mapping[str, Features]):
-    """Features of each image by name, which are loaded from the cache when they are used.
+    """Features of each image by name, loaded from the cache on access.
 
     Attributes:
-        source: Features by image index.
-        provider: Configuration of the features provider, or None for features of the caller.
+        source: Source of the features, with access by image index.
+        provider: Configuration of the features provider, or None for features that the caller
+            computed.
     """
 
     def __init__(
@@ -105,7 +106,7 @@ class FeatureSet(Mapping[str, Features]):
 
 
 class GivenFeatures:
-    """Features that the caller computed, as a :class:`FeatureSource`."""
+    """Feature source with features that the caller computed."""
 
     def __init__(self, names: list[str], features: Mapping[str, Features]) -> None:
         self._features = [features.get(name, NO_FEATURES) for name in names]

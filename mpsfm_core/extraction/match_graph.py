@@ -32,36 +32,36 @@ class MatchGraph:
     names: tuple[str, ...]
     """Names of the images."""
     features: Mapping[str, Features]
-    """Features with descriptors and scores, by image name; empty for a detector-free matcher."""
+    """Features with descriptors and scores by image name, empty for a detector-free matcher."""
     assembled: AssembledMatches
     """Verified pairs, and keypoints of all images, by image index."""
     candidates: tuple[CandidateMatches, ...] = ()
     """Matches of all matched pairs before verification, by image index."""
     geometries: tuple[TwoViewGeometry, ...] = ()
-    """Two-view geometry of each candidate."""
+    """Two-view geometry of each matched pair, in the order of ``candidates``."""
     min_inliers: int = 0
     """Minimum number of inliers of a verified pair."""
     num_proposed: int = 0
-    """Number of selected pairs before plugins filter the pairs."""
+    """Number of selected image pairs before plugins filter the pairs."""
     matcher: PairMatcher | None = None
-    """Matchers of the run, for the depth that a matcher predicts."""
+    """Matchers of the run, which also give the depth that a matcher predicts, or None."""
 
     @property
     def keypoints(self) -> dict[str, Float64]:
         """Adjusted keypoints (n, 2) float64 by image name, in pixels of the undistorted view.
 
-        The keypoints of :attr:`features` come first, then points of dense matches.
+        The keypoints of :attr:`features` come first, followed by points of dense matches.
         """
         return dict(zip(self.names, self.assembled.keypoints, strict=True))
 
     @property
     def keypoint_std_px(self) -> dict[str, float]:
-        """Standard deviation of the detected keypoints in pixels, by image name."""
+        """Standard deviation of keypoint coordinates in pixels, by image name."""
         return dict(zip(self.names, self.assembled.std_px, strict=True))
 
     @property
     def verified(self) -> dict[NamePair, VerifiedPair]:
-        """Verified matches with scores and relative pose, by image names."""
+        """Verified pair with inlier matches, scores and relative pose, by pair of image names."""
         return {
             (self.names[pair.image_a], self.names[pair.image_b]): pair
             for pair in self.assembled.pairs
@@ -69,12 +69,12 @@ class MatchGraph:
 
     @property
     def matches(self) -> dict[NamePair, SparseMatches]:
-        """Matches of :attr:`features` before verification, with scores, by image names."""
+        """Matches of :attr:`features` with scores before verification, by pair of image names."""
         return {self._pair(found): found.sparse for found in self.candidates}
 
     @property
     def dropped(self) -> dict[NamePair, Reason]:
-        """Reason why each pair that could not be verified is dropped, by image names."""
+        """Reason why an image pair could not be verified, by pair of image names."""
         return {
             self._pair(found): geometry.drop_reason(len(found), self.min_inliers)
             for found, geometry in zip(self.candidates, self.geometries, strict=True)
@@ -87,14 +87,13 @@ class MatchGraph:
 
 @dataclass(frozen=True, eq=False)
 class Priors:
-    """Calibrated depth and normal priors of a set of images, on the grid of the mapper."""
+    """Depth and normal priors with calibrated variance, in the resolution that the mapper uses."""
 
     depth: Mapping[str, DepthPrior]
     """Depth prior with variance by image name."""
     normals: Mapping[str, NormalPrior]
     """Normal prior with variance by image name."""
     groups: Mapping[str, int] = field(default_factory=dict)
-    """Number of the group of a multi-view network by image name. The depth of a group has one
-    scale."""
+    """Group number by image name; a multi-view network predicts depth of a group in one scale."""
     proposed_poses: Mapping[str, Pose] = field(default_factory=dict)
-    """Pose ``cam_from_group`` that a multi-view network predicts, by image name."""
+    """Pose ``cam_from_group`` that a multi-view network predicted, by image name."""

@@ -1,4 +1,4 @@
-"""Mapping problems from arrays of the caller and results of extraction, in any mixture."""
+"""Construction of mapping problems from arrays of the caller and results of extraction."""
 
 from __future__ import annotations
 
@@ -56,28 +56,30 @@ def build_problem(
     verification: VerificationOptions | None = None,
     seed: int = 0,
 ) -> MappingProblem:
-    """Build the input of the mapper from arrays and results of other stages, in any mixture.
+    """Build the input of the mapper from arrays of the caller and results of other stages.
 
     Args:
         cameras: Pinhole camera of each image by name, or the result of
-            :func:`mpsfm_core.load_images`. The order of the names is the order of the images.
+            :func:`mpsfm_core.load_images`. The mapping problem has its images in the same order.
         matches: Result of :func:`mpsfm_core.match_images`, or matches by pair of image names. The
             matches of a pair are (m, 2) indices of keypoints, :class:`~mpsfm_core.SparseMatches`
-            with scores, or a :class:`~mpsfm_core.VerifiedPair`. All except verified pairs are
-            verified by COLMAP's LO-RANSAC, and pairs that cannot be verified are dropped.
+            with scores, or a :class:`~mpsfm_core.VerifiedPair`. Pairs that are not yet verified are
+            verified by COLMAP's LO-RANSAC, and dropped if the verification fails.
         keypoints: (n, 2) keypoints in COLMAP pixels of the undistorted view, or
-            :class:`~mpsfm_core.Features`, by image name. Not needed for a match graph.
-        depth: Depth prior by image name: a :class:`~mpsfm_core.DepthPrior`, a z-depth map (h, w),
-            or a tuple of depth map and variance map. Maps of any size cover the whole view and have
-            an unknown unit. A map without variance gets the default uncertainty. An image without
-            depth gets a plane parallel to the image with a large variance.
-        normals: Normal prior by image name: a :class:`~mpsfm_core.NormalPrior`, or unit normals
-            (h, w, 3) in the camera frame. The default is the normals of the depth map.
-        masks: (H, W) bool by image name, False where keypoints and depth are not used.
-        poses: Known pose ``cam_from_world`` by image name: ``pycolmap.Rigid3d``, a (3, 4) or (4, 4)
-            matrix, or a tuple of rotation (3, 3) and translation (3,).
-        verification: Options of the verification.
-        seed: Seed of the verification.
+            :class:`~mpsfm_core.Features`, by image name. Keypoints are not needed if ``matches`` is
+            a match graph.
+        depth: Depth prior by image name, as a :class:`~mpsfm_core.DepthPrior`, a z-depth map (h,
+            w), or a tuple of depth map and variance map. Depth maps of any size cover the whole
+            view, and arrays have an unknown unit. A depth map without variance gets the default
+            variance. An image without depth map gets a plane parallel to the image with a large
+            variance.
+        normals: Normal prior by image name, as a :class:`~mpsfm_core.NormalPrior` or unit normals
+            (h, w, 3) in the camera frame. By default, normals are computed from the depth map.
+        masks: Mask (H, W) bool by image name, False where keypoints and depth are not used.
+        poses: Known pose ``cam_from_world`` by image name, as ``pycolmap.Rigid3d``, a (3, 4) or (4,
+            4) matrix, or a tuple of rotation (3, 3) and translation (3,).
+        verification: Options of the geometric verification of matches.
+        seed: Random seed of the geometric verification of matches.
 
     Returns:
         Input of :func:`mpsfm_core.run_mapper`.
@@ -111,7 +113,7 @@ def build_problem(
 
 
 class _Builder:
-    """Collects cameras and keypoints by image name."""
+    """Collector of cameras and keypoints by image name, which builds a mapping problem."""
 
     def __init__(self, cameras: Cameras, masks: Mapping[str, Bool]) -> None:
         self._images = cameras if isinstance(cameras, ImageSet) else None
@@ -126,7 +128,7 @@ class _Builder:
         self._std_px = dict.fromkeys(self.names, 1.0)
 
     def check_names(self, what: str, values: Mapping[str, Any]) -> None:
-        """Raise InputError if a name is not that of an image."""
+        """Raise InputError if a key of ``values`` is not an image name."""
         for name in values:
             self._check_name(what, name)
 
@@ -148,7 +150,8 @@ class _Builder:
     def pairs(
         self, matches: Mapping[NamePair, Any], options: VerificationOptions, seed: int
     ) -> tuple[VerifiedPair, ...]:
-        """Verify the matches of all pairs, in the order of the images."""
+        """Verify all pairs that are not yet verified; return the pairs in the order of the
+        images."""
         found: dict[tuple[int, int], VerifiedPair] = {}
         for (name_a, name_b), given in matches.items():
             for name in (name_a, name_b):
@@ -169,7 +172,7 @@ class _Builder:
     def _verified(
         self, name_a: str, name_b: str, given: Any, options: VerificationOptions, seed: int
     ) -> VerifiedPair | None:
-        """Verify the matches of a pair; return None if they cannot be verified."""
+        """Verify the matches of an image pair, and return None if the verification fails."""
         if isinstance(given, SparseMatches):
             indices, scores = given.indices, given.scores
         else:
@@ -222,7 +225,7 @@ class _Builder:
         poses: Poses,
         factors: Mapping[str, Float64],
     ) -> MappingImage:
-        """Combine keypoints, priors and pose of an image."""
+        """Combine camera, keypoints, priors and known pose of an image for the mapping problem."""
         camera = self._cameras[name]
         prior = _depth_prior(name, depth.get(name))
         given_normals = _normal_prior(name, normals.get(name), camera, prior)
@@ -257,7 +260,7 @@ def _pinhole(name: str, camera: Any) -> PinholeCamera:
 
 
 def _depth_prior(name: str, given: Any) -> DepthPrior:
-    """Return a depth prior with variance; without a depth map, a plane parallel to the image."""
+    """Return a depth prior with variance, by default of a plane parallel to the image."""
     if given is None:
         flat = DepthPrior.from_arrays(np.ones(FLAT_GRID), metric=False)
         return FLAT_CALIBRATION.apply(flat)

@@ -1,4 +1,4 @@
-"""Report of an extraction: outcomes of pairs, statistics of images and usage of providers."""
+"""Extraction report with outcomes of pairs, statistics of images and usage of providers."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ class PairReport(TypedDict, total=False):
     """Outcome of the geometric verification of an image pair."""
 
     images: list[str]
-    """Names of both images."""
+    """Names of both images of the pair."""
     matches: int
-    """Number of candidate matches."""
+    """Number of matches of the image pair before verification."""
     inliers: int
-    """Number of inliers of the two-view geometry, for verified pairs."""
+    """Number of inlier matches of the two-view geometry of a verified pair."""
     geometry: str
-    """COLMAP's configuration of the two-view geometry, for verified pairs."""
+    """COLMAP's configuration of the two-view geometry of a verified pair, such as CALIBRATED."""
     dropped: dict[str, Value]
-    """Reason (``PairReason``) why the pair was dropped, for all other pairs."""
+    """Reason (``PairReason``) why a pair that is not verified was dropped."""
 
 
 class ImageReport(TypedDict):
@@ -36,37 +36,37 @@ class ImageReport(TypedDict):
     keypoints: int
     adjusted_keypoints: int
     valid_depth: float
-    """Share of the pixels with a valid depth prior."""
+    """Ratio of the pixels of the image with a valid depth prior."""
     median_relative_depth_std: float | None
-    """Median of the standard deviation of depth relative to depth."""
+    """Median over the pixels of the depth prior's standard deviation relative to depth."""
     valid_normals: float
-    """Share of the pixels with a valid normal prior."""
+    """Ratio of the pixels of the image with a valid normal prior."""
 
 
 class ProviderReport(TypedDict):
-    """Usage of a provider."""
+    """Usage of a provider during extraction."""
 
     kind: str
     name: str
     computed: int
-    """Number of computed results."""
+    """Number of results that the provider computed in this run."""
     from_cache: int
-    """Number of results that were read from the cache."""
+    """Number of results of the provider that were read from the cache."""
     seconds: float
     """Time of all calls of the provider in seconds."""
 
 
 class ExtractionReport(TypedDict):
-    """Report of an extraction."""
+    """Report of the extraction of features, matches and priors for ``summary.json``."""
 
     pairs_proposed: int
-    """Number of selected pairs before plugins filter the pairs."""
+    """Number of selected image pairs before plugins filter the pairs."""
     pairs_matched: int
     pairs_verified: int
     pairs: list[PairReport]
-    """All matched pairs."""
+    """Outcome of each matched image pair."""
     failed: dict[str, str]
-    """Errors of providers, by image name."""
+    """Error message of a provider that failed on an image, by image name."""
     images: dict[str, ImageReport]
     """Statistics of each image, by image name."""
     providers: list[ProviderReport]
@@ -77,12 +77,12 @@ def describe(
     problem: MappingProblem,
     graph: MatchGraph,
 ) -> ExtractionReport:
-    """Describe pairs, images and providers of an extraction.
+    """Describe image pairs, images and providers of an extraction.
 
     Args:
         context: Context of the extraction with images, failures and providers.
         problem: Input of the mapper with images and verified pairs.
-        graph: Candidate matches and two-view geometries of all matched pairs.
+        graph: Match graph with matches and two-view geometries of all matched pairs.
     """
     names = context.images.names
     pairs = [

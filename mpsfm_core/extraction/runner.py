@@ -58,7 +58,7 @@ class Extraction:
     problem: MappingProblem
     """Input of the mapper, with the images in the order of the image set."""
     report: ExtractionReport
-    """Outcomes of pairs, statistics of images and usage of providers, for ``summary.json``."""
+    """Outcomes of image pairs, statistics of images and usage of providers for ``summary.json``."""
 
 
 def extract(
@@ -98,7 +98,7 @@ def extract(
 
 @contextmanager
 def extraction_environment(context: ExtractionContext) -> Iterator[None]:
-    """Limit the threads of native libraries, and use the configured executor."""
+    """Limit the threads of BLAS and use the configured executor inside a ``with`` block."""
     with (
         threadpool_limits(thread_count(context.config.runtime), user_api="blas"),
         use_executor(context),
@@ -172,7 +172,7 @@ def _extract(context: ExtractionContext, imported: ImportedMatches | None) -> Ex
 
 
 def feature_table(context: ExtractionContext) -> FeatureTable | None:
-    """Return the features of the configured provider, or None without such a provider."""
+    """Return the features of the configured provider, or None if no feature provider is set."""
     features = context.config.features
     return None if features is None else FeatureTable(context, features)
 
@@ -188,9 +188,9 @@ def match_images(
     """Select, match and verify pairs with the configured matchers, and adjust the keypoints.
 
     Args:
-        context: The run.
+        context: Context of the extraction with images, configuration and providers.
         source: Features of the images, or None for a detector-free matcher.
-        pairs: Pairs to match, or None to select pairs as configured.
+        pairs: Index pairs of images to match, or None to select pairs as configured.
         unconstrained: Indices of images of which each pair contains at least one; if None, all
             pairs are allowed.
         verified: Pairs that an earlier pass verified, which connect components.
@@ -255,9 +255,9 @@ def predict_priors(context: ExtractionContext, graph: MatchGraph | None) -> Prio
     """Predict calibrated depth and normals of all images.
 
     Args:
-        context: The run.
-        graph: Match graph, from which multi-view networks get groups of images. With None, a group
-            has consecutive images, and no matcher predicts depth.
+        context: Context of the extraction with images, configuration and providers.
+        graph: Match graph, whose pairs define the groups of images for a multi-view network.
+            Without a match graph, a group has consecutive images, and no matcher predicts depth.
     """
     names = context.images.names
     groups = _predict_groups(context, () if graph is None else graph.assembled.pairs)
@@ -275,7 +275,7 @@ def predict_priors(context: ExtractionContext, graph: MatchGraph | None) -> Prio
 
 
 def assemble_problem(images: ImageSet, graph: MatchGraph, priors: Priors) -> MappingProblem:
-    """Combine images, match graph and priors to the input of the mapper."""
+    """Combine images, match graph and priors into the input of the mapper."""
     assembled = graph.assembled
     return MappingProblem(
         tuple(

@@ -1,9 +1,9 @@
 """Decide which images share a camera, and guess the focal length of each camera.
 
 By default images share a camera if EXIF names the same camera and lens with the same focal length,
-and if their sizes agree. Images whose EXIF names no camera share one if they have the same size and
-folder. The mapper gives images that contradict the focal length of a shared camera their own camera
-(:mod:`mpsfm_core.mapping.initialization.camera_splitting`).
+and if their sizes agree. Images without a camera name in EXIF share a camera if they have the same
+size and folder. The mapper gives images that contradict the focal length of a shared camera their
+own camera (:mod:`mpsfm_core.mapping.initialization.camera_splitting`).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class CameraGuess(NamedTuple):
     """Camera of an image without given intrinsics."""
 
     number: int
-    """Number of the camera from 1; images that share the camera have the same number."""
+    """Number of the camera from 1, equal for images that share the camera."""
     focal_px: float
     """Guessed focal length in pixels of the original image."""
     source: FocalSource
@@ -41,13 +41,13 @@ def guess_cameras(
     """Group images that share a camera, and guess the focal length of each camera.
 
     Args:
-        headers: headers by image name.
+        headers: image headers with size, EXIF tags and camera name, by image name.
         sizes: (width, height) of the upright images in pixels, by image name.
         options: options with ``camera_per`` and ``default_focal_ratio``.
 
     Returns:
         The camera of each image by image name. The focal length of a camera is the median of the
-        EXIF focal lengths of its images, or the default focal length.
+        EXIF focal lengths of its images, or the default focal length if EXIF has none.
     """
     groups: dict[Hashable, list[str]] = {}
     for name, header in headers.items():
@@ -71,7 +71,7 @@ def guess_cameras(
 def _camera_key(
     name: str, header: ImageHeader, size: tuple[int, int], options: InputOptions
 ) -> Hashable:
-    """Return a key that is equal for images that share a camera."""
+    """Return a dictionary key that is equal for images that share a camera."""
     folder = PurePosixPath(name).parent
     if options.camera_per == "image":
         return name

@@ -1,8 +1,8 @@
-"""Read positions from the subtitles (``.SRT``) that DJI drones write next to a video.
+"""Read GPS positions from the subtitles (``.SRT``) that DJI drones write next to a video.
 
-Each subtitle has a time range and fields of one of two forms, which differ between models:
-``[latitude: 47.1] [longitude: 8.2] [rel_alt: 9.0 abs_alt: 410.0] [focal_len: 24.00]`` or
-``GPS(8.2,47.1,19)`` with the longitude first.
+Each subtitle has a time range and the GPS position of the drone. Newer drone models write
+``[latitude: 47.1] [longitude: 8.2] [rel_alt: 9.0 abs_alt: 410.0] [focal_len: 24.00]``, older models
+write ``GPS(8.2,47.1,19)`` with the longitude first.
 """
 
 from __future__ import annotations
@@ -17,17 +17,18 @@ _TIME = re.compile(r"(\d+):(\d\d):(\d\d)[,.](\d{3})\s*-->")
 _FIELD = re.compile(r"\b(latitude|long?t?itude|abs_alt|altitude|focal_len)\s*:\s*(-?\d+(?:\.\d+)?)")
 _OLD_POSITION = re.compile(r"\bGPS\s*\(\s*(-?\d+\.\d+)\s*,\s*(-?\d+\.\d+)")
 _TENTHS_MM = 200
-"""Value of ``focal_len`` from which the unit is a tenth of a millimeter, as of Mavic 2."""
+"""Minimum subtitle value ``focal_len`` that is in tenths of a millimeter, as written by Mavic 2."""
 
 
 def read_subtitles(path: Path) -> list[tuple[float, GpsPosition, float | None]]:
-    """Read time in seconds, position and 35 mm equivalent focal length in mm of each subtitle.
+    """Read time in s, GPS position and 35 mm equivalent focal length in mm of each subtitle.
 
-    Subtitles without a position, or with (0, 0) before the first GPS fix, are skipped.
+    Subtitles without a GPS position are skipped, and subtitles with latitude and longitude 0, which
+    drones write before the first GPS fix.
 
     Raises:
-        OSError: the file cannot be read.
-        ValueError: the file is not text.
+        OSError: the subtitle file cannot be read.
+        ValueError: the subtitle file is not text.
     """
     points = []
     starts = list(_TIME.finditer(text := read_text_file(path)))

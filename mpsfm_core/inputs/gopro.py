@@ -1,7 +1,8 @@
-"""Read positions from the telemetry track (GPMF) of GoPro's MP4 files.
+"""Read GPS positions from the telemetry track (GPMF) of GoPro's MP4 files.
 
-The track ``gpmd`` of the MP4 file has about one sample a second. A sample is a tree of key, type,
-size and repeat count with big-endian values, padded to four bytes [gopro/gpmf-parser, README].
+The track ``gpmd`` of the MP4 file has about one telemetry sample a second. A telemetry sample is a
+tree of entries with key, type, size, repeat count and big-endian values, padded to four bytes
+[gopro/gpmf-parser, README].
 """
 
 from __future__ import annotations
@@ -14,28 +15,28 @@ from typing import BinaryIO
 from mpsfm_core.inputs.gps import GpsPosition
 
 _MAX_BYTES = 256 << 20
-"""Maximum number of bytes of the description of the tracks and of a telemetry sample."""
+"""Maximum number of bytes of the MP4 box ``moov`` and of a telemetry sample."""
 _MAX_DOP = 10.0
-"""Dilution of precision above which GPS positions are ignored."""
+"""Dilution of precision (DOP) above which GPS positions are ignored."""
 _MIN_FIX = 2
-"""Smallest GPS fix, 2 for two dimensions and 3 for three dimensions."""
+"""Minimum GPS fix of positions that are used, 2 for a 2D fix and 3 for a 3D fix."""
 _GPS5 = struct.Struct(">5i")
-"""Latitude, longitude, altitude, speed in the plane, speed in space."""
+"""Layout of a GPS5 entry with latitude, longitude, altitude, 2D speed and 3D speed."""
 _GPS9 = struct.Struct(">7i2H")
-"""As GPS5, then days, seconds, dilution of precision, fix."""
+"""Layout of a GPS9 entry, which appends days, seconds, DOP and fix to the values of GPS5."""
 
 _Point = tuple[float, GpsPosition]
 
 
 def read_positions(video: Path) -> list[_Point]:
-    """Read time in seconds and position of all GPS measurements of a GoPro video.
+    """Read time in seconds and position of all GPS measurements of a GoPro video file.
 
     Returns:
-        Measurements in the order of time, none if the video has no telemetry track.
+        GPS measurements in the order of time, none if the video has no telemetry track.
 
     Raises:
-        OSError: the file cannot be read.
-        ValueError: the telemetry is damaged.
+        OSError: the video file cannot be read.
+        ValueError: the telemetry track is damaged.
     """
     points: list[_Point] = []
     try:
@@ -50,7 +51,7 @@ def read_positions(video: Path) -> list[_Point]:
 
 
 def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
-    """Yield type and content of the MP4 boxes in ``data``."""
+    """Yield type and content of each MP4 box in the bytes ``data``."""
     start = 0
     while start + 8 <= len(data):
         size, kind = struct.unpack_from(">I4s", data, start)
@@ -66,14 +67,14 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
 
 
 def _find(data: bytes, *path: bytes) -> bytes:
-    """Return the content of the first MP4 box at a path; raise KeyError if there is none."""
+    """Return the content of the first MP4 box at a path of box types, or raise KeyError."""
     for name in path:
         data = dict(reversed(list(_boxes(data))))[name]
     return data
 
 
 def _read_moov(file: BinaryIO) -> bytes | None:
-    """Read the box ``moov``, which describes the tracks, without the media data."""
+    """Read the content of the MP4 box ``moov``, which describes the tracks of the video."""
     file_size = file.seek(0, 2)
     start = 0
     while start + 16 <= file_size:
@@ -91,7 +92,7 @@ def _read_moov(file: BinaryIO) -> bytes | None:
 
 
 def _telemetry_samples(file: BinaryIO) -> Iterator[tuple[float, float, bytes]]:
-    """Yield time and duration in seconds and content of each sample of the track ``gpmd``."""
+    """Yield time in seconds, duration in seconds and content of each telemetry sample."""
     moov = _read_moov(file) or b""
     for kind, track in _boxes(moov):
         if kind != b"trak" or _find(track, b"mdia", b"hdlr")[8:12] != b"meta":
@@ -124,7 +125,7 @@ def _durations(table: bytes) -> Iterator[int]:
 
 
 def _sample_places(table: dict[bytes, bytes]) -> Iterator[tuple[int, int]]:
-    """Yield file offset and size of each sample from the tables of chunks and sizes."""
+    """Yield file offset and size in bytes of each sample of an MP4 track."""
     wide = b"co64" in table
     box = table[b"co64" if wide else b"stco"]
     chunks = _numbers(box, "Q" if wide else "I", 8, _numbers(box, "I", 4, 1)[0])
@@ -145,7 +146,7 @@ def _sample_places(table: dict[bytes, bytes]) -> Iterator[tuple[int, int]]:
 
 
 def _entries(data: bytes) -> Iterator[tuple[bytes, int, int, int, bytes]]:
-    """Yield key, type, structure size, repeat count and content of the GPMF entries in ``data``."""
+    """Yield key, type, size, repeat count and content of each GPMF entry in the bytes ``data``."""
     start = 0
     while start + 8 <= len(data):
         key, kind, size, repeat = struct.unpack_from(">4sBBH", data, start)
@@ -155,7 +156,7 @@ def _entries(data: bytes) -> Iterator[tuple[bytes, int, int, int, bytes]]:
 
 
 def _streams(sample: bytes) -> Iterator[dict[bytes, tuple[int, int, bytes]]]:
-    """Yield the entries of each stream by key, as (structure size, repeat count, content)."""
+    """Yield the GPMF entries of each stream by key, as (size, repeat count, content)."""
     for key, kind, *_, device in _entries(sample):
         if key != b"DEVC" or kind != 0:
             continue
@@ -165,7 +166,7 @@ def _streams(sample: bytes) -> Iterator[dict[bytes, tuple[int, int, bytes]]]:
 
 
 def _stream_positions(stream: dict[bytes, tuple[int, int, bytes]]) -> Iterator[GpsPosition]:
-    """Yield the GPS positions of a stream with GPS5 or GPS9 entries."""
+    """Yield the GPS positions in the GPS5 or GPS9 entry of a GPMF stream."""
     kind = next((key for key in (b"GPS9", b"GPS5") if key in stream), None)
     if kind is None:
         return

@@ -67,12 +67,12 @@ def read_gps(data: bytes) -> GpsPosition | None:
 def insert_exif(
     jpeg: bytes, position: GpsPosition | None, focal_35mm_mm: float | None = None
 ) -> bytes:
-    """Return a JPEG file with EXIF data inserted.
+    """Insert GPS position and focal length as EXIF data into a JPEG file without EXIF.
 
     Args:
         jpeg: bytes of a JPEG file without EXIF data.
-        position: GPS position.
-        focal_35mm_mm: 35 mm equivalent focal length in mm.
+        position: GPS position, or None to insert none.
+        focal_35mm_mm: 35 mm equivalent focal length in mm, or None to insert none.
     """
     if position is None and focal_35mm_mm is None:
         return jpeg
@@ -92,7 +92,7 @@ def insert_exif(
 
 
 def _gps_entries(position: GpsPosition) -> list[tuple[int, int, int, bytes]]:
-    """Return tag, type, count and value of the EXIF entries of a GPS position."""
+    """Return the EXIF entries of a GPS position, each with tag, type, count and value."""
 
     def degrees(angle: float) -> bytes:
         return struct.pack("<6I", round(abs(angle) * 1e7), 10_000_000, 0, 1, 0, 1)
@@ -111,7 +111,7 @@ def _gps_entries(position: GpsPosition) -> list[tuple[int, int, int, bytes]]:
 
 
 def _directory(entries: list[tuple[int, int, int, bytes]], offset: int) -> bytes:
-    """Return a TIFF directory that starts at a byte offset of its EXIF block."""
+    """Encode a TIFF directory of EXIF entries that starts at a byte offset of the EXIF block."""
     values_start = offset + 2 + _ENTRY_BYTES * len(entries) + 4
     directory, values = struct.pack("<H", len(entries)), b""
     for tag, kind, count, value in entries:

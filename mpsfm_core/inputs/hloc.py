@@ -17,7 +17,7 @@ _TO_COLMAP = 0.5
 
 
 class HlocFiles:
-    """The features file and, if given, the matches file that hloc wrote for a set of images.
+    """Reader of a features file and an optional matches file of hloc.
 
     All methods raise an :class:`InputError` that names the missing or damaged file or dataset.
     """

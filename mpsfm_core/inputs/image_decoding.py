@@ -125,13 +125,14 @@ def find_map_orientation(
 
     Args:
         map_size: (width, height) of the map, which covers the image in any resolution.
-        size: upright (width, height) of the image.
+        size: (width, height) of the upright image.
         orientation: EXIF orientation of the image.
-        convention: ``stored`` or ``upright`` if known, or ``auto`` to compare the aspect ratios of
-            map and image; a map that fits both belongs to the stored image.
+        convention: ``stored`` for maps with the axes of the stored pixels, ``upright`` for maps
+            with the axes of the upright image, or ``auto`` to choose by aspect ratio. A map that
+            fits both aspect ratios has the axes of the stored pixels.
 
     Returns:
-        ``orientation`` if the map belongs to the stored image, else 1.
+        ``orientation`` if the map has the axes of the stored pixels, or 1 if the map is upright.
     """
     if convention != "auto" or min(map_size) == 0:
         return 1 if convention == "upright" else orientation

@@ -52,7 +52,7 @@ class ImageHeader:
 
     @property
     def recorded_size(self) -> tuple[float, float]:
-        """(width, height) in EXIF, 0 if absent; editors often keep it when they crop or resize."""
+        """Image size (width, height) recorded in EXIF, 0 if absent, often outdated by editors."""
         return self.tags.get(_PIXELS_X, 0.0), self.tags.get(_PIXELS_Y, 0.0)
 
     def focal_px(self, width: int, height: int) -> float | None:

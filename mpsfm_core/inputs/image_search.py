@@ -26,7 +26,7 @@ _UNREADABLE = frozenset(
 _SIGNATURES = (b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n", b"II*\x00", b"MM\x00*")
 """First bytes of image formats, to recognize image files without extension."""
 _THUMBNAIL_FOLDERS = frozenset(("@eaDir", "__MACOSX", "lost+found"))
-"""Folders that network drives and archivers create next to photos."""
+"""Names of ignored folders that network drives and archive programs create next to images."""
 _MASK_MARK = re.compile(r"[_.-]masks?$", re.IGNORECASE)
 """Endings of file stems of masks such as ``X_mask.png`` (OpenDroneMap, Metashape)."""
 
@@ -41,7 +41,8 @@ def find_images(folder: Path, without: Path | None = None) -> list[str]:
         Image names relative to the folder, in natural order.
 
     Raises:
-        InputError: the path does not exist, is not a folder, or is a capture with sensor depth.
+        InputError: the path does not exist, is not a folder, or is a phone capture with sensor
+            depth.
     """
     if (capture := find_format(folder)) is not None:
         raise InputError(

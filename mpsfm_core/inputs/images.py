@@ -98,7 +98,7 @@ class SourceImage:
     mask: MaskFile | None = None
     """Mask file of the original image, None if the image has no mask."""
     pixels: UInt8 | None = None
-    """(H, W, 3) uint8 RGB pixels of an image in memory, None for an image file."""
+    """Pixels (H, W, 3) uint8 RGB of an image in memory, None for an image file."""
 
     def original_pixels(self, xy: Float64) -> Float64:
         """Map pixels (n, 2) of the undistorted view to pixels of the upright original image."""
@@ -111,8 +111,9 @@ class SourceImage:
     def refined_camera(self, pinhole: PinholeCamera) -> pycolmap.Camera:
         """Scale the original camera to the refined focal length of its undistorted view.
 
-        Focal lengths are refined together with distortion, and views of cameras with refined
-        distortion are undistorted again. The factor of the focal length then is 1.
+        If the distortion of the original camera was refined too, ``self`` already has the refined
+        camera and a view that is undistorted with the refined camera, so that the scale factor is
+        1.
         """
         camera = pycolmap.Camera(self.camera.todict())
         params = np.array(camera.params)
@@ -228,7 +229,7 @@ class ImageSet:
         return ImageSet(images, self._options, self.left_out)
 
     def with_cameras(self, cameras: Mapping[str, pycolmap.Camera]) -> ImageSet:
-        """Return a copy of the images with other cameras of some original images, by name."""
+        """Return a copy of the images, in which cameras of original images are replaced by name."""
 
         def changed(image: SourceImage) -> SourceImage:
             camera = cameras.get(image.name)
@@ -367,18 +368,19 @@ def images_from_arrays(
     cameras: Mapping[str, Any] | Any | None = None,
     options: InputOptions | None = None,
 ) -> ImageSet:
-    """Make images of arrays in memory.
+    """Make an image set of pixel arrays in memory.
 
     Args:
         pixels: (H, W, 3) uint8 RGB or (H, W) uint8 gray pixels by image name.
-        cameras: Camera of all images, or of each image by name, as
+        cameras: Camera of all images, or camera of each image by name, as
             :class:`~mpsfm_core.PinholeCamera` or ``pycolmap.Camera``. Without a camera, the focal
-            length is ``options.default_focal_ratio`` times the longer side, and refined.
+            length starts at ``options.default_focal_ratio`` times the longer image side and is
+            refined.
         options: see :class:`InputOptions`.
 
     Raises:
-        InputError: fewer than two images, pixels are not uint8, or a camera is missing or has
-            another size.
+        InputError: there are fewer than two images, pixels are not uint8, or a camera is missing or
+            has another size than its image.
     """
     options = options or InputOptions()
     if len(pixels) < 2:
@@ -458,7 +460,7 @@ class _ProbedImage:
 def _known_cameras(
     files: Mapping[str, _ProbedImage], given: Intrinsics | None, partial: Intrinsics | None
 ) -> dict[str, pycolmap.Camera]:
-    """Return the camera of each image in ``given``, or of some images in ``partial``."""
+    """Return known cameras by image name: all cameras from ``given``, or some from ``partial``."""
     known: dict[str, pycolmap.Camera] = {}
     for name, file in files.items():
         if given is not None:
@@ -474,11 +476,11 @@ def _add_guessed_cameras(
     options: InputOptions,
     max_id: int = 0,
 ) -> dict[str, tuple[pycolmap.Camera, FocalSource]]:
-    """Return camera and source of the focal length of each image, with guesses where unknown.
+    """Return camera and source of the focal length of each image, and guess unknown cameras.
 
     Args:
         known: Known cameras by image name.
-        files: Headers and sizes by image name.
+        files: Image headers and sizes by image name.
         options: Options of camera sharing.
         max_id: Largest id of the known cameras.
     """

@@ -241,7 +241,7 @@ def _yaml_entry(path: Path, key: object, value: object) -> CameraEntry:
 def _from_text(path: Path) -> tuple[CameraEntry, ...]:
     """Read ``cameras.txt`` of COLMAP and the image names of ``images.txt`` in the same folder.
 
-    The query lists of hloc are read too, whose lines have an image name instead of a camera id.
+    Query lists of hloc, whose lines start with an image name instead of a camera id, are read too.
     """
     names: dict[int, list[str]] = {}
     listing = path.with_name("images.txt")

@@ -46,7 +46,7 @@ class MaskFile:
     orientation: int = 1
     """EXIF orientation that rotates the mask upright, 1 for an upright mask."""
     is_alpha: bool = False
-    """Whether the file is the image, whose alpha channel is the mask."""
+    """True if the mask is the alpha channel of the image file."""
 
     def read(self, max_pixels: int) -> Bool:
         """Decode the upright mask, (H, W) bool, False at black or transparent pixels."""
@@ -213,7 +213,7 @@ def decode_opacity(data: bytes, path: Path) -> Bool | None:
     """Decode the alpha channel of a PNG or WebP image, before EXIF rotation.
 
     Returns:
-        (H, W) bool, False at transparent pixels, or None if all or no pixels are transparent.
+        Mask (H, W) bool, False at transparent pixels, or None if all or no pixels are transparent.
     """
     if not has_alpha(data):
         return None

@@ -81,11 +81,11 @@ def features_from_hloc(
     """Import features with descriptors from a features file of hloc.
 
     Returns:
-        Features in pixels of the undistorted views by image name, and the row (n,) in the file of
-        each feature. Keypoints outside of the view are left out.
+        Features in pixels of the undistorted views by image name, and (n,) row numbers of these
+        features in the file by image name. Keypoints outside of the undistorted view are left out.
 
     Raises:
-        InputError: the file is damaged, or has keypoints of none of the images.
+        InputError: the features file is damaged, or has keypoints of none of the images.
     """
     files = HlocFiles(path)
     matched = match_names(images.names, files.names())

@@ -48,10 +48,11 @@ class InputOptions(Options):
     decides, else uses ``stored`` [COLMAP, which ignores EXIF orientation]."""
     camera_per: Literal["auto", "image", "folder", "set"] = "auto"
     """Which images without given intrinsics share a camera [COLMAP single_camera,
-    single_camera_per_folder, single_camera_per_image]. The values are ``image`` (none), ``folder``
-    and ``set`` (all images of one size in a folder or in the set), and ``auto`` (images of the same
-    size whose EXIF names the same camera, lens and focal length, and images of the same folder and
-    size without EXIF). The mapper gives images with another focal length their own camera."""
+    single_camera_per_folder, single_camera_per_image]. With ``image``, each image has its own
+    camera. With ``folder`` or ``set``, all images of one size in a folder or in the whole set share
+    a camera. With ``auto``, images of one size share a camera if EXIF names the same camera, lens
+    and focal length, and images without EXIF share a camera by folder and size. The mapper gives
+    images that contradict the shared focal length their own camera."""
     default_focal_ratio: float = expert(1.2, gt=0)
     """Ratio of focal length to longer image side for images without a known focal length [COLMAP
     default_focal_length_factor]."""

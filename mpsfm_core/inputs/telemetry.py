@@ -1,4 +1,4 @@
-"""Positions that a drone or action camera recorded with a video, as EXIF of its frames."""
+"""GPS positions that a drone or action camera recorded with a video, as EXIF of its frames."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from mpsfm_core.inputs.gps import GpsPosition, insert_exif
 _log = logging.getLogger(__name__)
 
 _MAX_GAP_S = 1.0
-"""Maximum time in seconds between a frame and the nearest measurement of its position."""
+"""Maximum time in seconds between a video frame and the nearest GPS measurement."""
 _GOPRO_EXTENSIONS = frozenset((".mp4", ".mov"))
 
 
 @dataclass(frozen=True)
 class Telemetry:
-    """GPS positions of a video by time, and its focal length if recorded."""
+    """GPS positions of a video by time, and the focal length of the video if recorded."""
 
     points: tuple[tuple[float, GpsPosition], ...]
-    """Times in seconds, ascending, and positions."""
+    """Times in seconds from the start of the video, ascending, each with its GPS position."""
     focal_35mm_mm: float | None
     """35 mm equivalent focal length in mm, None if unknown or zoomed during the video."""
     fps: float
@@ -35,11 +35,11 @@ class Telemetry:
 
     @property
     def digest(self) -> str:
-        """Return a hash of the positions and the focal length."""
+        """Return a hash of the GPS positions and the focal length of a video."""
         return hashlib.sha256(repr((self.points, self.focal_35mm_mm)).encode()).hexdigest()
 
     def position(self, time_s: float) -> GpsPosition | None:
-        """Interpolate the position at a time, None without a measurement within one second."""
+        """Interpolate the GPS position at a time, None without a measurement within one second."""
         times = np.array([time for time, _ in self.points])
         if not len(times) or np.abs(times - time_s).min() > _MAX_GAP_S:
             return None
@@ -49,14 +49,15 @@ class Telemetry:
         return GpsPosition(latitude, longitude, None if np.isnan(altitude) else altitude)
 
     def add_exif(self, jpeg: bytes, number: int) -> bytes:
-        """Return a JPEG file of a frame with position and focal length in its EXIF data."""
+        """Insert GPS position and focal length as EXIF data into the JPEG file of a video frame."""
         return insert_exif(jpeg, self.position(number / self.fps), self.focal_35mm_mm)
 
 
 def read_telemetry(video: Path) -> Telemetry:
-    """Read the positions of a video from DJI's subtitles next to it, else from GoPro's track.
+    """Read GPS positions of a video from DJI's subtitles, or from the telemetry track of GoPro.
 
-    Damaged telemetry causes a warning and gives no positions.
+    If the subtitles or the telemetry track are damaged, a warning is logged and no position is
+    returned.
     """
     points: list[tuple[float, GpsPosition]] = []
     focals: set[float | None] = set()

@@ -65,9 +65,9 @@ def extract_frames(
 ) -> Path:
     """Select frames of a video and write them as JPEG files into ``output/frames``.
 
-    The name of a JPEG file contains the frame number, and its EXIF has the GPS position if a drone
-    or action camera recorded positions (see :func:`read_telemetry`). Existing frames of the same
-    video and options are reused.
+    The name of a JPEG file contains the frame number. EXIF of the JPEG file has the GPS position if
+    a drone or action camera recorded positions (see :func:`read_telemetry`). Existing frames of the
+    same video and options are reused.
 
     Args:
         video: video file.

@@ -1,7 +1,7 @@
-"""Detection of images of the same view: copies, edited copies, brackets, a camera at rest.
+"""Detection of duplicates, such as copies, exposure brackets or frames of a camera at rest.
 
-Images of the same view have most keypoints at the same pixels. An image that only shows the view of
-another image adds no parallax, so that matching it with all other images costs time for nothing.
+Duplicates have most keypoints at the same pixels. Matching a duplicate with all other images wastes
+time, because a duplicate adds no parallax.
 """
 
 from __future__ import annotations
@@ -15,23 +15,24 @@ from scipy.sparse import csr_array
 from mpsfm_core.data import Features, Float64, Int64, VerifiedPair
 
 MIN_SHARED_RATIO = 0.3
-"""Share of the keypoints at equal pixels, above chance, from which two images show the same view.
-Measured shares are 0.5 to 1 for edited copies, and below 0.1 for other images. [ours]"""
+"""Minimum ratio of keypoints at equal pixels, above chance, of two duplicates. The measured ratio
+is 0.5 to 1 for edited copies, and below 0.1 for images of different views. [ours]"""
 MIN_KEYPOINTS = 50
-"""Minimum number of keypoints of images that are compared."""
+"""Minimum number of keypoints by which the keypoints at equal pixels are divided."""
 
 
 def find_duplicates(
     features: Sequence[Features], sizes: Sequence[tuple[int, int]]
 ) -> dict[int, int]:
-    """Find images that show the same view as an earlier image of the same size.
+    """Find duplicates, which show the same view as an earlier image of the same size.
 
     Args:
         features: Features of the images, with keypoints in pixels.
         sizes: (width, height) of the images in pixels.
 
     Returns:
-        Index of the earlier image, by index of the duplicate. The earlier image is no duplicate.
+        Index of the original image by index of the duplicate. The original is the first image of a
+        view.
     """
     shared = np.zeros((len(sizes), len(sizes)))
     for size in set(sizes):
@@ -51,15 +52,15 @@ def find_duplicates(
 def restrict_matches(
     pairs: Sequence[VerifiedPair], duplicates: Mapping[int, int], min_matches: int
 ) -> tuple[VerifiedPair, ...]:
-    """Remove the matches of duplicates that no other image can triangulate.
+    """Remove matches of duplicates with their originals that no other image can triangulate.
 
-    A pair of an original and its duplicate has no parallax. Its matches are kept if another pair
-    also matches the keypoint of the original.
+    An original and its duplicate have no parallax. A match between an original and its duplicate is
+    kept if the keypoint of the original also has a match in another image.
 
     Args:
         pairs: Verified pairs of all images.
         duplicates: Original image by index of the duplicate.
-        min_matches: Number of matches below which a pair keeps all its matches.
+        min_matches: Minimum number of matches that remain; a pair with fewer keeps all its matches.
     """
     matched: dict[int, list[Int64]] = {}
     for pair in pairs:
@@ -77,10 +78,10 @@ def restrict_matches(
 
 
 def _measure_shared_ratios(keypoints: Sequence[Float64], size: tuple[int, int]) -> Float64:
-    """Return the share of equal pixels (n, n) among the keypoints of two images, above chance.
+    """Return the ratio (n, n) of keypoints at equal pixels above chance for pairs of n images.
 
-    Keypoints are rounded to pixels. Random keypoints of the density of the second image have the
-    share 0.
+    Keypoint coordinates are rounded down to pixels. The expected ratio of randomly distributed
+    keypoints is 0.
     """
     width, height = size
     rows, columns = [], []

@@ -31,8 +31,8 @@ class PairSelection:
         table: Features of the images, or None without a feature provider.
         unconstrained: Images to match again after the fast first pass, of which each pair contains
             at least one; if None, all pairs are allowed.
-        duplicates: Original image by index of each image that shows the same view. A duplicate is
-            only matched with its original.
+        duplicates: Index of the original image by index of the duplicate, which shows the same
+            view. A duplicate is only matched with its original.
     """
 
     def __init__(

@@ -22,14 +22,14 @@ def fit_to_grid(
     mask: Bool | None,
     options: ExtractionOptions,
 ) -> tuple[DepthPrior, NormalPrior]:
-    """Resize priors to the grid of the mapper, and apply mask and depth edges.
+    """Resize priors to the grid of the mapper, apply the mask, and down-weight normals at edges.
 
     Args:
         depth: Depth prior with variance.
         normals: Normal prior with variance.
-        size: (width, height) of the view in pixels.
-        mask: (H, W) mask of usable pixels of the view, or None if all are usable.
-        options: Size of the grid and threshold of depth edges.
+        size: (width, height) of the undistorted view in pixels.
+        mask: (H, W) bool mask of usable pixels of the view, or None if all pixels are usable.
+        options: Options with the size of the grid and the threshold of depth edges.
     """
     grid = integration_grid(size, options.integration_size)
     depth, normals = resize_depth(depth, grid), resize_normals(normals, grid)

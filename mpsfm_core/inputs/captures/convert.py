@@ -22,47 +22,47 @@ from mpsfm_core.support.files import replace_entries, write_file
 from mpsfm_core.support.npz import write_npz
 
 FORMATS: tuple[CaptureFormat, ...] = (POLYCAM, RECORD3D, STRAY_SCANNER)
-"""All formats of captures."""
+"""Supported formats of captures, which are images with depth and poses recorded by a phone app."""
 IMAGES, POSES, DEPTH = "images", "poses", "depth"
-"""Folders of a converted capture."""
+"""Names of the output folders of a converted capture."""
 _MAX_DEPTH_M = 5.0
 """Maximum depth in meters of the LiDAR sensor of iPhones and iPads [Polycam documentation]."""
 _STD_FLOOR_M = 0.015
-"""Smallest depth std in meters; smaller details are not resolved [Polycam documentation]."""
+"""Minimum standard deviation of sensor depth in meters [Polycam documentation]."""
 _HIGH_STD, _MEDIUM_STD = 0.01, 0.03
-"""Relative depth std of pixels with high confidence, and with medium or unknown one [ours]."""
+"""Depth std relative to depth for high confidence, and for medium or unknown confidence [ours]."""
 
 
 @dataclass(frozen=True)
 class ConvertedCapture:
-    """Folders and size of a converted capture."""
+    """Output folders and number of images of a converted capture."""
 
     program: str
-    """Name of the program that wrote the capture."""
+    """Name of the app that wrote the capture, such as Polycam."""
     images: Path
     """Folder of the images."""
     poses: Path
-    """Folder of the COLMAP model with cameras and poses, and without points."""
+    """Folder of the COLMAP model with cameras and poses but without points."""
     depth: Path | None
-    """Folder of the depth files in meters with variance, None if the capture has no depth."""
+    """Folder of the depth maps in meters with variance, None if the capture has no depth."""
     num_images: int
     """Number of images."""
 
 
 def find_format(path: Path) -> CaptureFormat | None:
-    """Return the format of a capture, None if the path is not a capture."""
+    """Return the format of a capture, or None if the path is not a capture of a known format."""
     return next((form for form in FORMATS if form.matches(path)), None)
 
 
 def convert_capture(path: Path, output: Path) -> ConvertedCapture:
     """Convert a capture to the folders ``images``, ``poses`` and ``depth`` of ``output``.
 
-    Depth with low confidence or behind the range of the sensor is invalid. The depth std grows with
-    depth and depends on the confidence.
+    Depth with low confidence or beyond the maximum range of the sensor is invalid. The standard
+    deviation of depth grows with depth and depends on the confidence.
 
     Args:
-        path: folder of a Polycam or Stray Scanner capture, or file or folder of Record3D.
-        output: folder whose three subfolders are replaced.
+        path: folder of a Polycam or Stray Scanner capture, or ``.r3d`` file or folder of Record3D.
+        output: folder in which the folders ``images``, ``poses`` and ``depth`` are replaced.
 
     Raises:
         InputError: the path is no capture, or the capture is damaged or has fewer than two images.

@@ -1,4 +1,4 @@
-"""Frame of a capture with sensor depth, the common type of all capture readers."""
+"""Frame of a phone capture with sensor depth, the common type of all capture readers."""
 
 from __future__ import annotations
 
@@ -32,33 +32,33 @@ class CapturedFrame:
     camera: pycolmap.Camera
     """Camera of the image."""
     cam_from_world: pycolmap.Rigid3d
-    """Pose in meters, whose world has y up [ARKit gravity alignment]."""
+    """Pose of the camera in meters; the y axis of the world points up [ARKit gravity alignment]."""
     depth: Float32 | None = None
-    """Depth along z in meters, (h, w), None if the capture has no depth of the frame."""
+    """Depth map (h, w) along z in meters, None if the capture has no depth of the frame."""
     confidence: UInt8 | None = None
-    """Confidence of each depth value, (h, w), ``LOW`` to ``HIGH``; None if unknown."""
+    """Confidence map (h, w) of depth with values ``LOW`` to ``HIGH``, None if unknown."""
 
 
 @dataclass(frozen=True)
 class CaptureFormat:
-    """Format of captures: how to recognize and read a capture."""
+    """Capture format of a phone app, with functions that recognize and read a capture."""
 
     name: str
-    """Name of the program that writes captures of the format."""
+    """Name of the app that writes captures of the format."""
     matches: Callable[[Path], bool]
-    """Return whether a folder or file is a capture of the format."""
+    """Function that returns whether a folder or file is a capture of the format."""
     read_frames: Callable[[Path], Iterator[CapturedFrame]]
-    """Yield the frames of a capture; raise :class:`InputError` if the capture is damaged."""
+    """Function that yields the frames of a capture, and raises InputError if files are damaged."""
 
 
 def pose_from_arkit(world_from_cam: Float64) -> pycolmap.Rigid3d:
     """Convert a pose of ARKit (camera x right, y up, z backward) to ``cam_from_world``.
 
     Args:
-        world_from_cam: matrix of the pose, (3, 4), in meters.
+        world_from_cam: (3, 4) pose matrix with the position in meters.
 
     Raises:
-        ValueError: the matrix is not a rigid transform.
+        ValueError: the matrix ``world_from_cam`` is not a rigid transform.
     """
     rotation = world_from_cam[:, :3]
     error = np.abs(rotation.T @ rotation - np.eye(3)).max()
@@ -73,8 +73,8 @@ def pinhole_camera(size: tuple[int, int], params: list[float], where: str) -> py
 
     Args:
         size: (width, height) of the image in pixels.
-        params: fx, fy, cx, cy in pixels.
-        where: file with the parameters, for the error message.
+        params: intrinsics fx, fy, cx, cy in pixels.
+        where: name of the file with the intrinsics, for the error message.
     """
     camera = pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=params)
     if not (min(size) > 0 and np.isfinite(params).all() and min(params[:2]) > 0):
@@ -83,10 +83,10 @@ def pinhole_camera(size: tuple[int, int], params: list[float], where: str) -> py
 
 
 def read_png(path: Path) -> NDArray[Any] | None:
-    """Read a map with one channel from a PNG file, None if there is no such file.
+    """Read a PNG file with one channel, such as a depth map; return None without such a file.
 
     Raises:
-        InputError: the file is damaged or has several channels.
+        InputError: the PNG file is damaged or has several channels.
     """
     if not path.is_file():
         return None
@@ -97,6 +97,6 @@ def read_png(path: Path) -> NDArray[Any] | None:
 
 
 def read_depth_png(path: Path) -> Float32 | None:
-    """Read a depth map in millimeters from a PNG file and return it in meters, as `read_png`."""
+    """Read a PNG depth map in millimeters, and return it in meters, or None without a file."""
     millimeters = read_png(path)
     return None if millimeters is None else millimeters.astype(np.float32) / np.float32(_MM_PER_M)

@@ -1,8 +1,9 @@
-"""Reader of Polycam's raw data (Developer mode, ``export`` of the raw data).
+"""Reader of captures that Polycam exports as raw data in developer mode.
 
-The folder ``keyframes`` has images, cameras, depth in millimeters and confidence, named by time.
-Polycam's optimized poses and undistorted images (``corrected_*``) are preferred to those of ARKit
-[PolyCam/polyform, README].
+The folder ``keyframes`` has images, cameras, depth maps in millimeters and confidence maps. The
+time of a keyframe is the name of its files. Poses that Polycam optimized and images that Polycam
+undistorted (``corrected_*``) are preferred to the poses and images of ARKit [PolyCam/polyform,
+README].
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from mpsfm_core.inputs.text_files import read_text_file
 
 _KEYFRAMES = "keyframes"
 _LEVELS = np.array([LOW, MEDIUM, HIGH], np.uint8)
-"""Confidence levels of the stored values 0, 127 and 255, divided by 86."""
+"""Confidence level by the stored value 0, 127 or 255 divided by 86 and rounded down."""
 _CAMERA_KEYS = ("fx", "fy", "cx", "cy")
 _POSE_KEYS = [[f"t_{row}{column}" for column in range(4)] for row in range(3)]
 

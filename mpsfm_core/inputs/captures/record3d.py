@@ -32,10 +32,10 @@ _METADATA = "metadata"
 _MAX_BYTES = 256 << 20
 """Maximum size in bytes of a file in the archive after decompression."""
 _NUM_POSE_VALUES = 7
-"""Number of values of a pose: quaternion x, y, z, w and position x, y, z."""
+"""Number of values of a pose, a quaternion x, y, z, w and a position x, y, z."""
 
 _Read = Callable[[str], bytes | None]
-"""Function that returns the bytes of a file of the capture, None if there is no such file."""
+"""Function that returns the content of a file of the capture by name, None without such a file."""
 
 
 def _is_capture(path: Path) -> bool:
@@ -102,7 +102,7 @@ def _frames(path: Path, read: _Read) -> Iterator[CapturedFrame]:
 
 
 def _read_intrinsics(metadata: dict[str, Any], matrix: Float64, count: int) -> list[list[float]]:
-    """Return fx, fy, cx, cy of each frame, which older captures share."""
+    """Return fx, fy, cx, cy in pixels of each frame; older captures have one set for all frames."""
     shared = [float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])]
     frames = metadata.get("perFrameIntrinsicCoeffs") or [shared] * count
     return [[float(value) for value in params[:4]] for params in frames]
@@ -119,7 +119,7 @@ def _convert_pose(pose: Float64, where: str) -> pycolmap.Rigid3d:
 def _decompress(
     data: bytes | None, dtype: type, size: tuple[int, int], depth_size: tuple[int, int], where: str
 ) -> NDArray[Any] | None:
-    """Decompress a map with LZFSE; return it as an array (h, w)."""
+    """Decompress a depth or confidence map with LZFSE, and return an array (h, w)."""
     if data is None:
         return None
     try:

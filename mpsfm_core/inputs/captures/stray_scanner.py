@@ -1,7 +1,7 @@
-"""Reader of ARKit captures of Stray Scanner.
+"""Reader of ARKit captures of the app Stray Scanner.
 
-The folder has ``rgb.mp4``, ``camera_matrix.csv``, ``odometry.csv`` (``world_from_cam`` with
-OpenCV's camera axes), ``depth/000000.png`` in millimeters and ``confidence/000000.png``
+The folder of a capture has ``rgb.mp4``, ``camera_matrix.csv``, ``odometry.csv`` (``world_from_cam``
+with OpenCV's camera axes), ``depth/000000.png`` in millimeters and ``confidence/000000.png``
 [strayrobots/scanner, docs/format.md].
 """
 
@@ -65,7 +65,7 @@ def _read_frames(path: Path) -> Iterator[CapturedFrame]:
 
 
 def _read_rows(path: Path) -> dict[int, dict[str, str]]:
-    """Read the rows of the odometry by frame number, with column names without spaces."""
+    """Read the rows of the CSV file with camera poses, by frame number."""
     try:
         lines = csv.DictReader(read_text_file(path).splitlines(), skipinitialspace=True)
         return {int(row["frame"]): row for row in lines}
@@ -74,7 +74,7 @@ def _read_rows(path: Path) -> dict[int, dict[str, str]]:
 
 
 def _read_matrix(path: Path) -> list[float] | None:
-    """Read fx, fy, cx, cy of the camera matrix, None without a valid matrix."""
+    """Read fx, fy, cx, cy of the camera matrix file; return None without a valid 3 x 3 matrix."""
     try:
         matrix = np.loadtxt(read_text_file(path).splitlines(), delimiter=",")
         return [float(matrix[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2))]
