@@ -80,7 +80,7 @@ _LAZY_MODULES = {
     "mpsfm_core.providers.registry": ("Registry",),
     "mpsfm_core.results.exports.formats": ("export",),
 }
-"""Exported names by the module that defines them, which is imported when a name is first used."""
+"""Exported names by defining module; a module is imported when one of its names is first used."""
 
 _LAZY_NAMES = {name: module for module, names in _LAZY_MODULES.items() for name in names}
 

@@ -1,6 +1,6 @@
-"""Stages of a reconstruction as functions, which ``mpsfm_core`` exports.
+"""Functions for the stages of a reconstruction, which ``mpsfm_core`` exports.
 
-:func:`mpsfm_core.reconstruct` runs the same stages in a row::
+The function :func:`mpsfm_core.reconstruct` runs the same stages one after another::
 
     images = load_images("photos/")
     features = extract_features(images)
@@ -12,7 +12,8 @@
 
 Every stage accepts arrays and objects of the caller instead of the results of earlier stages. A
 provider argument is the name of an installed provider, a configuration block, or an object with the
-method of its kind. The package ``mpsfm_core`` imports this module when a stage is first used.
+method that its provider kind requires. The package ``mpsfm_core`` imports the module when a stage
+is first used.
 """
 
 from __future__ import annotations
@@ -83,24 +84,24 @@ def load_images(
     """Load images and their cameras from a folder, a video, or arrays.
 
     Args:
-        images: Folder of photos, a video, or (H, W, 3) uint8 RGB pixels by image name.
-        cameras: Camera of all arrays, or of each array by name, as
-            :class:`~mpsfm_core.PinholeCamera` or ``pycolmap.Camera``. Without cameras, a guessed
-            focal length is refined.
-        intrinsics: Cameras of the photos as ``intrinsics.yaml``, a COLMAP model or
-            ``transforms.json``, by default from EXIF.
+        images: Folder of photos, path of a video, or (H, W, 3) uint8 RGB pixels by image name.
+        cameras: Camera of all pixel arrays, or camera of each array by image name, as
+            :class:`~mpsfm_core.PinholeCamera` or ``pycolmap.Camera``. Without cameras, the focal
+            length is guessed and refined.
+        intrinsics: Camera intrinsics as ``intrinsics.yaml``, a COLMAP model or ``transforms.json``,
+            by default from EXIF.
         image_list: Text file with one image name per line, by default all images of the folder.
         output: Folder into which the keyframes of a video are written.
-        config: Configuration whose block ``inputs`` is used.
+        config: Configuration, of which the block ``inputs`` is used.
         overrides: Settings such as ``"inputs.max_image_size=1600"``.
-        registry: Installed providers.
-        on_event: Function that receives the progress.
+        registry: Providers that the configuration may name, by default all installed ones.
+        on_event: Function that receives progress events.
 
     Returns:
-        Images, which are decoded and undistorted when they are used.
+        Image set, whose images are decoded and undistorted on access.
 
     Raises:
-        InputError: images or cameras cannot be read, or a video has no ``output``.
+        InputError: images or cameras cannot be read, or ``output`` is missing for a video.
 
     Examples:
         >>> images = mpsfm.load_images("photos/")
@@ -140,19 +141,19 @@ def extract_features(
 
     Args:
         images: Result of :func:`load_images`.
-        features: Provider of features, by default that of the configuration.
-        masks: Mask providers; features in masked areas are removed.
+        features: Provider of features, by default the configured feature provider.
+        masks: Mask providers, in whose masked areas features are removed.
         config: Configuration with providers and options.
         overrides: Settings such as ``"features.options.max_keypoints=2048"``.
-        registry: Installed providers.
-        on_event: Function that receives the progress.
+        registry: Providers that the configuration may name, by default all installed ones.
+        on_event: Function that receives progress events.
 
     Returns:
         Keypoints, descriptors, scores and scales by image name.
 
     Raises:
-        InputError: the provider or its weights are missing.
-        ProviderRunError: the provider failed on an image.
+        InputError: the feature provider or its weights are missing.
+        ProviderRunError: the feature provider failed on an image.
 
     Examples:
         >>> features = mpsfm.extract_features(images, "sift")
@@ -182,27 +183,28 @@ def match_images(
     registry: Registry | None = None,
     on_event: EventCallback | None = None,
 ) -> MatchGraph:
-    """Match image pairs, and verify the matches.
+    """Match image pairs, and verify the matches with two-view geometry.
 
     Args:
         images: Result of :func:`load_images`.
-        features: Result of :func:`extract_features`, or own features by image name. None extracts
-            the features of the configuration.
-        matcher: Matcher of features or of pixels, by default that of the configuration. The default
-            for own features is ``mutual-nearest``.
-        pairs: Pairs of image names to match, by default selected by the block ``pairs``.
+        features: Result of :func:`extract_features`, or features that the caller computed, by image
+            name. By default, the configured provider extracts features.
+        matcher: Sparse or dense matcher, by default the configured matcher. The default matcher for
+            features that the caller computed is ``mutual-nearest``.
+        pairs: Pairs of image names to match, by default selected as the configuration block
+            ``pairs`` specifies.
         retrieval: Provider of global image descriptors for the selection of pairs.
-        masks: Mask providers; dense matches in masked areas are removed.
+        masks: Mask providers, in whose masked areas dense matches are removed.
         config: Configuration with providers and options.
         overrides: Settings such as ``"pairs.mode=sequential"``.
-        registry: Installed providers.
-        on_event: Function that receives the progress.
+        registry: Providers that the configuration may name, by default all installed ones.
+        on_event: Function that receives progress events.
 
     Returns:
         Matches with scores, verified pairs with relative poses, and reasons of dropped pairs.
 
     Raises:
-        InputError: a provider is missing, or matcher and features are incompatible.
+        InputError: a provider is missing, or the matcher does not accept the features.
         ProviderRunError: a provider failed on an image or pair.
 
     Examples:
@@ -250,19 +252,19 @@ def predict_priors(
 
     Args:
         images: Result of :func:`load_images`.
-        depth: Depth provider, by default that of the configuration.
-        normals: Normals provider, by default that of the configuration. A depth provider without
-            normals is combined with normals of planes fitted to the depth.
-        multiview: Multi-view network, for ``depth="multiview"``.
-        matches: Match graph, from which a multi-view network gets its groups of images.
-        masks: Mask providers; priors in masked areas are invalid.
+        depth: Depth provider, by default the configured depth provider.
+        normals: Normals provider, by default the configured normals provider. If the depth provider
+            predicts no normals, the default normals come from planes fitted to the depth map.
+        multiview: Multi-view network, which is used if ``depth`` is ``"multiview"``.
+        matches: Match graph, whose pairs define the groups of images for a multi-view network.
+        masks: Mask providers, in whose masked areas depth and normals are invalid.
         config: Configuration with providers and options.
         overrides: Settings such as ``"extraction.integration_size=300"``.
-        registry: Installed providers.
-        on_event: Function that receives the progress.
+        registry: Providers that the configuration may name, by default all installed ones.
+        on_event: Function that receives progress events.
 
     Returns:
-        Depth and normals with variance by image name, on the grid of the mapper.
+        Depth and normals with variance by image name, in the resolution that the mapper uses.
 
     Raises:
         InputError: a provider or its weights are missing.
@@ -286,20 +288,20 @@ def run_mapper(
     *,
     on_event: EventCallback | None = None,
 ) -> MappingResult:
-    """Reconstruct poses, points and refined depth maps.
+    """Reconstruct poses, points and refined depth maps from matches and priors.
 
     Args:
         problem: Result of :func:`build_problem`.
         options: Options of the mapper, or settings such as ``{"known_poses": "fixed"}``.
-        on_event: Function that receives the progress, and may raise
+        on_event: Function that receives progress events. To cancel the mapper, the function raises
             :class:`~mpsfm_core.Cancelled`.
 
     Returns:
-        Reconstructions of the connected components, the largest first, and the reason of each image
-        that is not registered.
+        Reconstruction of each connected component, the largest first, and the reason why an image
+        is not registered, by image name.
 
     Raises:
-        SettingsError: an option is unknown or out of range.
+        SettingsError: a mapper option is unknown or out of range.
 
     Examples:
         >>> result = mpsfm.run_mapper(problem, {"known_poses": "fixed"})
@@ -319,15 +321,16 @@ def undistort_views(
     images: ImageSet,
     options: MapperOptions | None = None,
 ) -> tuple[MappingResult, MappingProblem, ImageSet]:
-    """Undistort views again with the radial distortion that the mapper estimated.
+    """Undistort images again with the radial distortion that the mapper estimated.
 
-    Depth maps are refined again in the new views. Nothing changes without estimated distortion.
+    Depth maps are refined again in the newly undistorted views. If the mapper estimated no
+    distortion, all arguments are returned unchanged.
 
     Args:
         result: Result of :func:`run_mapper`.
-        problem: Mapping problem.
-        images: Images of the problem.
-        options: Options of the mapper.
+        problem: Mapping problem, the input of :func:`run_mapper`.
+        images: Images of the mapping problem.
+        options: Mapper options, with which depth maps are refined.
 
     Example:
         >>> result, problem, images = mpsfm.undistort_views(result, problem, images)
@@ -349,10 +352,11 @@ def to_colmap(
     """Convert a reconstruction to a COLMAP model.
 
     Args:
-        reconstruction: Element of the result of :func:`run_mapper`.
-        problem: Mapping problem, which has the keypoints.
-        images: Images of the problem. With images, the model has their original cameras and colored
-            points; without, the cameras of the views and black points.
+        reconstruction: One reconstruction of the result of :func:`run_mapper`.
+        problem: Mapping problem with the keypoints, the input of :func:`run_mapper`.
+        images: Images of the mapping problem. With images, the model has original cameras and
+            colored points. Without images, the model has the pinhole cameras of undistorted views
+            and black points.
 
     Examples:
         >>> mpsfm.to_colmap(result.reconstructions[0], problem).num_points3D()
@@ -374,12 +378,13 @@ def from_colmap(
 
     Args:
         model: COLMAP model with poses and points.
-        images: Images of the model, which are needed for cameras with lens distortion.
-        depth: Depth maps by image name in units of the model. The default is a constant depth whose
-            std covers the depths of the image's points.
+        images: Images of the model, which are required for cameras with lens distortion.
+        depth: Depth maps by image name in units of the model. The default is a constant depth map,
+            whose standard deviation covers the depths of the points that the image observes.
 
     Raises:
-        InputError: an image has lens distortion and no image set, or neither points nor depth.
+        InputError: ``images`` is missing although a camera has lens distortion, or an image without
+            depth map observes no points.
 
     Examples:
         >>> reconstruction = mpsfm.from_colmap(pycolmap.Reconstruction("sparse/0"), images)
@@ -402,10 +407,10 @@ def densify(
         reconstruction: Posed images with depth maps.
         images: Images of the reconstruction.
         options: Options of multi-view stereo, or settings such as ``{"max_size": 800}``.
-        on_event: Function that receives the progress.
+        on_event: Function that receives progress events.
 
     Returns:
-        The reconstruction with dense depth maps.
+        Copy of the reconstruction with dense depth maps.
 
     Examples:
         >>> dense = mpsfm.densify(result.reconstructions[0], images)
@@ -423,12 +428,12 @@ def densify(
 
 
 def fuse(reconstruction: Reconstruction, images: ImageSet, seed: int = 0) -> FusedPointCloud:
-    """Fuse the depth maps of a reconstruction to a colored point cloud.
+    """Fuse the depth maps of a reconstruction into a colored point cloud.
 
     Args:
         reconstruction: Posed images with depth maps.
         images: Images of the reconstruction.
-        seed: Seed of the selection of pixels.
+        seed: Random seed of the selection of pixels that become points.
 
     Examples:
         >>> mpsfm.fuse(dense, images).points.shape
@@ -450,8 +455,8 @@ def build_mesh(
         options: Options of meshing, or settings such as ``{"max_triangles": 100000}``.
 
     Raises:
-        InputError: the depth maps give no surface, or the libraries of
-            ``pip install 'mpsfm-core[mesh]'`` are missing.
+        InputError: the depth maps contain no surface, or the packages that ``pip install
+            'mpsfm-core[mesh]'`` installs are missing.
 
     Examples:
         >>> mpsfm.build_mesh(dense, images).triangles.shape
@@ -469,20 +474,22 @@ def evaluate(
     *,
     convention: str = "paper",
 ) -> dict[str, Any]:
-    """Compare estimated poses with true poses: pose AUC and trajectory errors.
+    """Evaluate estimated poses against true poses by pose AUC and trajectory errors.
 
     Args:
-        estimated: Model, reconstruction or result folder, or poses ``cam_from_world`` by name as
-            for :func:`build_problem`.
-        truth: True poses, in the same forms.
+        estimated: Estimated poses as COLMAP model, reconstruction, result folder, or poses
+            ``cam_from_world`` by image name in the forms that :func:`build_problem` accepts.
+        truth: True poses, in the same forms as ``estimated``.
         images: Names of the images to evaluate, by default all images of ``truth``.
-        convention: Convention of the pose AUC: ``paper``, ``models``, ``colmap`` or ``vggt``.
+        convention: Convention of the pose AUC, one of ``paper``, ``models``, ``colmap`` and
+            ``vggt``.
 
     Returns:
-        Report as plain data, with the pose AUC in percent below ``auc``.
+        Report as dictionary; the key ``auc`` has the pose AUC in percent by threshold in degrees.
 
     Raises:
-        InputError: a model cannot be read, an image has no true pose, or the convention is unknown.
+        InputError: a COLMAP model cannot be read, an image has no true pose, or the convention is
+            unknown.
 
     Examples:
         >>> mpsfm.evaluate("out/", "truth/")["auc"]["5"]
@@ -517,7 +524,7 @@ class _ViewsByName:
 
 
 def _rows_of_pairs(images: ImageSet, pairs: Sequence[NamePair]) -> list[tuple[int, int]]:
-    """Return sorted pairs of image indices of pairs of image names."""
+    """Convert pairs of image names to sorted pairs of image indices."""
     rows = {name: row for row, name in enumerate(images.names)}
     for name in np.unique([name for pair in pairs for name in pair]):
         if name not in rows:
@@ -534,7 +541,7 @@ def _extraction(
     blocks: Sequence[str],
     on_event: EventCallback | None,
 ) -> Iterator[ExtractionContext]:
-    """Choose the providers of some blocks, and run extraction inside a ``with`` block."""
+    """Choose the providers of configuration blocks, and open an extraction in a ``with`` block."""
     stages = Stages(registry, on_event)
     config = config.model_copy(update={"fast_pass": None})
     config = resolve_providers(config, registry, stages, blocks).config

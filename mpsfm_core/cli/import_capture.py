@@ -1,4 +1,4 @@
-"""``mpsfm import``: convert a capture with sensor depth for ``mpsfm reconstruct``."""
+"""Command ``mpsfm import``, which converts a phone capture with sensor depth."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ def import_capture(
 ) -> None:
     """Convert a phone capture to DIR/images, DIR/poses and DIR/depth.
 
-    The command prints how to reconstruct the images with these poses, cameras and depth maps.
+    The command prints the call of mpsfm reconstruct that uses the converted images, poses and depth
+    maps.
     """
     from mpsfm_core.inputs.captures.convert import convert_capture
     from mpsfm_core.support.files import lock_output_folder

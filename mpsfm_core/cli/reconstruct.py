@@ -212,7 +212,7 @@ def _place(georeference: Mapping[str, Any]) -> str:
 
 
 def _refined_cameras(details: Collection[Mapping[str, Any]]) -> str:
-    """Describe refined focal lengths and radial distortions in the summary; empty if none."""
+    """Describe refined focal lengths and radial distortions as text, empty if none is refined."""
     radials = [
         image["radial_distortion"]
         for image in details

@@ -1,4 +1,4 @@
-"""``mpsfm extract``, ``mpsfm match`` and ``mpsfm map``: reconstruct step by step."""
+"""Commands ``mpsfm extract``, ``mpsfm match`` and ``mpsfm map`` to reconstruct in steps."""
 
 from __future__ import annotations
 
@@ -38,9 +38,9 @@ def extract(
 ) -> None:
     """Compute features, depth and normals of photos, and write them to a work folder.
 
-    Writes WORK/features.h5 in the format of hloc, and WORK/priors/depth and WORK/priors/normals.
-    Other programs may replace these files before mpsfm match and mpsfm map. Repeat the command to
-    continue an interrupted one.
+    The command writes WORK/features.h5 in the format of hloc, WORK/priors/depth and
+    WORK/priors/normals. Other programs may replace the written files before mpsfm match and mpsfm
+    map read them. Repeat an interrupted mpsfm extract to continue where it stopped.
     """
     from mpsfm_core.api import extract_features, load_images, predict_priors
     from mpsfm_core.cli.progress import show_progress
@@ -87,8 +87,9 @@ def match(
 ) -> None:
     """Match the features of a work folder, and verify the matches.
 
-    Reads WORK/features.h5, which hloc or another program may have written. Writes WORK/matches.h5
-    (hloc, before verification) and WORK/database.db (COLMAP, verified).
+    The command reads WORK/features.h5, which hloc or another program may have written. The command
+    writes matches before verification to WORK/matches.h5 in the format of hloc, and verified
+    matches to the COLMAP database WORK/database.db.
     """
     from mpsfm_core.api import load_images, match_images
     from mpsfm_core.cli.progress import show_progress
@@ -142,8 +143,9 @@ def map_images(
 ) -> None:
     """Reconstruct the photos of a work folder from its matches and priors.
 
-    Reads WORK/database.db, WORK/priors/depth and WORK/priors/normals, which other programs may have
-    written. Without these priors, depth and normals are predicted. Writes WORK/result.
+    The command reads WORK/database.db, WORK/priors/depth and WORK/priors/normals, which other
+    programs may have written. If a folder of priors is missing, networks predict the depth or
+    normals. The command writes the reconstruction to WORK/result.
     """
     from mpsfm_core.cli.reconstruct import run
     from mpsfm_core.data.errors import InputError

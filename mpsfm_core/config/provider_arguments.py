@@ -1,4 +1,4 @@
-"""Providers that a caller passes as object, name or configuration block."""
+"""Providers that the caller passes as object, name or configuration block."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 
 Provider = Any
-"""Provider argument of a public function: the name of a provider, a configuration block as mapping
-or :class:`~mpsfm_core.ProviderConfig`, or an object with the method of its kind."""
+"""Provider argument of a public function, which is the name of a provider, a configuration block
+(mapping or :class:`~mpsfm_core.ProviderConfig`), or an object with the method that its provider
+kind requires."""
 
 _DEFAULT_MATCHER = "mutual-nearest"
-"""Matcher of features that a caller chooses without a matcher, because it accepts all features."""
+"""Default matcher if the caller chooses only features; it accepts features of any kind."""
 
 
 def configure(
@@ -36,18 +37,19 @@ def configure(
     masks: Sequence[Provider] | None = None,
     **providers: Provider,
 ) -> tuple[Config, Registry]:
-    """Load a configuration and replace its providers by those of the caller.
+    """Load a configuration and replace its providers by providers of the caller.
 
     Args:
         config: Name of a shipped configuration, a YAML file, or a loaded configuration.
         registry: Providers that the configuration may name, by default all installed ones.
         overrides: Settings such as ``"runtime.workers=2"``.
-        masks: Mask providers, or None to keep those of the configuration.
-        providers: Provider by configuration block, such as ``depth``; None keeps the configured
-            provider. A dense matcher replaces the sparse matcher and vice versa.
+        masks: Mask providers of the caller, or None to keep the configured mask providers.
+        providers: Provider of the caller by configuration block, such as ``depth``, where None
+            keeps the configured provider. A dense matcher of the caller replaces a configured
+            sparse matcher, and a sparse matcher replaces a dense matcher.
 
     Returns:
-        The configuration, and the registry with the provider objects of the caller.
+        The configuration, and the registry extended by the provider objects of the caller.
 
     Raises:
         ConfigError: a setting or provider is wrong.
@@ -89,7 +91,7 @@ def configure(
 def _block(
     kind: Kind, path: SettingPath, provider: Provider, registry: Registry
 ) -> tuple[ProviderConfig, Registry]:
-    """Return the checked block of a provider, and a registry that has the provider."""
+    """Check a provider argument; return its configuration block and a registry that has it."""
     if isinstance(provider, str):
         block = ProviderConfig(use=provider)
     elif isinstance(provider, Mapping):

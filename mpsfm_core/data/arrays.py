@@ -22,8 +22,8 @@ Pose = tuple[Float64, Float64]
 def require_array(owner: object, name: str, dtype: Any, shape: tuple[int | None, ...]) -> None:
     """Check dtype and shape of an array attribute, and make the attribute read-only.
 
-    The array is replaced by a view, or by a copy if it is not in C order, because sums and products
-    of arrays depend on the memory layout in the last bit.
+    The attribute becomes a read-only view of the array. An array that is not in C order is copied,
+    because rounding errors of sums depend on the memory layout.
 
     Args:
         owner: Data class instance.

@@ -63,8 +63,8 @@ class PinholeCamera:
 
 
 MapOrientation = Literal["auto", "stored", "upright"]
-"""Orientation of map files of photos that EXIF rotates: before (``stored``) or after EXIF rotation
-(``upright``), or ``auto`` to compare the sizes of map and photo."""
+"""Orientation of depth, normal or mask files: the axes of the image before EXIF rotation
+(``stored``), after EXIF rotation (``upright``), or chosen by aspect ratio (``auto``)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +81,8 @@ class View:
     """(H, W) bool, False at pixels outside the undistorted image or masked by the user (None for
     all True)."""
     orientation: int = 1
-    """EXIF orientation that was applied to the original image, 1 to 8. Map files of the original
-    image may be stored without this rotation."""
+    """EXIF orientation that was applied to the original image, 1 to 8. A provider needs the
+    orientation to read depth, normal or mask files that are stored without the EXIF rotation."""
 
     def __post_init__(self) -> None:
         height, width = self.camera.height, self.camera.width

@@ -125,7 +125,7 @@ class CameraReason(ReasonCode):
     """The refined focal length is implausible for any lens; its 35 mm equivalent is
     ``equivalent_mm``."""
     DISTORTION_NOT_ESTIMATED = ("distortion-not-estimated",)
-    """The focal length is not refined, or refinement of distortion is disabled."""
+    """Distortion is not refined because its refinement is disabled or the focal length is fixed."""
     DISTORTION_NOT_OBSERVABLE = ("distortion-not-observable", "radial_std")
     """The images do not constrain the radial distortion, whose std is ``radial_std``."""
     DISTORTION_OUT_OF_RANGE = ("distortion-out-of-range", "radial")
@@ -156,7 +156,8 @@ class DoubtReason(ReasonCode):
     FEW_POINTS = ("few-points", "num_images", "min_points")
     """``num_images`` images observe fewer than ``min_points`` 3D points."""
     FEW_EXPLAINED_MATCHES = ("few-explained-matches", "num_images", "min_ratio")
-    """Most matches of ``num_images`` images contradict the model."""
+    """For ``num_images`` images, the model explains a smaller ratio of matches than
+    ``min_ratio``."""
     GPS_MISFIT = ("gps-misfit", "num_inliers", "num_positions")
     UNKNOWN_FOCAL_LENGTH = ("unknown-focal-length", "num_images")
     """``num_images`` images have a guessed focal length that bundle adjustment did not refine."""

@@ -36,7 +36,7 @@ class MpsfmError(Exception):
 class Cancelled(MpsfmError):
     """Exception that a callback ``on_event`` raises to end a run.
 
-    The same call continues from the last checkpoint.
+    A repeated call of ``reconstruct`` with the same arguments continues from the last checkpoint.
     """
 
     exit_code = 130

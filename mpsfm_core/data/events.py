@@ -11,23 +11,23 @@ from mpsfm_core.data.mapping_problem import SceneState
 
 @dataclass(frozen=True)
 class Notice:
-    """One line of text for the user, such as the name of a chosen provider."""
+    """Message of one line for the user, such as the name of a chosen provider."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class StageStarted:
-    """Start of a stage, such as ``"matching"``."""
+    """Event at the start of a stage, such as ``"matching"``."""
 
     stage: str
     total: int | None
-    """Number of steps of the stage, or None if it is unknown."""
+    """Number of steps of the stage, or None if the number is unknown."""
 
 
 @dataclass(frozen=True)
 class StageProgress:
-    """Number of finished steps of a stage."""
+    """Event after each finished step of a stage, with the number of finished steps."""
 
     stage: str
     done: int
@@ -36,7 +36,7 @@ class StageProgress:
 
 @dataclass(frozen=True)
 class StageFinished:
-    """End of a stage."""
+    """Event at the end of a stage."""
 
     stage: str
     seconds: float
@@ -45,31 +45,31 @@ class StageFinished:
 
 @dataclass(frozen=True)
 class ImageRegistered:
-    """Registration of an image by the mapper."""
+    """Event after the mapper registered an image."""
 
     name: str
     registered: int
-    """Number of registered images of the component, with this image."""
+    """Number of registered images of the component, including the new image."""
     total: int
-    """Number of all images."""
+    """Number of all images of the mapping problem."""
 
 
 @dataclass(frozen=True)
 class ImageRejected:
-    """Failed registration of an image, or its removal from the model."""
+    """Event after the registration of an image failed, or after an image was removed."""
 
     name: str
     reason: Reason
     text: str
-    """The reason in words."""
+    """Reason of the rejection as text for the user."""
 
 
 @dataclass(frozen=True)
 class SceneChanged:
-    """Change of poses or points during mapping."""
+    """Event after poses or points changed during mapping."""
 
     scene: Callable[[], SceneState]
-    """Function that copies the current reconstruction."""
+    """Function that returns a copy of the current poses and points."""
 
 
 Event = (
@@ -83,5 +83,5 @@ Event = (
 )
 
 EventCallback = Callable[[Event], None]
-"""Function that receives the events of a run in the thread of the caller. An exception that the
-function raises, such as :class:`~mpsfm_core.data.errors.Cancelled`, ends the run."""
+"""Function that receives the progress events of a run in the thread of the caller. An exception
+that the function raises, such as :class:`~mpsfm_core.data.errors.Cancelled`, ends the run."""

@@ -43,16 +43,16 @@ class MappingImage:
     focal_known: bool = True
     """False if the focal length is a guess for bundle adjustment to refine."""
     camera_id: int = 0
-    """Number of the physical camera. Images with equal number and intrinsics share a guessed focal
-    length."""
+    """Number of the physical camera. Images with equal camera number and equal intrinsics share a
+    guessed focal length."""
     focal_log_std: float = 0.7
     """Prior std of the logarithm of a guessed focal length."""
     focal_guess_px: float | None = None
     """Prior mean of ``fx`` in pixels of the undistorted view (None means ``camera.fx``)."""
     radial: float = 0.0
-    """Coefficient of the radial distortion (SIMPLE_RADIAL) that was removed from the view.
+    """Radial distortion (coefficient of SIMPLE_RADIAL) that was removed from the undistorted view.
 
-    Bundle adjustment refines the coefficient together with a guessed focal length."""
+    Bundle adjustment refines the radial distortion together with a guessed focal length."""
     known_pose: Pose | None = None
     """Known camera pose ``cam_from_world`` that the user provides, or None."""
     depth_group: int | None = None
@@ -78,14 +78,14 @@ class MappingImage:
 
     @property
     def shared_camera(self) -> tuple[int, PinholeCamera]:
-        """Number and intrinsics, which are equal for images that share a guessed focal length."""
+        """Camera number and intrinsics, which are equal for images that share a focal length."""
         return self.camera_id, self.camera
 
     def with_camera(self, camera: PinholeCamera) -> MappingImage:
-        """Return the image with another focal length; the prior keeps its mean.
+        """Return a copy of the image with another focal length and the same focal length prior.
 
-        The distortion that was removed from the view stays the same in pixels, so its coefficient
-        is scaled by the squared ratio of focal lengths.
+        The radial distortion that was removed from the view stays the same in pixels, so its
+        coefficient is multiplied by the squared ratio of new to old focal length.
         """
         radial = self.radial * (camera.fx / self.camera.fx) ** 2
         return replace(self, camera=camera, focal_guess_px=self.focal_prior_px, radial=radial)

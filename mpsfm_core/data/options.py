@@ -44,7 +44,7 @@ class SettingProblem:
     path: SettingPath
     """Path of the setting, such as ``("depth", "options", "scale")``."""
     text: str
-    """Violated rule of the setting."""
+    """Rule that the setting violates, as text for the user."""
     missing: bool = False
     """True if a required setting is absent."""
 

@@ -7,7 +7,7 @@ package ``mpsfm_core.results`` writes these files, and ``mpsfm_core.report`` rea
 SUMMARY = "summary.json"
 """Summary of a run: configuration, reconstructed components, and reasons for missing images."""
 IMAGES = "images"
-"""Images that the caller passed as arrays."""
+"""Folder of images that the caller passed as arrays, written as PNG files."""
 SPARSE = "sparse"
 """COLMAP model of the original (distorted) images in binary format."""
 SPARSE_TEXT = "sparse_text"

@@ -150,8 +150,7 @@ class _Builder:
     def pairs(
         self, matches: Mapping[NamePair, Any], options: VerificationOptions, seed: int
     ) -> tuple[VerifiedPair, ...]:
-        """Verify all pairs that are not yet verified; return the pairs in the order of the
-        images."""
+        """Verify pairs that are not yet verified; return all pairs in the order of the images."""
         found: dict[tuple[int, int], VerifiedPair] = {}
         for (name_a, name_b), given in matches.items():
             for name in (name_a, name_b):

@@ -70,7 +70,7 @@ class ProviderResolution:
     :meth:`Config.provider_configs`."""
 
     def describe(self, usage: Sequence[ProviderReport]) -> list[ProviderSummary]:
-        """Describe choice, licenses and usage of the provider of each block."""
+        """Describe choice, licenses and usage of the provider of each configuration block."""
         reports = {(report["kind"], report["name"]): report for report in usage}
         described: list[ProviderSummary] = []
         blocks = zip(self.choices, self.config.provider_configs(), strict=True)

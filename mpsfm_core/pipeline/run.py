@@ -120,9 +120,9 @@ def reconstruct(
     :func:`mpsfm_core.extract_features` and :func:`mpsfm_core.run_mapper`.
 
     Args:
-        images: Folder of photos, including subfolders; or a video, whose keyframes are selected
-            by ``inputs.video`` and written into ``frames/`` of the output; or the result of
-            :func:`mpsfm_core.load_images`.
+        images: Folder of photos with its subfolders, a video, or the result of
+            :func:`mpsfm_core.load_images`. Keyframes of a video are selected by ``inputs.video``
+            and written into ``frames/`` of the output.
         output: Result folder, used by one run at a time, or None to write nothing.
         config: Name of a shipped configuration, a YAML file, or a loaded configuration.
         intrinsics: Camera intrinsics as ``intrinsics.yaml``, a COLMAP model or ``transforms.json``.
@@ -131,16 +131,16 @@ def reconstruct(
         image_list: Text file with one image name per line, by default all images of the folder.
         poses: COLMAP model or ``transforms.json`` with poses of some or all images;
             ``mapping.known_poses`` chooses whether known poses are fixed or refined.
-        features: Provider of features instead of the configured one. Each provider argument is a
-            name, a configuration block, or an object with the method of its kind. An object keeps
-            no results for later runs.
-        matcher: Matcher of features or of pixels, which replaces all configured matchers. The
-            default for features of the caller is ``mutual-nearest``.
-        retrieval: Provider of global image descriptors.
+        features: Provider of features that replaces the configured provider. Each provider argument
+            is a name, a configuration block, or an object with the method that its provider kind
+            requires. Results of a provider object are not cached for later runs.
+        matcher: Sparse or dense matcher, which replaces all configured matchers. The default
+            matcher for a feature provider of the caller is ``mutual-nearest``.
+        retrieval: Provider of global image descriptors, which select image pairs.
         multiview: Multi-view network, used by ``depth="multiview"``.
         depth: Provider of depth priors.
         normals: Provider of normal priors.
-        masks: Mask providers, instead of those of the configuration.
+        masks: Mask providers, which replace the configured mask providers.
         database: COLMAP database whose keypoints and matches replace features and matchers. The
             matches of the database are verified again. The cameras of the database are ignored
             unless ``intrinsics`` names the database too.
@@ -149,8 +149,8 @@ def reconstruct(
             configuration.
         registry: Providers that the configuration may name, by default all installed ones.
         fresh: If true, ignore the checkpoint of an interrupted run and start mapping again.
-        on_event: Function that receives the progress, see :mod:`mpsfm_core.data.events`. To cancel
-            the run, the function raises :class:`~mpsfm_core.Cancelled`.
+        on_event: Function that receives progress events, see :mod:`mpsfm_core.data.events`. To
+            cancel the run, the function raises :class:`~mpsfm_core.Cancelled`.
 
     Returns:
         COLMAP models of the original photos, arrays of the mapper, and the summary.
@@ -203,7 +203,7 @@ class _Source:
     """Input files of a run."""
 
     images: Path | ImageSet
-    """Folder of photos, a video, or loaded images."""
+    """Folder of photos, path of a video, or loaded images."""
     intrinsics: Path | None
     image_list: Path | None
     poses: Path | None
@@ -212,7 +212,7 @@ class _Source:
 
     @property
     def video(self) -> Path | None:
-        """Path of the video, or None if the images are no video."""
+        """Path of the video, or None if the input is a folder or images in memory."""
         images = self.images
         return images if isinstance(images, Path) and is_video(images) else None
 
@@ -404,8 +404,8 @@ class _Run:
         """Match images with too few points after the fast pass, and map again from seed poses.
 
         Returns:
-            Extraction with all matches, images with the cameras whose views were mapped again, and
-            result of the mapper.
+            Extraction with all matches, images with refined cameras, and result of the second
+            mapper run.
         """
         config = self._config
         assert config.fast_pass is not None
@@ -448,7 +448,7 @@ class _Run:
     def _refine_depth_maps(
         self, refined: ImageSet, problem: MappingProblem, mapping: MappingResult
     ) -> MappingResult:
-        """Refine the depth maps in views that are undistorted with the refined cameras."""
+        """Refine depth maps again in views that are undistorted with the refined cameras."""
         options = self._config.mapper_options()
         with self._stages.stage("mapping"):
             parts = (
@@ -573,7 +573,7 @@ class _Run:
         models: Sequence[pycolmap.Reconstruction],
         originals: OriginalImages,
     ) -> RunSummary:
-        """Collect the facts of all stages for ``summary.json``."""
+        """Collect the results of all stages for ``summary.json``."""
         config, stages = self._config, self._stages
         return {
             "format_version": SUMMARY_FORMAT,
@@ -599,7 +599,7 @@ class _Run:
         }
 
     def _describe_resources(self, output: Path | None = None) -> dict[str, Any]:
-        """Describe estimated and measured memory and disk space; memory is the peak so far."""
+        """Describe estimated and measured disk space and peak memory of the run."""
         peaks = [record.peak_memory_mb or 0.0 for record in self._stages.report().values()]
         measured = {
             "memory_mb": round(max(peaks, default=0.0) + self._children.peak_mb),

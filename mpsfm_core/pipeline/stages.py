@@ -45,7 +45,7 @@ class StageRecord:
 
 
 class Stages:
-    """Receives progress events of a run, and forwards them to a callback and to plugins."""
+    """Receiver of progress events of a run, which forwards events to callback and plugins."""
 
     def __init__(self, registry: Registry, on_event: EventCallback | None = None) -> None:
         self._registry = registry
@@ -100,7 +100,7 @@ class Stages:
         self.notice(f"warning: {text}")
 
     def stage_started(self, stage: str, total: int | None) -> None:
-        """Forward the start of a stage with ``total`` steps (None if unknown)."""
+        """Forward the start of a stage and its number of steps to callback and plugins."""
         self._on_event(StageStarted(stage, total))
         self._registry.call_hook("mpsfm_stage_started", stage=stage, total=total)
 
@@ -134,7 +134,7 @@ class Stages:
 
 
 def _ignore(event: Event) -> None:
-    """Ignore an event of a run without callback."""
+    """Ignore a progress event, as default of the callback ``on_event``."""
 
 
 def _reset_peak_memory() -> None:

@@ -10,8 +10,9 @@
          database.db       COLMAP database with keypoints and verified matches
          result/           result folder of the reconstruction
 
-Each command reads the files of the earlier commands, so every file can be replaced by a file of
-another program. Results of providers are cached, so a repeated command continues where it stopped.
+Each command reads the files that earlier commands wrote. Other programs may replace files of the
+work folder between two commands. Results of providers are cached, so a repeated command continues
+where the interrupted command stopped.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.npz import write_npz
 
 FORMAT = 1
-"""Version of the file ``work.json``."""
+"""Format version of the file ``work.json``."""
 SETTINGS = "work.json"
 FEATURES = "features.h5"
 MATCHES = "matches.h5"
@@ -38,18 +39,18 @@ RESULT = "result"
 
 
 class WorkSettings(Options):
-    """Content of ``work.json``, which the later commands use."""
+    """Content of ``work.json``, which ``mpsfm match`` and ``mpsfm map`` read."""
 
     images: Path
-    """Folder of the photos."""
+    """Folder of the images."""
     intrinsics: Path | None = None
-    """Cameras of the photos as ``intrinsics.yaml``, a COLMAP model or ``transforms.json``."""
+    """Camera intrinsics as ``intrinsics.yaml``, a COLMAP model or ``transforms.json``."""
     image_list: Path | None = None
-    """Text file with one image name per line."""
+    """Text file with one image name per line, or None to use all images of the folder."""
     config: str = "default"
     """Name or file of the configuration."""
     overrides: tuple[str, ...] = ()
-    """Settings that replace those of the configuration."""
+    """Settings such as ``"runtime.workers=2"`` that override the configuration."""
     metric_depth: bool = True
     """True if the depth priors are in meters."""
 
@@ -58,7 +59,7 @@ def read_settings(work: Path) -> WorkSettings:
     """Read ``work.json`` of a work folder.
 
     Raises:
-        InputError: the file is missing or damaged.
+        InputError: the file ``work.json`` is missing or damaged.
     """
     path = work / SETTINGS
     try:
@@ -73,13 +74,13 @@ def read_settings(work: Path) -> WorkSettings:
 
 
 def write_settings(work: Path, settings: WorkSettings) -> None:
-    """Write ``work.json`` of a work folder, which is created if needed."""
+    """Write ``work.json`` into a work folder, which is created if needed."""
     content = {VERSION: FORMAT, **settings.model_dump(mode="json")}
     write_file(work / SETTINGS, json.dumps(content, indent=2) + "\n")
 
 
 def write_priors(work: Path, priors: Priors) -> None:
-    """Write depth and normal priors as NPZ files, in the format of the providers ``files``."""
+    """Write depth and normal priors as NPZ files, which providers named ``files`` read."""
     for name, depth in priors.depth.items():
         assert depth.variance is not None
         arrays = {"depth": depth.depth, "variance": depth.variance, "valid": depth.valid}

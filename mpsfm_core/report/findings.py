@@ -189,8 +189,9 @@ def _providers(summary: Mapping[str, Any]) -> Iterator[Finding]:
 def describe_scale(summary: Mapping[str, Any]) -> tuple[str, str]:
     """Describe the unit of the first reconstruction, and where its scale comes from.
 
-    Agreeing depth maps of a network do not prove the scale, because the network may not know the
-    kind of scene. The description therefore names the source of the scale.
+    Depth maps of a network that agree with each other do not prove the metric scale, because the
+    network may not know the kind of scene. The description of the scale therefore names the source,
+    such as a network or GPS.
     """
     metric = summary["reconstructions"][0]["metric_scale"]
     if metric is None:
@@ -275,13 +276,13 @@ def _focal_lengths(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _range(changes: Sequence[float]) -> str:
-    """Return smallest and largest relative change as text, one value if they are equal."""
+    """Return minimum and maximum of relative changes as text, such as ``+3% to +8%``."""
     ends = dict.fromkeys(f"{change:+.0%}" for change in (min(changes), max(changes)))
     return " to ".join(ends)
 
 
 def _distortions(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield findings about estimated and refused radial distortions."""
+    """Yield a finding about images with estimated radial distortion."""
     details = summary["images"]["details"]
     refined = {
         name: (image["radial_distortion"], image["radial_distortion_std"])

@@ -77,10 +77,10 @@ def build_model(
 def build_pinhole_model(
     reconstruction: Reconstruction, problem: MappingProblem
 ) -> pycolmap.Reconstruction:
-    """Build a COLMAP model of the views with black points, without the images.
+    """Build a COLMAP model with black points, which needs no images, of the undistorted views.
 
-    The cameras are pinhole cameras, or SIMPLE_RADIAL if the mapper estimated radial distortion of
-    views that are not undistorted.
+    Cameras of the model are PINHOLE, or SIMPLE_RADIAL if the mapper estimated radial distortion and
+    the views were not undistorted with the estimate.
     """
     cameras = [
         _with_distortion(image.camera, image.radial)
@@ -102,13 +102,14 @@ def reconstruction_from_model(
 
     Args:
         model: COLMAP model with poses and points.
-        cameras: Camera of the undistorted view by image name; images that are missing here need a
-            camera without lens distortion.
-        depth: Depth map by image name; images that are missing here get a constant depth, whose std
-            covers the depths of their points.
+        cameras: Camera of the undistorted view by image name. An image without entry needs a camera
+            without lens distortion in the COLMAP model.
+        depth: Depth map by image name. An image without entry gets a constant depth map, whose
+            standard deviation covers the depths of the points that the image observes.
 
     Raises:
-        InputError: an image has lens distortion, or neither points nor depth.
+        InputError: an image without entry in ``cameras`` has lens distortion, or an image without
+            entry in ``depth`` observes no points.
     """
     point_ids = sorted(model.points3D)
     rows = {number: row for row, number in enumerate(point_ids)}

@@ -25,9 +25,9 @@ _MIN_POSITIONS = 4
 _MIN_SPREAD_STDS = 5.0
 """Minimum spread of the GPS positions in standard deviations of GPS noise."""
 _MAX_TILT_STD_DEG = 2.0
-"""Maximum std in degrees of gravity from GPS altitudes, before camera orientations are used."""
+"""Std in degrees of gravity from GPS altitudes, above which camera orientations are preferred."""
 _NO_TILT_DEG = 90.0
-"""Std in degrees of gravity without enough GPS altitudes."""
+"""Std in degrees of the gravity direction if there are too few GPS altitudes."""
 _ALTITUDE_STD_RATIO = 2.0
 """Ratio of vertical to horizontal GPS noise [GPS.gov, 1.5 to 3]."""
 _MAX_ERROR_STDS = 3.0
@@ -63,7 +63,8 @@ def georeference(
 
     The similarity is estimated with RANSAC. If GPS altitudes do not determine gravity, camera
     orientations determine gravity, and GPS positions determine heading, scale and translation. If
-    most positions contradict gravity from camera orientations, GPS altitudes are used after all.
+    most GPS positions are outliers with gravity from camera orientations, gravity from GPS
+    altitudes is used nevertheless.
 
     Args:
         reconstruction: reconstruction in an arbitrary world frame and scale.
@@ -117,10 +118,11 @@ def georeference(
 def _generate_alignments(
     poses: list[Pose], centers: Float64, enu: Float64, std_m: float
 ) -> Iterator[tuple[pycolmap.Sim3d, str]]:
-    """Yield ``enu_from_world`` and the source of gravity, the more reliable source first.
+    """Yield alignments ``enu_from_world`` with their source of gravity, most reliable first.
 
-    If GPS altitudes do not determine gravity well, camera orientations come first. Camera
-    orientations are misleading if all cameras look down, as in mapping flights.
+    If GPS altitudes do not determine gravity well, the alignment with gravity from camera
+    orientations comes first. Gravity from camera orientations is wrong if all cameras look down, as
+    in mapping flights.
     """
     tilt_deg = _tilt_deg(enu, std_m)
     if tilt_deg >= _MAX_TILT_STD_DEG:

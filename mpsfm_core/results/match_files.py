@@ -19,19 +19,20 @@ from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.inputs.model_orientation import orient_camera
 
 _TO_HLOC = -0.5
-"""Offset in pixels from COLMAP to hloc, because hloc's first pixel center is (0, 0)."""
+"""Offset in pixels from COLMAP to hloc, because the first pixel center of hloc is (0, 0)."""
 _INVERSE_ORIENTATION = {6: 8, 8: 6}
-"""EXIF orientation that reverts an orientation, where they differ."""
+"""Inverse of EXIF orientations 6 and 8; all other EXIF orientations are their own inverse."""
 _NO_ID = 2**32 - 1
-"""Camera id of a COLMAP camera without id."""
+"""Camera id that COLMAP gives to a camera without id."""
 
 
 def write_hloc_features(path: Path, images: ImageSet, features: Mapping[str, Features]) -> None:
     """Write keypoints, descriptors and scores to a features file of hloc.
 
     Args:
-        path: HDF5 file to write.
-        images: Images of the features; the file has the pixels of the image files.
+        path: HDF5 features file to write.
+        images: Images of the features, with which keypoints are converted to pixels of the image
+            files.
         features: Features by image name in pixels of the undistorted views.
 
     Raises:
@@ -58,9 +59,10 @@ def write_hloc_matches(
     """Write the matches of features before verification to a matches file of hloc.
 
     Args:
-        path: HDF5 file to write.
-        graph: Match graph of a sparse matcher.
-        rows: Row in the features file of each feature, by image name, if rows were left out.
+        path: HDF5 matches file to write.
+        graph: Match graph with matches of a sparse matcher.
+        rows: Row number in the features file of each feature (n,) by image name. By default,
+            features and file have the same rows.
 
     Raises:
         InputError: h5py is not installed.
@@ -83,12 +85,13 @@ def write_hloc_matches(
 def write_match_database(path: Path, images: ImageSet, graph: MatchGraph) -> None:
     """Write cameras, images, keypoints and verified matches to a COLMAP database.
 
-    The keypoints are those of :attr:`MatchGraph.keypoints`, in pixels of the image files.
+    The database has the keypoints of :attr:`MatchGraph.keypoints`, converted to pixels of the image
+    files.
 
     Args:
-        path: Database file to write; an existing file is replaced.
+        path: Database file to write, or to replace if the file exists.
         images: Images of the match graph.
-        graph: Match graph.
+        graph: Match graph with keypoints and verified pairs.
     """
     unfinished = path.with_name(f".{path.name}.unfinished")
     unfinished.unlink(missing_ok=True)
@@ -120,14 +123,14 @@ def write_match_database(path: Path, images: ImageSet, graph: MatchGraph) -> Non
 
 
 def _stored_camera(image: SourceImage) -> pycolmap.Camera:
-    """Return the camera of the image file before EXIF rotation."""
+    """Return the camera of an image in the orientation of its file, before EXIF rotation."""
     inverse = _INVERSE_ORIENTATION.get(image.orientation, image.orientation)
     return orient_camera(image.camera, inverse)
 
 
 @contextmanager
 def _replaced(path: Path) -> Iterator[Any]:
-    """Open an HDF5 file that replaces ``path`` at the end of the ``with`` block."""
+    """Write an HDF5 file that replaces the file ``path`` at the end of the ``with`` block."""
     try:
         h5py: Any = importlib.import_module("h5py")
     except ImportError as error:
@@ -141,7 +144,7 @@ def _replaced(path: Path) -> Iterator[Any]:
 
 
 def _stored_pixels(image: SourceImage, xy: Float64) -> Float64:
-    """Map pixels (n, 2) of the undistorted view to pixels of the image file."""
+    """Map pixels (n, 2) of the undistorted view to stored pixels of the image file."""
     upright = image.original_pixels(xy)
     inverse = _INVERSE_ORIENTATION.get(image.orientation, image.orientation)
     return apply_orientation_to_pixels(upright, image.original_size, inverse)

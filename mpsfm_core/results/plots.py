@@ -1,7 +1,7 @@
 """Plots of images, matches, depth, cameras and residuals with matplotlib.
 
-The plots need ``pip install "mpsfm-core[report]"``. Each function returns a figure, which a
-notebook shows and ``figure.savefig("FILE.png")`` writes.
+The plots need ``pip install "mpsfm-core[report]"``. Each plot function returns a matplotlib figure,
+which a notebook shows and ``figure.savefig("FILE.png")`` writes.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from mpsfm_core.extraction.match_graph import MatchGraph
 from mpsfm_core.inputs.images import ImageSet
 
 _MAX_LINES = 100
-"""Maximum number of drawn matches."""
+"""Maximum number of matches in a plot of two images."""
 _MAX_POINTS = 20_000
-"""Maximum number of drawn points."""
+"""Maximum number of 3D points in a plot of a model."""
 
 
 def plot_matches(images: ImageSet, matches: MatchGraph, name_a: str, name_b: str) -> Figure:
@@ -32,7 +32,7 @@ def plot_matches(images: ImageSet, matches: MatchGraph, name_a: str, name_b: str
         name_b: Name of the right image.
 
     Raises:
-        InputError: the pair is not verified.
+        InputError: the images ``name_a`` and ``name_b`` are no verified pair.
 
     Examples:
         >>> plots.plot_matches(images, matches, "view_0.jpg", "view_1.jpg")
@@ -59,10 +59,10 @@ def plot_matches(images: ImageSet, matches: MatchGraph, name_a: str, name_b: str
 
 
 def plot_depth(view: View, depth: DepthPrior) -> Figure:
-    """Draw an image, its depth map and the relative std of the depth map.
+    """Draw an image, its depth map, and the standard deviation of depth relative to depth.
 
     Args:
-        view: Undistorted view.
+        view: Undistorted view of the image.
         depth: Depth prior or refined depth of the view.
 
     Examples:
@@ -86,7 +86,7 @@ def plot_depth(view: View, depth: DepthPrior) -> Figure:
 def plot_model(model: pycolmap.Reconstruction) -> Figure:
     """Draw the points and camera centers of a COLMAP model from above and from the side.
 
-    The plot has the two main directions of the scene (principal components) as axes.
+    The axes of the plot are principal components of the point positions.
 
     Examples:
         >>> plots.plot_model(result.model)
@@ -110,7 +110,7 @@ def plot_model(model: pycolmap.Reconstruction) -> Figure:
 
 
 def plot_residuals(model: pycolmap.Reconstruction) -> Figure:
-    """Draw a histogram of the reprojection errors of a COLMAP model, and their mean per image.
+    """Draw a histogram of the reprojection errors of a COLMAP model, and the mean per image.
 
     Examples:
         >>> plots.plot_residuals(result.model)
@@ -126,7 +126,7 @@ def plot_residuals(model: pycolmap.Reconstruction) -> Figure:
 
 
 def _residuals(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Float64:
-    """Return the reprojection errors (n,) of the observations of an image in pixels."""
+    """Return the reprojection errors (n,) in pixels of the observations of an image."""
     errors = []
     for point in image.points2D:
         if point.has_point3D():

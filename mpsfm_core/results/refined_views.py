@@ -1,8 +1,9 @@
-"""Undistort views again with the radial distortion that the mapper estimated.
+"""Undistort images again with the radial distortion that the mapper estimated.
 
-The first views of guessed cameras are pinhole images of guessed focal length. If the mapper finds
-radial distortion, keypoints, depth and normal priors move to views that are undistorted with the
-refined cameras. Depth along z and normals in the camera frame keep their values.
+Images without given intrinsics are first mapped as pinhole images of a guessed focal length. If the
+mapper estimates radial distortion, keypoints, depth priors and normal priors are transferred to
+views that are undistorted with the refined cameras. The transfer moves pixels, and keeps values of
+depth along z and of normals in the camera frame.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 MIN_VALID_WEIGHT = 0.999
-"""Smallest interpolation weight of valid pixels for which a resampled pixel is valid. [ours]"""
+"""Minimum sum of interpolation weights of valid pixels for a valid resampled pixel. [ours]"""
 
 
 def undistort_images(
@@ -37,12 +38,12 @@ def undistort_images(
 ) -> ImageSet:
     """Return the images with the SIMPLE_RADIAL cameras that the mapper estimated.
 
-    Images that are not registered take the camera of a registered image with the same guessed
+    An image that is not registered gets the camera of a registered image that shares its guessed
     camera. The images are returned unchanged if no radial distortion was estimated.
 
     Args:
-        images: Images whose views were mapped.
-        problem: Mapping problem of these views.
+        images: Images whose undistorted views were mapped.
+        problem: Mapping problem of the undistorted views.
         reconstructions: Components that the mapper reconstructed.
     """
     registered = {image.index: image for part in reconstructions for image in part.images}
@@ -64,12 +65,12 @@ def undistort_images(
 def undistort_problem(
     images: ImageSet, refined: ImageSet, problem: MappingProblem
 ) -> MappingProblem:
-    """Return the mapping problem of ``images`` with the views of ``refined``.
+    """Transfer a mapping problem to views that are undistorted with refined cameras.
 
     Args:
-        images: Images whose views the problem describes.
-        refined: The same images with refined cameras.
-        problem: The mapping problem.
+        images: Images with the cameras before refinement, to whose views the problem refers.
+        refined: Images with the refined cameras, in the same order.
+        problem: Mapping problem with keypoints and priors on the views of ``images``.
     """
     views = []
     for old, new, view in zip(images, refined, problem.images, strict=True):
@@ -78,9 +79,9 @@ def undistort_problem(
 
 
 def undistort_cameras(refined: ImageSet, reconstruction: Reconstruction) -> Reconstruction:
-    """Return a reconstruction with the pinhole cameras of the refined views.
+    """Replace the cameras of a reconstruction by the pinhole cameras of refined views.
 
-    The depth maps stay those of the mapped views, so they have to be refined again.
+    The depth maps of the reconstruction do not change, so they have to be refined again.
 
     Args:
         refined: Images with the cameras that :func:`undistort_images` estimated.
@@ -94,7 +95,7 @@ def undistort_cameras(refined: ImageSet, reconstruction: Reconstruction) -> Reco
 
 
 def _refined_camera(source: SourceImage, registered: RegisteredImage) -> pycolmap.Camera:
-    """Return the SIMPLE_RADIAL camera of an upright original image."""
+    """Return the SIMPLE_RADIAL camera that the mapper estimated for an upright original image."""
     camera = source.camera
     focal_px = camera.mean_focal_length() * registered.camera.fx / source.pinhole.fx
     center = camera.principal_point_x, camera.principal_point_y
@@ -108,14 +109,14 @@ def _refined_camera(source: SourceImage, registered: RegisteredImage) -> pycolma
 
 
 class _ViewWarp:
-    """Resampling from the view of one camera to the view of another camera of the same image."""
+    """Resampling of keypoints and maps from an old to a new undistorted view of an image."""
 
     def __init__(self, old: SourceImage, new: SourceImage) -> None:
         self._old, self._new = old, new
         self._pixels: dict[tuple[int, int], Float32] = {}
 
     def move_view(self, image: MappingImage) -> MappingImage:
-        """Return an image of the mapping problem on the new view."""
+        """Return an image of the mapping problem with keypoints and priors on the new view."""
         return replace(
             image,
             camera=self._new.pinhole,
@@ -131,7 +132,7 @@ class _ViewWarp:
         return float(self._new.camera.params[self._new.camera.extra_params_idxs()[0]])
 
     def move_keypoints(self, xy: Float64) -> Float64:
-        """Map pixels (n, 2) of the old view to pixels of the new view."""
+        """Map keypoints (n, 2) in pixels of the old view to pixels of the new view."""
         camera = self._new.camera
         center = np.array([camera.principal_point_x, camera.principal_point_y])
         distorted = (self._old.original_pixels(xy) - center) / camera.mean_focal_length()
@@ -139,7 +140,7 @@ class _ViewWarp:
         return project(self._new.pinhole, np.column_stack([rays, np.ones(len(rays))]))
 
     def move_depth(self, prior: DepthPrior) -> DepthPrior:
-        """Resample a depth map by bilinear interpolation of log depth."""
+        """Resample a depth prior on the new view by bilinear interpolation of log depth."""
         safe = np.where(prior.valid, prior.depth, np.float32(1))
         depth = np.exp(self._resample(np.log(safe)))
         variance = prior.variance
@@ -150,7 +151,7 @@ class _ViewWarp:
         )
 
     def move_normals(self, prior: NormalPrior) -> NormalPrior:
-        """Resample a normal map by bilinear interpolation."""
+        """Resample a normal prior on the new view by bilinear interpolation."""
         variance = None if prior.variance is None else self._resample(prior.variance)
         return NormalPrior.from_arrays(
             self._resample(prior.normals), variance, self._resample_mask(prior.valid)
@@ -171,7 +172,7 @@ class _ViewWarp:
         return resampled
 
     def _map_pixels(self, rows: int, columns: int) -> Float32:
-        """Return the position (h, w, 2) on a map of the old view of each pixel of a new map."""
+        """Return pixels (h, w, 2) in a map of the old view of each pixel of a new map."""
         old, new = self._old.pinhole, self._new.pinhole
         width = max(1, round(columns * new.width / old.width))
         height = max(1, round(rows * new.height / old.height))

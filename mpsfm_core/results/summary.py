@@ -1,7 +1,8 @@
 """Content of ``summary.json``.
 
-:class:`RunSummary` declares all keys. The pipeline fills in the choice of providers, times,
-resources and configuration, and this module describes images, pairs and reconstructions.
+:class:`RunSummary` declares all keys of ``summary.json``. The functions of this module describe
+images, pairs and reconstructions, and the pipeline adds providers, times, resources and
+configuration.
 """
 
 from __future__ import annotations
@@ -45,16 +46,16 @@ class ImagesSummary(TypedDict):
     unregistered: dict[str, dict[str, Value]]
     """Reason why each unregistered image is not registered, by image name."""
     left_out: dict[str, str]
-    """Reason why a file is not used as an image, by file name."""
+    """Reason why an image file is not used, by file name."""
     failed: dict[str, str]
-    """Errors of providers, by image name."""
+    """Error message of a provider that failed on an image, by image name."""
     details: dict[str, dict[str, Any]]
-    """Focal length, distortion and :class:`~mpsfm_core.extraction.report.ImageReport`, by
-    image name."""
+    """Focal length, distortion and statistics of extraction
+    (:class:`~mpsfm_core.extraction.report.ImageReport`), by image name."""
 
 
 class PairsSummary(TypedDict):
-    """Numbers of image pairs, and the outcome of each pair."""
+    """Numbers of proposed, matched and verified image pairs, and the outcome of each pair."""
 
     proposed: int
     matched: int
@@ -73,7 +74,7 @@ class ReconstructionSummary(TypedDict):
     observations: int
     mean_track_length: float
     mean_reprojection_error_px: float | None
-    """Mean over the 3D points in pixels of the original images."""
+    """Mean reprojection error over the 3D points in pixels of the original images."""
     median_relative_depth_std: float | None
     metric_scale: dict[str, Any] | None
     """:class:`~mpsfm_core.mapping.scene.reconstruction.MetricScale` of the reconstruction."""
@@ -102,7 +103,7 @@ ProviderSummary = TypedDict(
 
 
 class StageSummary(TypedDict):
-    """Run time and peak memory of a stage."""
+    """Run time and peak memory of a stage of the pipeline."""
 
     seconds: float
     peak_memory_mb: float | None
@@ -120,23 +121,23 @@ class RunSummary(TypedDict):
     config: dict[str, Any]
     versions: dict[str, str]
     photos: str | None
-    """Absolute path of the folder of photos, or None for photos in memory."""
+    """Absolute path of the images folder, or None for images in memory."""
     matches_from: str | None
-    """File of imported matches."""
+    """File from which matches were imported, or None if the images were matched."""
     images: ImagesSummary
     pairs: PairsSummary
     reconstructions: list[ReconstructionSummary]
-    """All components, the model in ``sparse`` first."""
+    """Summary of each component; the first component is the model in ``sparse``."""
     mapping_runs: int
     """Number of mapper runs with different seeds."""
     mapping_steps: dict[str, dict[str, Any]]
-    """Seconds and number of calls of each step of the mapper."""
+    """Run time in seconds and number of calls of each step of the mapper."""
     georeference: dict[str, Any] | None
-    """Alignment of the first reconstruction with GPS positions, or the reason ``why_not``."""
+    """Alignment of the first reconstruction with GPS positions, or the reason of no alignment."""
     dense: list[dict[str, Any]] | None
-    """Stereo depth of each reconstruction."""
+    """Report of multi-view stereo for each reconstruction, or None if stereo is disabled."""
     resources: dict[str, Any]
-    """Memory and disk space, ``predicted`` and ``measured``."""
+    """Estimated (``predicted``) and ``measured`` memory and disk space of the run."""
 
 
 def read_summary(path: Path) -> dict[str, Any]:
@@ -186,7 +187,7 @@ def describe_images(
     """Describe status and statistics of all images, with reasons for unregistered images.
 
     Args:
-        images: images of the run, with the cameras that were given or guessed.
+        images: images of the run with the initial cameras, which were given or guessed.
         extraction: report of the extraction of features, priors and matches.
         mapping: result of the mapper.
         photos: original images with the refined cameras.
@@ -226,7 +227,7 @@ def describe_images(
 def _describe_camera(
     image: SourceImage, registered: RegisteredImage | None, photos: OriginalImages
 ) -> dict[str, Any]:
-    """Describe initial and refined focal length and distortion, with std or a reason of no std."""
+    """Describe initial and refined focal length and distortion of an image, with std or reason."""
     described: dict[str, Any] = {
         "focal_length_from": image.focal_source,
         "focal_length_px": image.camera.mean_focal_length(),
