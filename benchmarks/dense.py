@@ -6,11 +6,11 @@ A case is a scene, a bucket of its test sets (grouped by overlap) and a depth pr
 of the test sets are stored in the output folder and reused. With ``--true-poses`` the mapper keeps
 the true poses fixed, and estimates depth scales, points and refined depth maps.
 
-Depth errors are computed in the scale of the camera centers, std coverage in the scale that fits
-the depth best. The fused cloud is aligned by camera centers and compared with all true depth maps
-of the test set. The scene ``fountain`` has no true depth maps. The metric on ``fountain`` is the
-share of points, triangulated with the true poses, whose depth is within 1 %. ``--json`` prints one
-JSON object as the last line.
+Depth errors are computed after scaling by the camera centers, std coverage after scaling to the
+true depth. The fused cloud is aligned by camera centers and compared with all true depth maps of
+the test set. The scene ``fountain`` has no true depth maps. The metric on ``fountain`` is the share
+of points, triangulated with the true poses, whose depth is within 1 %. ``--json`` prints one JSON
+object as the last line.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ NEAR = 0.1
 WAYS = ("mapper", "dense", "without prior")
 """Sources of depth maps: mapper, dense stage, and dense stage without depth prior.
 
-Without depth prior, the dense stage only knows the depth range of the triangulated points.
+The dense stage without depth prior only gets the depth range of the triangulated points.
 """
 POINT_NEAR = 0.01
 """Maximum relative depth error of an accurate pixel at a triangulated point of ``fountain``."""
@@ -98,7 +98,7 @@ CASES: Mapping[str, Case] = {
     for bucket in buckets
     for prior in priors
 }
-"""Cases by name; the depth prior ``config`` is the network FastDepth."""
+"""Benchmark cases by name; the depth prior ``config`` is the network FastDepth."""
 
 
 def main() -> None:
@@ -123,7 +123,7 @@ def main() -> None:
 
 
 def mapped_sets(name: str, output: Path, true_poses: bool = False) -> list[Reconstruction]:
-    """Map the test sets of a case, with true poses on request, or read the stored result."""
+    """Reconstruct the test sets of a case, or read the stored reconstructions."""
     stored = output / f"{name}{'-true-poses' if true_poses else ''}.pickle"
     if stored.is_file():
         return list(pickle.loads(stored.read_bytes()))
@@ -223,9 +223,9 @@ def set_errors(
 ) -> dict[str, float]:
     """Compute the errors of depth maps and fused cloud (n, 3) of one test set.
 
-    The result is empty if too few camera centers determine the scale. The matches of ``problem``
-    define the true depth of the scene ``fountain``. ``seen`` contains the mask (h, w) of measured
-    pixels of each depth map, by image name.
+    The returned errors are empty if too few camera centers determine the scale of the
+    reconstruction. The matches of ``problem`` define the true depth of the scene ``fountain``.
+    ``seen`` contains the mask (h, w) of measured pixels of each depth map, by image name.
     """
     maps = {image.name: image.depth for image in reconstruction.images}
     errors = trajectory_errors(reconstruction.poses, scene.truth)
@@ -243,7 +243,7 @@ def set_errors(
     map_metrics = [map_errors(each, scale, own_scale_factor) for each in common_pixels]
     cameras = {photo.name: photo.pinhole for photo in photos}
     accuracy = evaluate_dense_geometry(reconstruction, cloud, scene, cameras, TOLERANCES)
-    assert accuracy is not None  # because true depth is known
+    assert accuracy is not None  # because the scene has true depth
     result = {"abs_rel": accuracy["depth"]["abs_rel"], **_means(map_metrics)}
     for tolerance in map(str, TOLERANCES):
         centimetres = round(100 * float(tolerance))
@@ -267,7 +267,8 @@ class MapBesideTruth(NamedTuple):
 
     @classmethod
     def of(cls, depth: DepthPrior, truth: Float32, seen: Bool | None) -> MapBesideTruth:
-        """Collect the pixels with true depth; ``seen`` is the mask of measured depth."""
+        """Collect the pixels with true depth; the argument ``seen`` is the mask of pixels that
+        multi-view stereo measured."""
         assert depth.variance is not None  # refined depth maps always have a std
         xy, depth_samples, true = sample_depth_at_truth(depth.depth, depth.valid, truth)
         variance, _ = sample_bilinear(depth.variance, depth.valid, xy)
@@ -280,8 +281,8 @@ class MapBesideTruth(NamedTuple):
 def own_scale(maps: Sequence[MapBesideTruth]) -> float:
     """Compute the median of true over estimated depth over the measured pixels of a test set.
 
-    All pixels are used if no pixel is measured. The median depth ratio is more accurate than the
-    scale of a few camera centers.
+    All pixels are used if no pixel is measured. The median depth ratio is a more accurate scale
+    than the scale from a few camera centers.
     """
     ratios = [each.truth / each.depth for each in maps]
     measured_ratios = [ratio[each.measured] for ratio, each in zip(ratios, maps, strict=True)]
@@ -293,9 +294,9 @@ def own_scale(maps: Sequence[MapBesideTruth]) -> float:
 def map_errors(pixels: MapBesideTruth, scale: float, own_scale_factor: float) -> dict[str, float]:
     """Compute the depth errors of one depth map.
 
-    The share of accurate pixels and AbsRel are in the scale of the camera centers (``scale``). A
-    second AbsRel and the share of errors within one std are in the scale that fits the depth maps
-    best (``own_scale_factor``).
+    The share of accurate pixels and AbsRel are computed after scaling by ``scale``, from the camera
+    centers. A second AbsRel and the share of errors within one std are computed after scaling by
+    ``own_scale_factor``, which fits the depth maps best.
     """
     measured, relative = pixels.measured, np.abs(scale * pixels.depth - pixels.truth) / pixels.truth
     error = np.abs(own_scale_factor * pixels.depth - pixels.truth)

@@ -8,8 +8,8 @@ The other pipeline is pyarchinit-photogrammetry (GPL), which only this benchmark
 
 pyarchinit-photogrammetry runs PatchMatch stereo in Rust and COLMAP's fusion on the CPU, with the
 defaults for close range (``moderate``). OpenCV's semi-global matching of rectified pairs
-initializes PatchMatch. Both pipelines start from the photos and from our sparse model. The cases
-and their reconstructions are those of :mod:`benchmarks.dense`.
+initializes PatchMatch. Both pipelines start from the photos and from our sparse model. The
+benchmark cases and their reconstructions are those of :mod:`benchmarks.dense`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from mpsfm_core.results.colmap_model import build_model
 from mpsfm_core.results.ply import read_ply
 
 MODE = "moderate"
-"""Mode of pyarchinit-photogrammetry, its default for close range."""
+"""Quality mode of pyarchinit-photogrammetry, the default for close range."""
 _INSTALL = "pip install --no-deps pyarchinit-photogrammetry pyarchinit-photogrammetry-core"
 Maps = dict[str, DepthPrior]
 
@@ -146,7 +146,8 @@ def ours(
 def depth_errors(
     scene: SceneFolder, maps: Maps, chosen: dict[str, Bool], names: Sequence[str], scale: float
 ) -> dict[str, float]:
-    """Compute median relative depth error, share within 1 %, and share of the measured pixels."""
+    """Compute median relative depth error, share of pixels within 1 %, and share of measured
+    pixels."""
     assert scene.depth is not None
     total, errors = 0, [np.zeros(0)]
     for name in names:

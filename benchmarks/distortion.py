@@ -4,9 +4,10 @@
         [--max-images N] [--seeds 1] [--without-colmap] [--set KEY=VALUE ...] [--folder FOLDER]
 
 The images of a scene are resampled to a SIMPLE_RADIAL camera with the principal point at the image
-center. The focal length is the shortest one without blank pixels. Neither program gets intrinsics.
-The table is that of :mod:`benchmarks.real_photos`. Rows are kept in ``--folder``, so that an
-interrupted run continues.
+center. The focal length of the SIMPLE_RADIAL camera is the shortest one for which no pixel is
+blank. Neither program gets intrinsics. The result table has the columns of
+:mod:`benchmarks.real_photos`. Table rows are stored in ``--folder``, so that an interrupted
+benchmark continues.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from mpsfm_core.inputs.undistortion import resize_camera
 from mpsfm_core.results.colmap_model import write_model
 
 NUM_BISECTIONS = 40
-"""Number of bisections of the focal length."""
+"""Number of bisections that find the shortest focal length without blank pixels."""
 
 
 def main() -> None:
@@ -65,14 +66,15 @@ def main() -> None:
 
 
 def distort_scene(source: Path, target: Path, radial: float, width: int, max_images: int) -> None:
-    """Write a scene of at most ``max_images`` images as a distorting lens takes them.
+    """Write a scene with images resampled to a camera with radial distortion.
 
     Args:
         source: Scene folder with ``images/`` and the COLMAP model ``gt/`` of pinhole cameras.
-        target: Scene folder to write.
+        target: Folder to which the resampled scene is written.
         radial: Radial distortion coefficient of the new camera.
         width: Width of the new images in pixels.
-        max_images: Maximum number of images, which are evenly spaced in the order of their names.
+        max_images: Maximum number of images; the selected images are evenly spaced in the order of
+            their names.
     """
     truth = pycolmap.Reconstruction(source / "gt")
     images = sorted(truth.images.values(), key=lambda image: str(image.name))
@@ -102,7 +104,7 @@ def distort_scene(source: Path, target: Path, radial: float, width: int, max_ima
 
 
 def find_camera(pinhole: pycolmap.Camera, radial: float) -> pycolmap.Camera:
-    """Return the SIMPLE_RADIAL camera of shortest focal length that sees only the pinhole image."""
+    """Return the SIMPLE_RADIAL camera of shortest focal length without pixels outside the image."""
     width, height = pinhole.width, pinhole.height
     corners = np.array([[x, y] for x in (0.5, width - 0.5) for y in (0.5, height - 0.5)])
     low_px, high_px = 0.2 * pinhole.mean_focal_length(), 5 * pinhole.mean_focal_length()

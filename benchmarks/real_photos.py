@@ -3,12 +3,12 @@
     python -m benchmarks.real_photos [SET ...] [--photos FOLDER] [--seeds 1] [--without-colmap]
         [--set KEY=VALUE ...] [--output FILE] [--json]
 
-Each set of photos is a folder with ``images/`` and, if there is a reference, a COLMAP model
-``gt/``. Neither program gets intrinsics. COLMAP uses SIFT, all pairs, the incremental mapper and
-one SIMPLE_RADIAL camera per image. Pose AUC counts all pairs; an unregistered image has an error of
-180 degrees. Rotation errors are those after alignment to the image with the smallest median error.
-Camera centers are compared with GPS after a similarity transform, horizontally. ``--json`` prints
-one JSON object as the last line.
+Each photo set is a folder with ``images/`` and, if true poses are known, a COLMAP model ``gt/``.
+Neither program gets intrinsics. COLMAP uses SIFT, all pairs, the incremental mapper and one
+SIMPLE_RADIAL camera per image. Pose AUC counts all image pairs; a pair with an unregistered image
+has an error of 180 degrees. Rotation errors are measured after alignment to the image with the
+smallest median rotation error. Camera centers are compared with GPS after a similarity transform,
+horizontally. ``--json`` prints one JSON object as the last line.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ CONVENTION = CONVENTIONS["paper"]
 MAX_ROTATION_DEG = 2.0
 """Maximum rotation error in degrees of an image whose pose counts as correct. [ours]"""
 MIN_GPS_POSITIONS = 4
-"""Minimum number of GPS positions to evaluate; any three fit a similarity well. [ours]"""
+"""Minimum number of GPS positions for an evaluation, because a similarity transform fits any three
+positions well. [ours]"""
 NUM_GPS_ITERATIONS = 20
 """Number of iterations of the trimmed alignment of camera centers to GPS. [ours]"""
 
@@ -73,12 +74,13 @@ def main() -> None:
 
 
 def reconstruct_and_measure(folder: Path, method: str, overrides: Sequence[str]) -> dict[str, Any]:
-    """Reconstruct a set of photos, and print and return its row of the table.
+    """Reconstruct a photo set, then print and return its row of the result table.
 
     Args:
-        folder: Folder of the set of photos.
-        method: ``COLMAP``, or ``seed`` and the random seed of our mapper.
-        overrides: Options of our configuration, as ``KEY=VALUE``.
+        folder: Folder of the photo set.
+        method: Reconstruction method, either ``COLMAP``, or ``seed`` and the random seed of our
+            mapper.
+        overrides: Settings ``KEY=VALUE`` that override our configuration.
     """
     start, verdict = time.perf_counter(), ""
     if method == "COLMAP":
@@ -97,8 +99,8 @@ def reconstruct_with_defaults(
 ) -> tuple[list[pycolmap.Reconstruction], str]:
     """Return the models of ``mpsfm reconstruct IMAGES``, largest first, and the verdict.
 
-    The verdict includes the names of the reasons for doubt. The list of models is empty if the
-    reconstruction fails.
+    The returned verdict string includes the names of the reasons for doubt. The list of models is
+    empty if the reconstruction fails.
     """
     offline = ["runtime.offline=true", "dense.enabled=false"]
     try:
@@ -136,8 +138,8 @@ def measure(models: Sequence[pycolmap.Reconstruction], folder: Path) -> dict[str
     """Measure registered images, pose AUC, rotation, focal and distortion errors, GPS residual.
 
     Args:
-        models: Models of one set of photos, largest first; only the largest model is evaluated.
-            folder: Folder of the set of photos.
+        models: Models of one photo set, largest first; only the largest model is evaluated. folder:
+            Folder of the photo set.
     """
     names = sorted(path.name for path in (folder / "images").iterdir())
     row: dict[str, Any] = {
@@ -192,7 +194,8 @@ def measure_gps_residual(poses: Mapping[str, Pose], images: Path) -> float | Non
     """Measure the median horizontal distance of camera centers to GPS, in meters.
 
     The similarity transform is a least-squares fit to the half of the images with the smaller
-    residuals. None if fewer than ``MIN_GPS_POSITIONS`` images have a position.
+    residuals. Median distance, or None if fewer than ``MIN_GPS_POSITIONS`` images have a GPS
+    position.
     """
     positions = {name: read_gps((images / name).read_bytes()) for name in poses}
     known = {name: position for name, position in positions.items() if position is not None}

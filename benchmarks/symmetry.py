@@ -3,11 +3,11 @@
     python -m benchmarks.symmetry [--seeds 9] [--placed-only] [--output FILE]
 
 The first table (*placed*) checks images at given poses, with refined depth. The depth check
-compares each view at its true pose with all other views. The check also compares each view at the
-corresponding pose in the other room with the views of that room and of the corridor. The second
-table (*mapped*) runs the whole mapper, with and without the depth check. The registered pose of an
-image is wrong if it is nearer to the corresponding position in the other room than to the true
-position, relative to the first pair.
+compares each view at its true pose with all other views. The depth check also compares each view at
+the corresponding wrong pose in the other room with the views of the other room and of the corridor.
+The second table (*mapped*) runs the whole mapper, with and without the depth check. The registered
+pose of an image is wrong if it is nearer to the corresponding position in the other room than to
+the true position, relative to the first pair.
 """
 
 from __future__ import annotations
@@ -48,7 +48,8 @@ HEADER_MAPPED = (
 
 
 def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
-    """Check each view at a correct and at a wrong pose; yield (is wrong, is rejected, seconds)."""
+    """Check the depth of each view at a correct and a wrong pose; yield (wrong, rejected,
+    seconds)."""
     views = zip(case.problem.images, case.poses, strict=True)
     images = tuple(replace(i, known_pose=(p[:, :3].copy(), p[:, 3].copy())) for i, p in views)
     pairs = tuple(p for p, false in zip(case.problem.pairs, case.false, strict=True) if not false)
@@ -65,7 +66,7 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
             if pose is not None:
                 scene.registered = everything & (room != room[image])
                 scene.translations[image] = truth + pose[:, 3] - case.poses[image][:, 3]
-                # keep the observations, because only the pose of the view is wrong
+                # keep the view's observations of points, because only the pose of the view is wrong
                 scene.tracks.point_of[scene.graph.keypoints_of(int(image))] = NO_POINT
             start = time.perf_counter()
             check = DepthConsistencyCheck(scene, options.consistency).check_image(
@@ -78,7 +79,8 @@ def placed(case: SymmetricProblem) -> Iterator[tuple[bool, bool, float]]:
 
 
 class Observed(ModelMaintenance):
-    """Scene that records for every depth check if the pose is wrong, and if it is rejected."""
+    """Scene that records for every depth check whether the pose is wrong and whether it is
+    rejected."""
 
     case: SymmetricProblem
     verdicts: list[tuple[bool, bool]]

@@ -1,14 +1,15 @@
-"""Verdicts of runs beside the true pose errors of their images.
+"""Comparison of the verdicts of ``summary.json`` with the true pose errors of the images.
 
     python -m benchmarks.verdicts [SET ...] [--config default] [--cache FOLDER] [--output FILE]
 
-The sets are the real photo sets, fountain, low-overlap sets of rendered_kitchen and hololens_room,
-and adversarial inputs: identical photos, a pure rotation, an object that turns before a static
-background, wrong EXIF, and photos with other zooms, crops and edited copies. No run gets
-intrinsics. The error of an image is the median over the other images of the pose error of the pair,
-the maximum of rotation and translation direction in degrees. A verdict "good" should mean that at
-most 2 % of the images have an error of more than 2 degrees, and no image one of more than 5.
-Finished runs in the cache folder are not repeated.
+The photo sets are the real photo sets, the scene fountain, low-overlap sets of the scenes
+rendered_kitchen and hololens_room, and adversarial photo sets with identical photos, a pure
+rotation, an object that turns before a static background, wrong EXIF, different zooms, crops, or
+edited copies. The photo sets are reconstructed without known intrinsics. The error of an image is
+its median relative pose error with the other images. A relative pose error is the maximum of the
+rotation error and the translation direction error in degrees. If the verdict is "good", at most 2 %
+of the images should have an error above 2 degrees, and no image an error above 5 degrees. Photo
+sets with a result in the folder ``--cache`` are not reconstructed again.
 """
 
 from __future__ import annotations
@@ -38,20 +39,20 @@ from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.report.verdict import judge
 
 MAX_ERRORS_DEG = (2.0, 5.0)
-"""Errors above which an image counts as wrong."""
+"""Pose errors in degrees above which the pose of an image counts as wrong."""
 LONGER_SIDE = 640
-"""Longer side in pixels of the photos of generated sets."""
+"""Longer side in pixels of the photos of generated photo sets."""
 NUM_LOW_OVERLAP_SETS = 2
-"""Number of sets of each low-overlap bucket."""
+"""Number of test sets of each bucket (test sets of similar overlap) with low overlap."""
 
 Photo = tuple[UInt8, dict[int, float]]
-"""BGR pixels and numeric tags of the EXIF directory."""
+"""Photo as BGR pixels, with numeric tags of its EXIF directory."""
 Edit = Callable[[UInt8, int], Photo]
-"""Function that edits a photo, given its pixels and its number in the set."""
+"""Function that edits a photo, given its pixels and its number in the photo set."""
 
 
 def main() -> None:
-    """Parse the command line, run or read all sets, and print the table."""
+    """Reconstruct all photo sets without a stored result, and print the table of verdicts."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("sets", nargs="*", metavar="SET")
     parser.add_argument("--config", default="default")
@@ -75,11 +76,11 @@ def main() -> None:
 
 
 Writer = Callable[[Path], dict[str, Pose]]
-"""Function that writes the photos of a set into a folder and returns their true poses by name."""
+"""Function that writes a photo set to a folder, and returns the true poses by name of the photo."""
 
 
 def list_sets(shared: Path) -> dict[str, Writer]:
-    """Return the functions that write each set of photos, by name of the set."""
+    """Return the functions that write the photo sets, by name of the photo set."""
     fountain = shared / "data" / "fountain"
     sets: dict[str, Writer] = {
         name: link_photos(shared / "photos" / name)
@@ -109,7 +110,7 @@ def list_sets(shared: Path) -> dict[str, Writer]:
 
 
 def link_photos(scene: Path, names: Sequence[str] | None = None) -> Writer:
-    """Return a function that links the photos of a scene, or some of them."""
+    """Return a function that links the named photos of a scene, or all photos."""
 
     def write(folder: Path) -> dict[str, Pose]:
         for path in (scene / "images").iterdir():
@@ -128,14 +129,14 @@ def edit_photos(
     same_photo: bool = False,
     with_copies: bool = False,
 ) -> Writer:
-    """Return a function that writes edited photos.
+    """Return a function that writes edited photos of a scene to a folder.
 
     Args:
-        scene: Scene folder.
+        scene: Scene folder with the original photos.
         edit: Function that edits each photo.
-        stems: Names of the photos without suffix, or None for all.
-        same_photo: Edit the first photo again and again.
-        with_copies: Also write a brightened copy of each photo.
+        stems: Names of the edited photos without suffix, or None for all photos.
+        same_photo: Edit only the first photo, once for each photo.
+        with_copies: Add a brightened copy of each photo to the photo set.
     """
 
     def write(folder: Path) -> dict[str, Pose]:
@@ -159,7 +160,7 @@ def edit_photos(
 
 
 def crop(image: UInt8, zoom: float, shift: float = 0.0) -> UInt8:
-    """Enlarge an image about a point, which is shifted by a share of its size."""
+    """Enlarge an image about a point at a distance from the image center, a share of the size."""
     height, width = image.shape[:2]
     center = np.array([width / 2, height / 2]) * (1 + shift)
     matrix = np.column_stack([zoom * np.eye(2), np.array([width / 2, height / 2]) - zoom * center])
@@ -178,7 +179,7 @@ def on_background(image: UInt8) -> UInt8:
 
 
 def rotate_view(image: UInt8, number: int) -> Photo:
-    """Return the view of a camera that turns about its vertical axis without moving."""
+    """Return the photo of a camera that is rotated about its vertical axis without translation."""
     height, width = image.shape[:2]
     matrix = np.array([[0.9 * width, 0, width / 2], [0, 0.9 * width, height / 2], [0, 0, 1]])
     rotation = cv2.Rodrigues(np.array([0.0, np.radians(4.0 * (number - 2)), 0.0]))[0]
@@ -189,7 +190,7 @@ def rotate_view(image: UInt8, number: int) -> Photo:
 
 
 def read_poses(scene: Path, folder: Path) -> dict[str, Pose]:
-    """Return the true poses of the photos in a folder by name, empty without a reference."""
+    """Return the true poses of the photos in a folder by name, or no poses without a true model."""
     if not (scene / "gt").is_dir():
         return {}
     poses = reconstruction_poses(pycolmap.Reconstruction(scene / "gt"))
@@ -198,7 +199,7 @@ def read_poses(scene: Path, folder: Path) -> dict[str, Pose]:
 
 
 def run_set(name: str, write: Writer, config: str) -> dict[str, Any]:
-    """Reconstruct a set of photos without intrinsics, and return summary and errors by image."""
+    """Reconstruct a photo set without intrinsics, and return its summary and image errors."""
     start = time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="mpsfm-verdicts-") as folder:
         true_poses = write(Path(folder))
@@ -220,7 +221,7 @@ def run_set(name: str, write: Writer, config: str) -> dict[str, Any]:
 def measure_errors_deg(
     poses: Mapping[str, Pose], true_poses: Mapping[str, Pose]
 ) -> dict[str, float]:
-    """Measure the median pose error in degrees of each image to the other images."""
+    """Compute the median relative pose error in degrees of each image with the other images."""
     names = [name for name in true_poses if name in poses]
     errors = np.full((len(names), len(names)), np.nan)
     for i, a in enumerate(names):
@@ -233,13 +234,13 @@ def measure_errors_deg(
 
 
 def _relative(a: Pose, b: Pose) -> tuple[Float64, Float64]:
-    """Return rotation and translation direction from one camera to another."""
+    """Return the rotation and the translation direction from the first to the second camera."""
     baseline = a[0] @ (camera_center(*b) - camera_center(*a))
     return b[0] @ a[0].T, baseline / max(float(np.linalg.norm(baseline)), 1e-12)
 
 
 def describe(run: Mapping[str, Any]) -> dict[str, Any]:
-    """Judge a stored run with the present rules, and count its wrong images."""
+    """Compute the verdict of a stored reconstruction, and count the images with wrong poses."""
     if "error" in run:
         return {"set": run["set"], "verdict": "failed", "doubts": run["error"][:60]}
     verdict = judge(run["summary"])
@@ -256,7 +257,7 @@ def describe(run: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format a Markdown table with one row per set."""
+    """Format a Markdown table with the verdict and the number of wrong images of each photo set."""
     limits = " | ".join(f"> {limit:g} deg" for limit in MAX_ERRORS_DEG)
     lines = [f"| set | registered | {limits} | verdict | doubts |", "|---" * 6 + "|"]
     for row in rows:

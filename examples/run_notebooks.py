@@ -1,4 +1,4 @@
-"""Execute the notebooks of this folder and store their outputs: run_notebooks.py [NAME...]."""
+"""Execute the example notebooks and store their outputs, by run_notebooks.py [NAME...]."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from PIL import Image
 
 HERE = Path(__file__).parent
 COLORS = 48
-"""Number of colors of stored pictures, which keeps the files small."""
+"""Number of colors of the pictures in notebooks; few colors keep the notebook files small."""
 
 
 def execute(path: Path) -> nbformat.NotebookNode:
-    """Execute a notebook in its folder and return it with outputs; an exception is an error."""
+    """Execute a notebook in its folder, and return the notebook with the outputs of its cells."""
     notebook = nbformat.read(path, as_version=4)
     where = {"metadata": {"path": str(path.parent)}}
     NotebookClient(notebook, timeout=600, resources=where).execute()
@@ -40,7 +40,7 @@ def reduce_colors(png: str) -> str:
 
 
 def main() -> None:
-    """Execute the named notebooks, or all, and store their outputs."""
+    """Execute the notebooks named on the command line, or all notebooks, and store the outputs."""
     for path in sorted(HERE.glob("*.ipynb")):
         if len(sys.argv) == 1 or path.stem in sys.argv[1:]:
             started = time.perf_counter()

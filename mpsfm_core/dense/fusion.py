@@ -20,8 +20,8 @@ from mpsfm_core.support.threads import parallel_map
 DEFAULT_MAX_POINTS = 2_000_000
 """Default maximum number of points of a fused cloud, 32 bytes each in ``dense.ply`` [ours]."""
 _MAX_RELATIVE_STD = 0.1
-"""Maximum relative depth std of fused pixels, unless more than three quarters of the pixels exceed
-the maximum [twice the std of the weaker networks in paper C]."""
+"""Maximum relative depth std of fused pixels, unless more than three quarters of the pixels have a
+larger depth std [twice the std of the weaker networks in paper C]."""
 _MAX_DIFFERENCE_STDS = 3.0
 """Depth difference in standard deviations from which the depth map of another image contradicts a
 pixel [ours]."""

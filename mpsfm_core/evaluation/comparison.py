@@ -1,10 +1,11 @@
 """Statistical comparison of two benchmark runs by differences of pose AUC.
 
-Two benchmarks are compared on their common test sets. Confidence intervals come from a paired
-bootstrap over test sets. P-values come from a randomization test that swaps the two benchmarks in
-each test set. If an overlap bucket (test sets of similar overlap) has too few sets, image pairs are
-resampled. Image pairs of a set share images, so pair resampling gives too narrow intervals; the
-table states what was resampled.
+Two benchmark runs are compared on their common test sets. Confidence intervals come from a paired
+bootstrap over test sets. P-values come from a randomization test that swaps the results of the two
+benchmark runs in random test sets. If an overlap bucket (test sets of similar overlap) has too few
+test sets, image pairs are resampled instead of test sets. Image pairs of a test set share images,
+so pair resampling gives too narrow confidence intervals; the comparison table states whether test
+sets or image pairs were resampled.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from mpsfm_core.results.ply import read_ply
 
 
 def find_photos(output: Path) -> Path | None:
-    """Return the existing folder of photos that a result folder records, else None."""
+    """Return the photo folder that ``summary.json`` records, or None if the folder is missing."""
     try:
         recorded = json.loads((output / SUMMARY).read_text(encoding="utf-8")).get("photos")
     except (OSError, ValueError, AttributeError, RecursionError):

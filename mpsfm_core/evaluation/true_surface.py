@@ -28,9 +28,10 @@ def read_true_depth(
 
     Args:
         folder: Folder of true depth maps as 16-bit PNG files in millimeters.
-        image: Name of the image.
+        image: Name of the photo.
         size: Upright (width, height) of the image at any resolution.
-        photos: Folder of the photos, None to skip the rotation.
+        photos: Folder of the photos with their EXIF orientation, or None if the depth maps are
+            upright.
 
     Returns:
         Depth (h, w) in meters, 0 where unknown, or None if there is no depth map of the image.

@@ -11,10 +11,10 @@ from mpsfm_core.data import Float64, PinholeCamera
 from mpsfm_core.geometry.projection import project, rays
 
 NUM_ITERATIONS = 20
-"""Number of Newton iterations, which converge to machine precision. [ours]"""
+"""Number of Newton iterations that invert the distortion to machine precision. [ours]"""
 MIN_SLOPE = 0.1
 """Smallest derivative ``1 + 3 k r^2`` of the distorted radius for which the distortion is inverted.
-Beyond this radius, negative distortion folds the image over. [ours]"""
+A negative coefficient ``k`` folds the image over where the derivative is negative. [ours]"""
 
 
 def distort_rays(rays_xy: Float64, radial: float) -> Float64:
@@ -32,8 +32,9 @@ def undistort_rays(distorted: Float64, radial: float) -> Float64:
         radial: Radial distortion coefficient ``k``.
 
     Returns:
-        (n, 2) undistorted normalized coordinates. If no inverse exists, the radius is the largest
-        radius at which the derivative of the distorted radius is at least ``MIN_SLOPE``.
+        (n, 2) undistorted normalized coordinates. If the distortion has no inverse at a point, the
+        point gets the largest undistorted radius at which the derivative of the distorted radius is
+        at least ``MIN_SLOPE``.
     """
     length = np.linalg.norm(distorted, axis=1)
     max_radius = np.sqrt((1 - MIN_SLOPE) / (-3 * radial)) if radial < 0 else np.inf
@@ -50,12 +51,12 @@ def undistort_rays(distorted: Float64, radial: float) -> Float64:
 def change_distortion(
     xy: Float64, old: tuple[PinholeCamera, float], new: tuple[PinholeCamera, float]
 ) -> Float64:
-    """Undistort pixels with another camera and coefficient than they were undistorted with.
+    """Convert undistorted pixels to another camera and radial distortion coefficient.
 
     Args:
         xy: (n, 2) pixels that were undistorted with the old camera.
-        old: Pinhole camera, and radial distortion coefficient that was removed from ``xy``.
-        new: Pinhole camera of the same image, and radial distortion coefficient to remove.
+        old: Old pinhole camera, and the radial distortion coefficient that was removed from ``xy``.
+        new: New pinhole camera of the same image, and the radial distortion coefficient to remove.
 
     Returns:
         (n, 2) pixels of the new pinhole camera.

@@ -41,7 +41,7 @@ def pose_from(name: str, given: Any) -> Pose:
             translation.
 
     Raises:
-        InputError: the matrix has another shape.
+        InputError: the pose matrix is neither (3, 4) nor (4, 4).
     """
     if isinstance(given, tuple):
         rotation, translation = given
@@ -54,5 +54,5 @@ def pose_from(name: str, given: Any) -> Pose:
 
 
 def camera_key(camera: pycolmap.Camera) -> str:
-    """Return a text key that is equal for cameras of equal model, size and parameters."""
+    """Return a string that is equal for cameras of equal model, image size and parameters."""
     return f"{camera.model_name} {camera.width} {camera.height} {camera.params.tolist()}"

@@ -29,7 +29,7 @@ class CheckpointStore(Protocol):
         """Handle a checkpoint that cannot be restored, before the mapper restarts from scratch."""
 
     def due(self) -> bool:
-        """Return True if the mapper shall save a checkpoint now."""
+        """Return True if the mapper must save a checkpoint before it registers the next image."""
 
     def save(self, state: CheckpointArrays, registered: int) -> None:
         """Save a checkpoint.
@@ -56,7 +56,7 @@ class Checkpointer:
         self._store = store
 
     def load(self) -> MapperProgress:
-        """Load the last mapper checkpoint, or return empty progress if none can be read."""
+        """Load the last mapper checkpoint, or return no mapper runs if none is readable."""
         if self._store is not None and (arrays := self._store.load()) is not None:
             try:
                 state = unflatten_state(arrays)

@@ -44,7 +44,7 @@ _WITHOUT_POINTS = {
 
 
 def do_nothing() -> None:
-    """Return without effect, as the default of optional callback arguments."""
+    """Do nothing, as the default of optional callback arguments."""
 
 
 class Component:
@@ -78,10 +78,10 @@ class Component:
     def compute_pair_weights(self, unregistered: Bool) -> Float64:
         """Weight the match scores (p,) of the pairs of unregistered images by depth checks.
 
-        This method requires a scene without registered images.
+        The scene must not have registered images.
         """
-        # all mapper runs use the same seed to check pairs, so that pair poses do not differ among
-        # runs
+        # all mapper runs use the same random seed to check pairs, so that relative poses do not
+        # differ
         options = self._options.model_copy(update={"seed": 0})
         pose_estimator = AbsolutePoseEstimator(self.scene, self.refiner, options)
         check = PairConsistencyCheck(pose_estimator, options)
@@ -117,12 +117,12 @@ class Component:
     def initialize_globally(self, unregistered: Bool) -> bool:
         """Register all well connected images together (motion averaging).
 
-        Images whose depth contradicts other images are deregistered. The global poses are kept if
-        both keypoints of enough matches then observe the same 3D point (option
+        Images whose depth contradicts other images are deregistered. The globally averaged poses
+        are kept if both keypoints of enough matches observe the same 3D point (option
         ``enough_explained``).
 
         Returns:
-            False if the initialization is rejected; the scene is then empty.
+            False if the global initialization is rejected, which leaves no image registered.
         """
         before = self.scene.snapshot()
         with self._event_log.timed("global initialization"):
@@ -133,7 +133,8 @@ class Component:
         self.refiner.adapts_reprojection_loss = True
         self.maintenance.refine_globally()
         if self.refiner.can_refine_focals():
-            # the first refinement started from poses that a wrong focal length had distorted
+            # poses that a wrong focal length distorted need a second refinement with the refined
+            # focal length
             self.maintenance.refine_globally()
         max_violations = self._options.consistency.max_violations
         self.maintenance.check_all_images(max_violations, "global-initialization")
@@ -236,8 +237,8 @@ class Component:
         Args:
             candidates: (n,) bool mask of the images that may be registered.
             save_checkpoint: Function that is called after each image registration.
-            wide: If an image cannot be registered by its local bundle, also use its best matching
-                images, before the acceptance thresholds relax.
+            wide: If an image cannot be registered by the local bundle of its best match, use its
+                best matching images before the acceptance thresholds relax.
         """
         while self.registration.register_next_image(candidates, wide=wide):
             self.maintenance.refine_if_grown()

@@ -18,11 +18,13 @@ def refine_depth_maps(
 ) -> Reconstruction:
     """Refine the depth maps of a reconstruction again, with fixed poses, points and scales.
 
-    Tentatively registered images observe no points, so they take the scaled depth priors.
+    Tentatively registered images observe no points, so their depth maps are the scaled depth
+    priors.
 
     Args:
-        problem: The mapping problem with the views of the reconstruction's cameras.
-        reconstruction: Poses, points and depth scales, whose depth maps are replaced.
+        problem: Mapping problem whose views have the cameras of the reconstruction.
+        reconstruction: Reconstruction with poses, points and depth scales, whose depth maps are
+            replaced.
         options: Options of the mapper.
     """
     scene = Scene(problem, weigh_by_score=options.weigh_by_score)

@@ -32,7 +32,7 @@ class EventLog:
         self._counts: dict[str, int] = defaultdict(int)
 
     def registered(self, image: int, count: int) -> None:
-        """Tell the event receiver that the ``count``-th image of a component is registered."""
+        """Notify the event receiver that the ``count``-th image of a component is registered."""
         images = self._problem.images
         self._events.image_registered(images[image].name, count, len(images))
 
@@ -68,7 +68,7 @@ class EventLog:
         return MappingReport(reasons, self._pair_reasons, dict(self._seconds), dict(self._counts))
 
     def state_dict(self) -> StateDict:
-        """Return the collected reasons and times for a checkpoint."""
+        """Return the collected rejection reasons and run times for a checkpoint."""
         return {
             "image_reasons": reasons_to_json(self.image_reasons),
             "pair_reasons": reasons_to_json(self._pair_reasons),
@@ -77,7 +77,7 @@ class EventLog:
         }
 
     def load_state_dict(self, state: StateDict) -> None:
-        """Restore the collected reasons and times from a checkpoint."""
+        """Restore the collected rejection reasons and run times from a checkpoint."""
         self.image_reasons = reasons_from_json(state["image_reasons"])
         self._pair_reasons = reasons_from_json(state["pair_reasons"])
         self._seconds.update(state["seconds"])
@@ -85,7 +85,7 @@ class EventLog:
 
 
 def _initial_reasons(problem: MappingProblem) -> dict[str, Reason]:
-    """Return the reasons for images that the mapper cannot try to register."""
+    """Return the rejection reason of each image that applies before any registration attempt."""
     matched = {index for pair in problem.pairs for index in (pair.image_a, pair.image_b)}
     reasons = {}
     for index, image in enumerate(problem.images):

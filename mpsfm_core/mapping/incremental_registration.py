@@ -44,9 +44,9 @@ class IncrementalRegistration:
         """Register the next image, and relax the thresholds until an image is registered.
 
         Args:
-            candidates: (n,) bool mask of the images that may be registered.
-            wide: If an image cannot be registered by its local bundle, also use its best matching
-                images, before the acceptance thresholds relax.
+            candidates: (n,) bool mask of the images that this call may register.
+            wide: If an image cannot be registered by the local bundle of its best match, use its
+                best matching images before the acceptance thresholds relax.
 
         Returns:
             False if no image can be registered at the most relaxed thresholds.
@@ -67,8 +67,8 @@ class IncrementalRegistration:
     def deregister_contradicted_image(self) -> bool:
         """Deregister the image whose depth several rejected images contradict.
 
-        Each image is deregistered at most once. The method returns False if no image is
-        contradicted.
+        Each image is deregistered at most once. Returns False if the depth of no registered image
+        is contradicted.
         """
         contradicted = self._history.pop_contradicted_image(self._scene.registered)
         if contradicted is None or self._maintenance.size <= 2:
@@ -83,7 +83,8 @@ class IncrementalRegistration:
         """Register the first of the ranked images that passes verification.
 
         Args:
-            ranked: Ranked images, each with the registered image that it matches best.
+            ranked: Unregistered images in order of rank, each with its best matching registered
+                image.
             wide: See :meth:`register_next_image`.
         """
         for image, best_match in ranked:
@@ -101,8 +102,8 @@ class IncrementalRegistration:
     def _register_contradicted_image(self, candidates: Bool) -> bool:
         """Register an image if only global refinement makes its depth consistent.
 
-        At a loop closure, drift makes a correct pose contradict the depth of the scene. The method
-        returns False if no image can be registered.
+        At a loop closure, drift makes a correct pose contradict the depth of the scene. Returns
+        False if global refinement makes the depth of no image consistent.
         """
         self._thresholds.reset()
         scores = np.where(self._history.excluded_references, self._scores, 0)
@@ -132,7 +133,7 @@ class IncrementalRegistration:
         return [k for k in references if not self._history.excluded_references[image, k]]
 
     def _would_fail_again(self, image: int, references: list[int]) -> bool:
-        """Return whether a registration attempt would repeat the last failed attempt."""
+        """Return whether an attempt to register an image would repeat its last failed attempt."""
         if not self._history.is_exhausted(image, references):
             return False
         best = self._history.get_last_pose(image)
@@ -141,7 +142,7 @@ class IncrementalRegistration:
     def _estimate_poses(
         self, image: int, references: list[int], correspondences: PoseCorrespondences
     ) -> list[ScoredPose]:
-        """Estimate poses of an image, best first, including the best pose of the last attempt."""
+        """Estimate poses of an image, best first, including the best pose of its last attempt."""
         options, history = self._options.registration, self._history
         poses = []
         last_pose = history.get_last_pose(image)
@@ -164,13 +165,14 @@ class IncrementalRegistration:
         """Register an image with the first of its estimated poses that passes verification.
 
         Args:
-            image: The image to register.
-            references: Registered images whose matches are used.
-            refine_globally: Refine all images before the depth check. Because global refinement is
-                slow, the pose needs a high inlier ratio.
+            image: Index of the image to register.
+            references: Registered images whose matches determine the pose of the image.
+            refine_globally: Refine all registered images before the depth check. Because global
+                refinement is slow, the pose needs a high inlier ratio.
 
         Returns:
-            None if the image is registered, else the rejection reason, with the scene unchanged.
+            None if the image is registered, else the rejection reason of the image, with the scene
+            unchanged.
         """
         scene = self._scene
         with self._event_log.timed("registration"):
@@ -251,7 +253,7 @@ class IncrementalRegistration:
     def _exclude_references(
         self, image: int, pose: ScoredPose, correspondences: PoseCorrespondences
     ) -> None:
-        """Exclude reference images whose matches support a pose with contradicting depth."""
+        """Exclude reference images whose matches support a pose that depth contradicts."""
         options = self._options.registration
         for reference in map(int, np.unique(correspondences.references)):
             rows = correspondences.references == reference

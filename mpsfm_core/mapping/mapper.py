@@ -86,7 +86,7 @@ def reconstruct(
     is_complete = bool(runs) and interrupted is None
     pair_weights = None
     initial_problem = problem
-    for run in runs:  # each completed mapper run may have refined focal lengths
+    for run in runs:  # completed mapper runs, oldest first
         initial_problem = _apply_refined_focals(initial_problem, run, options) or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):
         run_options = options.model_copy(update={"seed": options.seed + number})
@@ -160,7 +160,7 @@ class Mapper:
         self._set_pair_weights(pair_weights)
 
     def state_dict(self) -> StateDict:
-        """Return the state of the run, between two image registrations, for a checkpoint."""
+        """Return the state of the mapper run between two image registrations, for a checkpoint."""
         return {
             "component": self.component.maintenance.state_dict(),
             "event_log": self.event_log.state_dict(),
@@ -173,7 +173,7 @@ class Mapper:
         }
 
     def load_state_dict(self, state: StateDict) -> None:
-        """Restore the state of a run from a checkpoint of the same problem and options."""
+        """Restore the state of a mapper run from a checkpoint of the same problem and options."""
         self._set_pair_weights(state["pair_weights"])
         self._pair_selector.load_state_dict(state["pair_selector"], self._weighted_problem.pairs)
         self.event_log.load_state_dict(state["event_log"])
@@ -278,14 +278,12 @@ class Mapper:
         return self._uses_known_poses
 
     def _absorb_components(self) -> bool:
-        """Register images of completed components, if the current one becomes the largest.
+        """Absorb images of completed components if the current component becomes the largest.
 
         A bad initialization leads to a small component, whose images fit a later component better.
         Completed components that lose an image are dissolved, and their images become unregistered.
-        Images with a known pose are not absorbed.
-
-        Returns:
-            True if the current component took images of completed components and was finalized.
+        Images with a known pose are not absorbed. Returns: True if the current component took
+        images of completed components and was finalized.
         """
         component = self.component
         max_size = max((len(model.images) for model in self.models), default=0)

@@ -97,7 +97,7 @@ class ModelMaintenance:
         self._checked = state["checked"]
 
     def _parts(self) -> dict[str, Stateful]:
-        """Return the parts of the model that have a state, in the order of their restoration."""
+        """Return the model parts that a checkpoint stores, in their order of restoration."""
         return {
             "scene": self.scene,
             "refiner": self.refiner,
@@ -145,7 +145,7 @@ class ModelMaintenance:
 
         Args:
             max_violations: Largest accepted share of pixels with contradicting depth.
-            step: Name of the mapper step in the recorded reason.
+            step: Name of the mapper step that the recorded rejection reason contains.
         """
         images = self.scene.registered & ~self._checked
         self._checked |= images
@@ -211,8 +211,8 @@ class ModelMaintenance:
     def _undo_jump(self, before: Snapshot) -> None:
         """Undo a refinement that rotated a camera far and increased the depth contradictions.
 
-        A robust loss has several minima, so refinement may move an image with few matches to a
-        wrong minimum.
+        The robust reprojection loss has several minima, so refinement may move an image with few
+        matches to a wrong pose.
         """
         images = self.scene.registered_images()
         turns = self.scene.rotations[images] @ before.rotations[images].transpose(0, 2, 1)

@@ -2,7 +2,7 @@
 
 The selected run has the component that explains the largest share of the match scores. A component
 explains a match if both keypoints of the match observe the same 3D point. Among runs that explain
-equal shares of the match scores, the agreement of depth maps decides.
+equal shares of the match scores, the run with the best agreement of its depth maps is selected.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class MapperRun(NamedTuple):
         return len(self.models[0].images) if self.models else 0
 
     def state_dict(self) -> StateDict:
-        """Return the run for a checkpoint."""
+        """Return the state of the mapper run for a checkpoint."""
         return {
             "models": [model.state_dict() for model in self.models],
             "explained_ratios": self.explained_ratios,
@@ -56,7 +56,7 @@ class MapperRun(NamedTuple):
 
     @classmethod
     def from_state_dict(cls, state: StateDict) -> MapperRun:
-        """Restore a run from a checkpoint."""
+        """Restore a mapper run from a checkpoint."""
         models = [Reconstruction.from_state_dict(model) for model in state["models"]]
         report = MappingReport.from_state_dict(state["report"])
         return cls(models, state["explained_ratios"], report)
@@ -73,7 +73,8 @@ def select_run(runs: Sequence[MapperRun], options: ConsistencyOptions) -> Mapper
     """Select the run whose largest component explains the most matches.
 
     Among runs that explain equal shares of the match scores, the result that occurs in most runs is
-    selected. Among several most frequent results, the agreement of depth maps decides.
+    selected. Among equally frequent results, the result with the best agreement of its depth maps
+    is selected.
     """
     max_ratio = max(run.largest_explained_ratio for run in runs)
     candidates = [

@@ -24,8 +24,8 @@ class InitializationOptions(Options):
     poses fail verification. False always initializes from an image pair. [tuned:
     benchmarks.ablation]"""
     max_pairs: int = expert(50, ge=1)
-    """Maximum number of initial image pairs to try; raising it takes longer and may initialize more
-    components. [ours]"""
+    """Maximum number of initial image pairs to try; raising the number takes longer and may
+    initialize more components. [ours]"""
     num_compared: int = expert(5, ge=1)
     """Number of image pairs with most matches whose relative poses are compared; the pair with the
     best supported pose is tried first. [tuned: benchmarks.accuracy]"""
@@ -207,8 +207,8 @@ class MappingOptions(Options):
     """Share of the summed match scores whose keypoints must observe common 3D points, so that no
     further mapper run is needed. [tuned: benchmarks.accuracy]"""
     register_tentatively: bool = False
-    """Also register the remaining images in the best supported poses. These images observe no
-    points, and the summary lists them as unconfirmed."""
+    """Register images that cannot be verified in the best supported poses. Such images observe no
+    points, and ``summary.json`` lists them as unconfirmed."""
     initialization: InitializationOptions = InitializationOptions()
     """Options of the initialization."""
     registration: RegistrationOptions = RegistrationOptions()

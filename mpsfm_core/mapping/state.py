@@ -18,10 +18,11 @@ from mpsfm_core.data.decisions import ImageReason, Reason, reason_from_json
 from mpsfm_core.data.errors import DataError
 
 StateDict: TypeAlias = dict[str, Any]
-"""Arrays, numbers, texts and None by name, or lists and dictionaries of them."""
+"""State of an object, as arrays, numbers, strings and None by name, or nested lists and
+dictionaries."""
 CheckpointArrays: TypeAlias = Mapping[str, NDArray[Any]]
-"""Arrays of a state by path, such as ``mapper/component/scene/rotations``, and the array ``state``
-with all other values as JSON."""
+"""Flattened state with its arrays by path, such as ``mapper/component/scene/rotations``, and an
+array ``state`` with all other values as JSON."""
 
 _TREE = "state"
 _PLAIN = (bool, int, float, str, type(None))
@@ -41,7 +42,8 @@ def flatten_state(state: StateDict) -> CheckpointArrays:
     """Convert a state to arrays that an NPZ file can store.
 
     Raises:
-        TypeError: The state contains an unsupported value; the message has the path of the value.
+        TypeError: The state contains a value that JSON and NPZ do not support; the message has the
+            path of the value.
     """
     arrays: dict[str, NDArray[Any]] = {}
     tree = _separate(state, "", arrays)
@@ -53,7 +55,7 @@ def unflatten_state(arrays: CheckpointArrays) -> StateDict:
     """Restore a state from the arrays of :func:`flatten_state`.
 
     Raises:
-        DataError: An array is missing or has no valid content.
+        DataError: An array of the flattened state is missing or damaged.
     """
     try:
         stored = json.loads(arrays[_TREE].tobytes())
@@ -68,7 +70,7 @@ def unflatten_state(arrays: CheckpointArrays) -> StateDict:
 
 
 def _separate(value: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
-    """Move the arrays of a state to ``arrays``, with None in their place."""
+    """Move the arrays of a nested state to ``arrays``, and replace each array by None."""
     if isinstance(value, np.ndarray):
         arrays[path] = value
         return None
@@ -82,9 +84,10 @@ def _separate(value: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
 
 
 def _join(value: Any, path: str, arrays: CheckpointArrays) -> Any:
-    """Put the arrays of a state back in their places."""
+    """Put the arrays of a nested state back in place of None."""
     if path in arrays:
-        return arrays[path].copy(order="K")  # the memory layout changes the last bit of sums
+        # Preserve C or Fortran order, because the order of elements affects the rounding of sums.
+        return arrays[path].copy(order="K")
     if isinstance(value, dict):
         return {name: _join(item, _child(path, name), arrays) for name, item in value.items()}
     if isinstance(value, list):
@@ -97,7 +100,7 @@ def _child(path: str, name: object) -> str:
 
 
 def reasons_to_json(reasons: Mapping[str, Reason]) -> StateDict:
-    """Convert rejection reasons to JSON, by the name of an image or image pair."""
+    """Convert rejection reasons to JSON values, by the name of the rejected image or image pair."""
     return {name: reason.to_json() for name, reason in reasons.items()}
 
 

@@ -44,21 +44,21 @@ MIN_DAMPING = 1e-10
 MAX_DAMPING = 1e16
 """Levenberg-Marquardt damping above which bundle adjustment stops. [ours]"""
 MAX_FOCAL_STEP = 1.0
-"""Largest change of a log focal length per step. [ours]"""
+"""Largest change of a log focal length per Levenberg-Marquardt step. [ours]"""
 MAX_RADIAL_STEP = 0.1
-"""Largest change of a radial distortion per step. [ours]"""
+"""Largest change of a radial distortion coefficient per Levenberg-Marquardt step. [ours]"""
 CG_TOLERANCE = 1e-3
 """Relative tolerance of conjugate gradients on the reduced camera system. [ours]"""
 MAX_CG_ITERATIONS = 500
-"""Maximum number of conjugate-gradient iterations per step. [ours]"""
+"""Maximum number of conjugate-gradient iterations per Levenberg-Marquardt step. [ours]"""
 MIN_GAIN = 1e-3
-"""Smallest ratio of actual and predicted decrease of an accepted step.
+"""Smallest ratio of the actual and the predicted decrease of the cost for a step to be accepted.
 [Ceres min_relative_decrease]"""
 
 
 @dataclass(frozen=True, eq=False)
 class BundleResult:
-    """Adjusted poses, points, intrinsics and depth scales, with a solver summary."""
+    """Adjusted poses, points, intrinsics and depth scales, with a summary of the solver."""
 
     rotations: Float64
     translations: Float64
@@ -71,8 +71,8 @@ class BundleResult:
     reduced camera system at the solution. The standard deviation is NaN for a constant focal length
     and infinite for an undetermined focal length."""
     std_radial: Float64
-    """(k,) posterior standard deviation of each variable radial distortion, NaN if constant and
-    infinite if undetermined."""
+    """(k,) posterior standard deviation of each camera's radial distortion, NaN for a constant and
+    infinite for an undetermined distortion."""
     initial_cost: float
     final_cost: float
     iterations: int
@@ -88,12 +88,13 @@ def adjust_bundle(problem: BundleProblem, options: BundleOptions | None = None) 
     """Adjust poses, points, intrinsics and depth scales; the cost never increases.
 
     As in COLMAP, an observation whose point is behind the camera, or more than 89.9999 degrees off
-    its axis, has residual 0. The same holds where radial distortion folds the image over. If a step
-    makes an observation invisible in this way, the observation keeps its previous cost. The
-    adjusted parameters do not depend on the number of threads, bit for bit.
+    the optical axis, has residual 0. An observation where radial distortion folds the image over
+    also has residual 0. If a solver step makes the residual of an observation 0 in this way, the
+    observation keeps its previous cost. The adjusted parameters do not depend on the number of
+    threads, bit for bit.
 
     Args:
-        problem: Parameters and observations of bundle adjustment, which are copied.
+        problem: Initial parameters and observations of bundle adjustment, which stay unchanged.
         options: Robust losses and solver options of bundle adjustment.
 
     Returns:
@@ -120,7 +121,7 @@ def _blas() -> ThreadpoolController:
 
 
 def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> BundleResult:
-    """Minimize by Levenberg-Marquardt with Nielsen's damping schedule, as Ceres."""
+    """Minimize the cost by Levenberg-Marquardt with Nielsen's damping schedule, as Ceres does."""
     state, trial = p.state, kernels.BundleParameters(*(np.empty_like(array) for array in p.state))
     normal = SchurComplementSolver(p, options, run)
     damping, growth = INITIAL_DAMPING, 2.0
@@ -203,7 +204,7 @@ class SchurComplementSolver:
 
     @staticmethod
     def _intrinsic_slots(layout: kernels.ParameterLayout) -> NDArray[np.int32]:
-        """Return the slots (2k,) of the focal length and of the radial distortion of cameras."""
+        """Return the indices (2k,) of focal lengths and radial distortions in the camera system."""
         return np.concatenate([layout.focal_slot, layout.radial_slot])
 
     def _prior_cost(self, state: kernels.BundleParameters) -> float:
@@ -233,14 +234,15 @@ class SchurComplementSolver:
     def compute_intrinsic_stds(self, state: kernels.BundleParameters) -> tuple[Float64, Float64]:
         """Compute the posterior standard deviation of log focal lengths and radial distortions.
 
-        The variance of a parameter is a diagonal entry of the inverse reduced camera system.
+        The posterior variance of an intrinsic parameter is a diagonal entry of the inverse reduced
+        camera system.
 
         Args:
             state: Poses, points, intrinsics and depth scales at which the residuals are linearized.
 
         Returns:
-            (k,) standard deviations of log focal lengths, and (k,) of radial distortions, NaN if
-            constant and infinite if undetermined.
+            (k,) posterior standard deviations of log focal lengths and (k,) of radial distortions,
+            NaN for constant and infinite for undetermined parameters.
         """
         slots = self._intrinsic_slots(self.p.bundle.layout)
         stds, num_cameras = np.full(len(slots), np.nan), len(slots) // 2
@@ -320,7 +322,7 @@ class SchurComplementSolver:
         return visible, cost - visible - lost, predicted
 
     def _limit_intrinsic_steps(self, delta: Float64) -> None:
-        """Clip the steps of focal lengths and radial distortions in ``delta`` (d,)."""
+        """Limit the changes of focal lengths and radial distortions in a step ``delta`` (d,)."""
         layout, first = self.p.bundle.layout, self.total.border.shape[1]
         limits = ((layout.focal_slot, MAX_FOCAL_STEP), (layout.radial_slot, MAX_RADIAL_STEP))
         for slots, limit in limits:

@@ -40,7 +40,7 @@ otherwise move distant points behind the camera. [ours]"""
 STEP_REDUCTION = 0.25
 """Factor that shortens the step of a point whose depth decreases too much. [ours]"""
 MIN_STEP_LENGTH = 0.01
-"""Ratio of shortened to full step length below which a point is not moved. [ours]"""
+"""Ratio of shortened to full step length of a point below which the point is not moved. [ours]"""
 MAX_POINT_STEPS = 10
 """Maximum number of steps of each point with fixed cameras after a joint step of points and
 cameras. Points with outliers converge slowly under robust losses, and the additional steps halve
@@ -49,10 +49,10 @@ POINT_STEP_DAMPING = 1e-6
 """Levenberg-Marquardt damping of the steps of single points with fixed cameras. [ours]"""
 MIN_RADIAL_SLOPE = 0.1
 """Smallest derivative ``1 + 3 k r^2`` of the distorted radius at a point that projects into an
-image. The distortion folds the image over where the derivative is 0. [ours]"""
+image. Radial distortion folds the image over where the derivative is 0. [ours]"""
 NUM_IMAGE_PARAMS, NUM_INTRINSIC_PARAMS = np.int64(7), np.int64(1)
-"""Number of parameters of an image (pose and log scale of its depth map) and of an intrinsic
-slot."""
+"""Number of parameters of an image (pose and log scale of its depth map), and of one intrinsic
+parameter."""
 LOG_SCALE_IDX = 6
 """Index of the depth map's log scale among the 7 parameters of an image."""
 _ONLY = np.int64(0)
@@ -76,7 +76,8 @@ class BundleObservations(NamedTuple):
 class ParameterLayout(NamedTuple):
     """Indices of the variable parameters in the linear system; -1 for constants.
 
-    An image has a pose slot if its pose or the log scale of its depth map is variable.
+    An image has a pose slot (index in the linear system) if its pose or log depth scale is
+    variable.
     """
 
     camera_of_image: Int32
@@ -283,8 +284,9 @@ def _add_depth_residual(
     """Add the log-depth residual of an observation at depth ``z`` to its derivatives.
 
     Returns:
-        Twice the cost, the fields ``gz`` and ``hzz`` with the log-depth residual, and the fields
-        ``gs``, ``hss`` and ``hzs``, which are 0 if the scale is constant or depth is invalid.
+        Twice the cost of the observation, the fields ``gz`` and ``hzz`` with the log-depth residual
+        added, and the fields ``gs``, ``hss`` and ``hzs``, which are 0 if the depth scale is
+        constant or the depth is invalid.
     """
     obs, robust = bundle.obs, bundle.robust
     gs = hss = hzs = 0.0
@@ -335,7 +337,7 @@ def _linearize_distorted_observation(
     rho, weight = evaluate_loss(
         robust.reprojection_loss, ru * ru + rv * rv, robust.reprojection_scale
     )
-    # The rows of d(ru, rv) / d(x, y). The derivative by z is the product of these rows and -(u, v).
+    # Rows of the Jacobian d(ru, rv) / d(x, y), whose product with -(u, v) is the derivative by z.
     ux = fx * inverse * (factor + 2.0 * radial * u * u)
     uy = fx * inverse * 2.0 * radial * u * v
     vx = fy * inverse * 2.0 * radial * u * v
@@ -483,7 +485,8 @@ def _add_intrinsic(
 ) -> None:
     """Add the gradient and blocks of an intrinsic parameter to the camera system.
 
-    A step of the parameter displaces the camera-frame point by ``by (x, y, 0)``.
+    A change of the intrinsic parameter by 1 has the effect of moving the camera-frame point by ``by
+    (x, y, 0)``.
     """
     x, y = by * s.x, by * s.y
     own = x * x * s.hxx + y * y * s.hyy
@@ -512,7 +515,7 @@ def _add_focal_and_radial(
 
 @_helper
 def _fill_intrinsic_column(s: LinearizedObservation, by: float, columns: Float64) -> None:
-    """Multiply an observation's Gauss-Newton matrix by the Jacobian of an intrinsic parameter."""
+    """Multiply an observation's Gauss-Newton matrix by the Jacobian of the intrinsic parameter."""
     x, y = by * s.x, by * s.y
     columns[0, 0] = x * s.hxx + y * s.hxy
     columns[1, 0] = y * s.hyy + x * s.hxy
@@ -558,8 +561,8 @@ def _invert_factor(block: Float64, p: int, damping: float) -> bool:
 
     The damping of a point is relative to ``m``, the mean of the diagonal of V. The inverse factor
     replaces V in ``block[p, :6]``, and ``m`` is written to ``block[p, 9]``. A point in a single
-    view has no constraint along its ray. Isotropic damping prevents motion along the ray, unlike
-    damping by the diagonal of V.
+    view has no constraint along its ray. Isotropic damping prevents motion of the point along its
+    ray, unlike damping by the diagonal of V.
 
     Returns:
         False if the damped block is not positive definite, in which case V is unchanged.
@@ -652,7 +655,7 @@ def _eliminate_from_intrinsics(
     system: ReducedCameraSystem,
     scratch: EliminationBuffers,
 ) -> None:
-    """Subtract a point's Schur complement from the blocks of its intrinsics."""
+    """Subtract a point's Schur complement from the blocks of the observing intrinsics."""
     intrinsics, yf, slots, y = scratch.intrinsics, scratch.yf, scratch.slots, scratch.y
     for f in range(num_intrinsics):
         y0, y1, y2 = yf[f, 0, 0], yf[f, 1, 0], yf[f, 2, 0]
@@ -691,15 +694,15 @@ def eliminate_points(
     """Linearize the observations of the points ``first:last`` and eliminate these points.
 
     Args:
-        first: Index of the first point.
-        last: Index after the last point.
+        first: Index of the first point of the range.
+        last: Index after the last point of the range.
         damping: Levenberg-Marquardt damping of the points; the camera blocks remain undamped.
         bundle: Observations, parameter layout and robust losses.
         state: Poses, points, intrinsics and depth scales.
         system: Reduced camera system to which the points of the range are added.
         eliminated: (p, 10) output with a row per point: 6 entries of ``L^-1`` with the damped block
-            ``V = L L^T``, the gradient, and the mean of the diagonal of V. Rows of constant or
-            unobserved points are 0.
+            ``V = L L^T``, the gradient, and the mean of the diagonal of V. Output rows of constant
+            or unobserved points are 0.
         scratch: Buffers of this range of points.
 
     Returns:
@@ -736,7 +739,7 @@ def eliminate_points(
             _add_point(s, state.rotations, image, eliminated, p)
             if slot >= 0:
                 # A track may contain an image twice. Observations are sorted by image, so equal
-                # slots are adjacent.
+                # pose slots are adjacent.
                 fresh = count == 0 or slots[count - 1] != slot
                 if fresh:
                     slots[count] = slot

@@ -26,15 +26,16 @@ MAX_BUFFER_BYTES = 1 << 30
 
 Result = TypeVar("Result")
 PointRange = tuple[int, int, int]
-"""Number of a range of points, index of its first point, and index after its last point."""
+"""Range of 3D points, as the number of the range, the index of its first point, and the index after
+its last point."""
 
 
 @dataclass(frozen=True, eq=False)
 class BundleProblem:
     """Parameters and observations of a bundle adjustment with n images, k cameras and p points.
 
-    Callers fix the gauge by a constant pose. If no depth determines the scale, callers also set
-    ``scale_anchor``.
+    Callers fix the gauge by a constant pose. If no depth determines the scale of the scene, callers
+    also set ``scale_anchor``.
     """
 
     rotations: Float64
@@ -54,13 +55,13 @@ class BundleProblem:
     obs_xy: Float64
     """(m, 2) keypoint of each observation, in COLMAP's pixel coordinates."""
     obs_std_px: Float64 | float = 1.0
-    """(m,) standard deviation in pixels of the keypoint of each observation, or one number for
-    all."""
+    """(m,) standard deviation in pixels of the keypoint of each observation, or one number for all
+    keypoints."""
     obs_log_depth: Float64 | None = None
     """(m,) log of the depth map at each observation, NaN if invalid (None without depth)."""
     obs_std_log_depth: Float64 | float = 1.0
-    """(m,) standard deviation ``sqrt(variance) / depth`` of each log depth, or one number for
-    all."""
+    """(m,) standard deviation ``sqrt(variance) / depth`` of each log depth, or one number for all
+    observations."""
     variable_pose: Bool | None = None
     """(n,) bool, True for images with variable pose (None makes all poses variable)."""
     variable_point: Bool | None = None
@@ -71,30 +72,31 @@ class BundleProblem:
     prior_log_focals: Float64 | None = None
     """(k,) mean of the prior on ``log fx`` of each camera (None uses ``intrinsics``)."""
     prior_std_log_focals: Float64 | float = np.inf
-    """(k,) standard deviation of the prior on ``log fx``, or one number for all (infinite without
-    prior)."""
+    """(k,) standard deviation of the prior on ``log fx``, or one number for all cameras (infinite
+    without prior)."""
     radial: Float64 | None = None
     """(k,) radial distortion coefficient of each camera, as in COLMAP's SIMPLE_RADIAL (None uses
     0)."""
     variable_radial: Bool | None = None
-    """(k,) bool, True for cameras with variable radial distortion (None keeps all constant)."""
+    """(k,) bool, True for cameras with variable radial distortion (None keeps all distortions
+    constant)."""
     prior_std_radial: Float64 | float = np.inf
-    """(k,) standard deviation of the zero-mean prior on ``radial``, or one number for all (infinite
-    without prior)."""
+    """(k,) standard deviation of the zero-mean prior on ``radial``, or one number for all cameras
+    (infinite without prior)."""
     log_scales: Float64 | None = None
     """(n,) log of the scale factor on the depth map of each image (None uses 0)."""
     expected_log_scales: Float64 | None = None
     """(n,) mean of the prior on the log scale of each depth map (None uses 0)."""
     std_log_scales: Float64 | float = np.inf
-    """(n,) standard deviation of the prior on the log scales, or one number for all (infinite
-    without prior)."""
+    """(n,) standard deviation of the prior on the log scales, or one number for all images
+    (infinite without prior)."""
     variable_scale: Bool | None = None
     """(n,) bool, True for images whose depth map has a variable log scale (None keeps all
     constant)."""
     scale_anchor: int | None = None
     """Image with a variable pose, one translation coordinate of which is kept constant to fix the
-    scale. The constant coordinate is the most sensitive to a change of scale about the first
-    constant pose."""
+    scale. The constant translation coordinate is the one most sensitive to a change of scale about
+    the first constant pose."""
 
 
 class ScalePrior(NamedTuple):
@@ -107,10 +109,10 @@ class ScalePrior(NamedTuple):
     log_scale: Float64
     """(s,) mean."""
     weight: Float64
-    """(s,) inverse variance of the prior on each parameter."""
+    """(s,) inverse variance of the prior on each log scale."""
 
     def cost(self, state: kernels.BundleParameters) -> float:
-        """Return the cost of the prior, half the weighted sum of squared residuals."""
+        """Return the cost of the log scale prior, half the weighted sum of squared residuals."""
         residuals = state.log_scales[self.image] - self.log_scale
         return 0.5 * float(residuals @ (self.weight * residuals))
 
@@ -125,7 +127,7 @@ class FocalPrior(NamedTuple):
     log_focal: Float64
     """(s,) mean."""
     weight: Float64
-    """(s,) inverse variance of the prior on each parameter."""
+    """(s,) inverse variance of the prior on each log focal length."""
 
     def residuals(self, state: kernels.BundleParameters) -> Float64:
         """Return the residuals (s,), log focal lengths minus their prior means."""
@@ -133,7 +135,7 @@ class FocalPrior(NamedTuple):
         return residuals
 
     def cost(self, state: kernels.BundleParameters) -> float:
-        """Return the cost of the prior, half the weighted sum of squared residuals."""
+        """Return the cost of the focal length prior, half the weighted sum of squared residuals."""
         residuals = self.residuals(state)
         return 0.5 * float(residuals @ (self.weight * residuals))
 
@@ -146,7 +148,7 @@ class RadialPrior(NamedTuple):
     slot: Int64
     """(s,) intrinsic slot of each radial distortion."""
     weight: Float64
-    """(s,) inverse variance of the prior on each parameter."""
+    """(s,) inverse variance of the prior on each radial distortion."""
 
     def residuals(self, state: kernels.BundleParameters) -> Float64:
         """Return the residuals (s,), which equal the radial distortions."""
@@ -154,7 +156,7 @@ class RadialPrior(NamedTuple):
         return residuals
 
     def cost(self, state: kernels.BundleParameters) -> float:
-        """Return the cost of the prior, half the weighted sum of squared residuals."""
+        """Return the cost of the distortion prior, half the weighted sum of squared residuals."""
         residuals = self.residuals(state)
         return 0.5 * float(residuals @ (self.weight * residuals))
 
@@ -180,7 +182,7 @@ class RangeExecutor(Protocol):
     """Callable that applies a function to all ranges of 3D points, possibly in threads."""
 
     def __call__(self, function: Callable[[int, int, int], Result]) -> list[Result]:
-        """Return the function's results in the order of the ranges of 3D points."""
+        """Apply a function to all ranges of 3D points, and return the results in their order."""
 
 
 def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBundle:

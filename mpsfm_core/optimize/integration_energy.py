@@ -40,7 +40,7 @@ _MISSING = 1e30
 """Squared normal residual of a pixel towards a missing neighbor."""
 _SQRT_3 = 1.7320508075688772
 _MIN_NORMAL_VARIANCE = 1e-4
-"""Minimum variance of a normal, (0.6 deg)^2. Smaller variances of normals make the linear system
+"""Minimum variance of a normal, (0.6 deg)^2, because smaller variances make the linear system
 ill-conditioned."""
 MIN_LOG_VARIANCE = 1e-6
 """Minimum variance of log depth, (0.1 %)^2."""
@@ -139,7 +139,7 @@ def compute_mean_point_energy(z: Float64, points: PointTerms, scale: float) -> f
 
 
 def majorize(z: Float64, terms: EnergyTerms) -> QuadraticMajorizer:
-    """Compute the energy of a map of log depth (h, w), and its majorizer at that map."""
+    """Compute the energy of a log depth map (h, w), and the quadratic majorizer at this map."""
     framed = np.zeros((z.shape[0] + 2, z.shape[1] + 2))
     framed[1:-1, 1:-1] = z
     gradient = np.zeros_like(framed)
@@ -195,9 +195,9 @@ def _add_normals(
     coupling: Float32,
     gradient: Float64,
 ) -> float:
-    """Compute the normal energy along one axis, and add its couplings and half gradient.
+    """Compute the energy of normal residuals along an axis; add couplings and half gradient.
 
-    All arrays are contiguous and have a border of one pixel.
+    All input and output arrays are contiguous and have a border of one pixel.
     """
     height, width = z.shape
     stride = 1 if axis == 0 else width
@@ -251,9 +251,10 @@ def _link_row(
     force_ahead: Float64,
     force_behind: Float64,
 ) -> float:
-    """Compute the normal energy of a row of pixels, with couplings and half gradients.
+    """Compute the energy of normal residuals of a pixel row, with couplings and half gradients.
 
-    If a pixel has only one neighbor, the soft minimum uses this neighbor and the limit.
+    If a pixel has only one neighbor, the soft minimum takes the residual of that neighbor and the
+    residual limit.
     """
     k, limit = losses.sharpness, losses.normal_limit
     two_sides, one_side = np.log(2.0 + np.exp(-k * limit)), np.log(1.0 + np.exp(-k * limit))
@@ -320,7 +321,7 @@ def _log(x: float) -> float:
 def _add_prior(
     z: Float64, prior: PriorTerms, scale: float, mass: Float32, gradient: Float64
 ) -> float:
-    """Compute the Charbonnier energy of the depth prior, with mass and half gradient."""
+    """Compute the Charbonnier energy of the depth prior, its curvature and half gradient."""
     energy, square = 0.0, scale * scale
     for i in range(z.shape[0]):
         for j in range(z.shape[1]):
@@ -338,7 +339,7 @@ def _add_prior(
 def _add_points(
     z: Float64, points: PointTerms, scale: float, mass: Float32, gradient: Float64
 ) -> float:
-    """Compute the Cauchy energy of the sparse points, with mass and half gradient."""
+    """Compute the Cauchy energy of the sparse points, and add curvature and half gradient."""
     energy = 0.0
     for k in range(points.rows.size):
         i, j = points.rows[k], points.columns[k]

@@ -67,7 +67,7 @@ def _compiled(function: F, **options: Any) -> F:
 
 
 def _add_dependencies(compiled: Any) -> None:
-    """Make a cached kernel depend on the constants and functions of other modules that it uses.
+    """Recompile a cached kernel if constants or functions that it uses in other modules change.
 
     By default, numba compiles a kernel again only if the file of the kernel itself changes.
     """
@@ -76,9 +76,9 @@ def _add_dependencies(compiled: Any) -> None:
 
 
 def describe_globals(function: Callable[..., Any]) -> list[str]:
-    """Describe values of constants and code of functions that a function uses from its module.
+    """Return the values of constants and the code of functions that a function uses.
 
-    Functions are followed recursively into other modules of the package.
+    Functions from other modules of the package are followed recursively.
     """
     described: dict[str, str] = {}
     pending = [function]

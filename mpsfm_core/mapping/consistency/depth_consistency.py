@@ -3,18 +3,18 @@
 Each pixel of an image's refined depth map is projected into another image. If the pixel is clearly
 in front of the surface in that image, both depth maps contradict each other, because that image
 sees empty space where the pixel has a surface. A pixel behind the surface of the other image is
-occluded. A contradiction of depth maps has one of two causes.
+occluded. A contradiction of depth maps has one of two causes, wrong depth or a wrong pose.
 
-* In the first case, the depth of an image is wrong. The errors of log depth in both images have
-  normal distributions with standard deviations ``s`` and ``s'``. The likelihood of the
-  contradiction is ``L = E_e[exp(-(e' / s')^2 / 2)]`` over the errors ``e`` along the pixel's ray,
-  where ``e'`` is the log-depth difference between the other surface and the shifted pixel, or 0 if
-  the shifted pixel is occluded or outside the other image. At wide angles, an error of depth also
-  shifts the pixel laterally in the other image. The likelihood is the expectation over ``e``
-  instead of the maximum, because some error nearly always shifts the pixel past a depth edge.
+* The depth of an image may be wrong. The errors of log depth in both images have normal
+  distributions with standard deviations ``s`` and ``s'``. The likelihood of the contradiction is
+  ``L = E_e[exp(-(e' / s')^2 / 2)]`` over the errors ``e`` of the pixel's log depth, where ``e'`` is
+  the log-depth difference between the other surface and the shifted pixel, or 0 if the shifted
+  pixel is occluded or outside the other image. At wide angles, an error of depth also shifts the
+  pixel laterally in the other image. The likelihood is the expectation over ``e`` instead of the
+  maximum, because some error nearly always shifts the pixel past a depth edge.
 
-* In the second case, the pose of an image is wrong. A wrong pose makes the depth that the other
-  image has along the pixel's ray independent of the pixel's depth.
+* The pose of an image may be wrong. A wrong pose makes the depth that the other image has along the
+  pixel's ray independent of the pixel's depth.
 
 A pixel is a violation if its likelihood ``L`` is below that of a depth error of ``max_deviation``
 standard deviations. The violation ratio (beta in the paper) is the share of violating pixels,
@@ -61,8 +61,8 @@ NUM_ERROR_STEPS = 4
 PIXEL_STRIDE = 2
 """Distance in pixels between the compared pixels of the subsampled depth maps. [ours]"""
 MIN_SIGNIFICANCE = 3.0
-"""Number of standard deviations from the limit, beyond which the violation ratio of a quarter of
-the pixels decides and all other pixels are skipped. [ours]"""
+"""Number of standard deviations between the violation ratio of a quarter of the pixels and its
+limit, beyond which all other pixels are skipped. [ours]"""
 OVERLAP_GRID = 16
 """Columns and rows of the pixel grid that measures the overlap of two images. [ours]"""
 MIN_OVERLAP_RATIO = 0.05
@@ -85,8 +85,8 @@ class DepthConsistencyCheck:
     Args:
         scene: The scene.
         options: Thresholds of the depth consistency check.
-        fill_holes: Fill holes of one or two pixels in sensor depth maps. If such holes are not
-            filled, an image with a slightly wrong pose sees other surfaces through them.
+        fill_holes: Fill holes of one or two pixels in sensor depth maps. An image with a slightly
+            wrong pose would see other surfaces through unfilled holes.
     """
 
     def __init__(
@@ -161,9 +161,9 @@ class DepthConsistencyCheck:
             a: A registered image.
             b: Another registered image.
             std_factor: See :meth:`check_image`.
-            limit: Limit to which the violation ratio is compared. A quarter of the pixels is
-                measured if it shows significantly that the ratio is below or above the limit. A
-                limit of NaN measures all pixels.
+            limit: Limit to which the violation ratio is compared. Only a quarter of the pixels is
+                measured if their violation ratio is significantly above or below the limit. A limit
+                of NaN measures all pixels.
             by_target_area: Weight a violating pixel by its area in the other image, at most 1. The
                 weights reduce the influence of near surfaces, which project to few pixels of the
                 other image, and so demand clearer evidence against registered images.
@@ -181,10 +181,10 @@ class DepthConsistencyCheck:
         )
 
     def state_dict(self) -> StateDict:
-        """Return the cached depth maps for a checkpoint, except those of replaced refined depth.
+        """Return cached depth maps for a checkpoint, without the maps of outdated refined depth.
 
-        The local depth noise in a cached depth map depends on the points at the time of its
-        computation.
+        The local depth noise of a cached depth map depends on the points from which the map was
+        computed.
         """
         maps = self._scene.maps
         return {
@@ -308,7 +308,7 @@ class _DepthGrid(NamedTuple):
 
 
 class _DepthMapState(NamedTuple):
-    """Inputs of a subsampled depth map, which the cache compares to detect a change.
+    """Inputs of a subsampled depth map, by which the cache detects that the map is outdated.
 
     The points that measure the local standard deviation are not compared, because the depth map is
     refined whenever these points change.
@@ -349,8 +349,8 @@ def compute_violation_ratio(
         rotation: (3, 3) ``b_from_a``.
         translation: (3,) ``b_from_a``.
         criteria: Criteria for a pixel to be a violation.
-        limit: Limit of the violation ratio. A quarter of the pixels is measured if it shows
-            significantly on which side of the limit the ratio is.
+        limit: Limit of the violation ratio. Only a quarter of the pixels is measured if their
+            violation ratio is significantly above or below the limit.
     """
     inverse_rotation, counts = rotation.T.copy(), np.zeros((2, 2))
     inverse_translation = -inverse_rotation @ translation

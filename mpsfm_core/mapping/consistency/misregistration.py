@@ -4,13 +4,12 @@ A match is explained if both of its keypoints observe the same 3D point. If hard
 pair of registered images is explained, the matches are wrong or one image is misregistered.
 Misregistered images are detected in three ways.
 
-1. An image pair has more unexplained matches than the maximum flow of explained matches between its
-   images. The images on the smaller side of the minimum cut may be misregistered.
-2. Two images match a third image which cannot be registered, so at most one of the two has a
-   correct pose. The matches of both images with the third image count as unexplained matches
-   between both images.
-3. The unexplained matches of one image clearly outnumber its explained matches, summed over all
-   pairs.
+1. First, an image pair may have more unexplained matches than the maximum flow of explained matches
+between its images. The images on the smaller side of the minimum cut may be misregistered. 2.
+Second, two images may match a third image which cannot be registered, so at most one of the two has
+a correct pose. The matches of both images with the third image count as unexplained matches between
+both images. 3. Third, the unexplained matches of one image may clearly outnumber its explained
+matches, summed over all pairs.
 """
 
 from __future__ import annotations
@@ -46,10 +45,12 @@ class Misregistration(NamedTuple):
     supporting_pairs: Int64
     """(k, 2) pairs of a misregistered and another image whose matches support the present poses."""
     margin: int
-    """Number of matches that contradict the poses, minus number of matches that support them."""
+    """Number of matches that contradict the poses of the misregistered images, minus number of
+    matches that support the poses."""
     splits: bool = False
-    """True if one pair connects the images to the model and several pairs contradict this
-    connection. Such images are deregistered if no other poses are found for them."""
+    """True if one image pair connects the misregistered images to the model and several pairs
+    contradict this pair. The misregistered images are then deregistered unless other poses are
+    found."""
 
 
 class ContradictedCut(NamedTuple):
@@ -66,7 +67,7 @@ class ContradictedCut(NamedTuple):
 
     @property
     def has_one_link(self) -> bool:
-        """True if one pair supports the poses and several pairs contradict them."""
+        """True if one image pair supports the poses of its images and several contradict them."""
         return self.num_supporting_pairs == 1 and self.num_contradicting_pairs > 1
 
 
@@ -117,7 +118,8 @@ def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistrat
             inside = scene.registered & ~inside
         add(inside, margin)
     if not detected:
-        # a wrong relative pose also explains its own pair, however many matches the pair has
+        # a wrong relative pose also explains the matches of its own image pair, however many there
+        # are
         for cut in find_contradicted_cuts(scene.registered, contradicting, explained, 0.0):
             if cut.has_one_link and np.count_nonzero(cut.inside) > 1:
                 add(cut.inside, cut.margin, splits=True)

@@ -1,16 +1,16 @@
 """Depth consistency of verified pairs before registration (paper section 3.4).
 
-Look-alike places give hundreds of matches that one relative pose explains. The surroundings of
-look-alike places differ, so a wrong relative pose puts surfaces where the other image sees empty
-space.
+Two look-alike places give hundreds of matches that one wrong relative pose explains. The
+surroundings of look-alike places differ, so a wrong relative pose puts surfaces where the other
+image sees empty space.
 
 1. The relative pose of each verified pair is checked for depth consistency. If the relative pose of
-   a pair is inconsistent, other pose hypotheses are checked in the order of their support.
-2. The matches of a pair are weighted by the support of the best depth-consistent pose, relative to
-   the best supported pose.
-3. A pair without a depth-consistent pose may still be correct, if few or bad matches make its
-   relative pose inaccurate. The pair is removed if consistent pairs connect its images by more
-   matches (maximum flow) and imply another relative rotation.
+   a pair is inconsistent, other pose hypotheses are checked in the order of their support. 2. The
+   matches of a pair are weighted by the support of the best depth-consistent pose, relative to the
+   best supported pose. 3. A pair without a depth-consistent pose may still be correct, if few or
+   bad matches make its relative pose inaccurate. A pair without a depth-consistent pose is removed
+   if consistent pairs connect its images by more matches (maximum flow) and imply another relative
+   rotation.
 
 Image pairs with fewer matches than a registration needs are not checked.
 """
@@ -78,8 +78,8 @@ class PairConsistencyCheck:
             candidates: (n,) bool mask of the images whose pairs are checked.
 
         Returns:
-            (p,) float64 weights in [0, 1], 1 for pairs that are not checked, and 0 for pairs to
-            remove.
+            (p,) float64 weights of the image pairs in [0, 1], 1 for pairs that are not checked, and
+            0 for pairs to remove.
         """
         min_matches = self._options.registration.min_inliers
         results = {

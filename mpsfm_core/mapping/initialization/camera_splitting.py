@@ -1,9 +1,9 @@
-"""Detection of images that do not have the focal length of the camera that they share.
+"""Detection of images whose focal length differs from that of their shared camera.
 
-Photos without EXIF may differ in zoom or crop although their sizes are equal. Such an image has
-clearly more support with a focal length of its own than with the shared focal length, in absolute
-pose estimation from points that at least two other images observe. Where focal length and distance
-are ambiguous, for example for a frontal plane, the support does not differ.
+Photos without EXIF may differ in zoom or crop although their sizes are equal. The pose of a zoomed
+or cropped image is estimated with the shared focal length and with a focal length of its own. The
+image gets its own camera if clearly more keypoints then support the pose. Where focal length and
+distance are ambiguous, for example for a frontal plane, both poses have equal support.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 MIN_FOCAL_RATIO = 1.05
 """Ratio of own and shared focal length from which an image gets its own camera. [ours]"""
 MIN_SUPPORT_RATIO = 1.2
-"""Ratio of the supports with own and shared focal length from which an image gets its own camera.
-[ours]"""
+"""Ratio of the pose supports (MSAC scores) with own and shared focal length from which an image
+gets its own camera. [ours]"""
 MAX_ERROR_PX = 4.0
-"""Largest reprojection error of a supporting match, in standard deviations of the keypoint
-position. A wrong focal length only causes errors of a few pixels. [COLMAP
+"""Largest reprojection error of a match that supports a pose, in standard deviations of the
+keypoint position. A wrong focal length only causes errors of a few pixels. [COLMAP
 filter_max_reproj_error]"""
 MIN_OTHER_IMAGES = 2
-"""Minimum number of other images that observe a point. The position of the point then does not
-depend on the tested image. [ours]"""
+"""Minimum number of other images that observe a point, so that the tested image does not determine
+the position of the point. [ours]"""
 
 
 def find_deviating_focals(
@@ -45,13 +45,13 @@ def find_deviating_focals(
     """Find images whose focal length differs from that of their shared camera.
 
     Args:
-        problem: The mapping problem that was reconstructed.
-        model: Its largest component.
+        problem: Mapping problem that was reconstructed.
+        model: Largest component of the reconstruction.
         options: Options of absolute pose estimation.
         seed: Seed of RANSAC.
 
     Returns:
-        Focal lengths ``fx`` in pixels of the deviating images, by image index.
+        Focal lengths ``fx`` in pixels of the images with a deviating focal length, by image index.
     """
     guessed = [image.shared_camera for image in problem.images if not image.focal_known]
     num_images = Counter(guessed)
@@ -73,7 +73,8 @@ def find_deviating_focals(
         max_error_px = MAX_ERROR_PX * image.keypoint_std_px
         shared = estimate_absolute_pose(camera, xy, xyz, options, seed)
         support = _measure_support(camera, shared[:2], xy, xyz, max_error_px) if shared else 0.0
-        if MIN_SUPPORT_RATIO * support >= len(xy):  # no pose has more support than matches
+        # A pose with any focal length has at most the support len(xy).
+        if MIN_SUPPORT_RATIO * support >= len(xy):
             continue
         own = estimate_pose_with_focal(camera, xy, xyz, sample_focal_lengths(image), options, seed)
         if own is None or abs(np.log(own.focal_px / camera.fx)) < np.log(MIN_FOCAL_RATIO):
@@ -87,11 +88,12 @@ def find_deviating_focals(
 def split_cameras(
     images: Sequence[MappingImage], own_focals: Mapping[int, float]
 ) -> tuple[MappingImage, ...]:
-    """Return the images, of which some get their own camera.
+    """Return the images, and give images with a deviating focal length their own camera.
 
     Args:
-        images: The images.
-        own_focals: Focal length ``fx`` in pixels by index of the images with their own camera.
+        images: All images of the mapping problem.
+        own_focals: Focal lengths ``fx`` in pixels of the images that get their own camera, by image
+            index.
     """
     first_id = 1 + max((image.camera_id for image in images), default=0)
     split = list(images)

@@ -1,8 +1,8 @@
 """Selection and relative pose of the initial image pair (paper section 3.1).
 
 If points are lifted from depth, the second image is registered by the points of the first image.
-Without lifted points, the relative pose is that of the verified pair, and the baseline length is
-measured by depth.
+Without lifted points, the relative pose of the pair is that of geometric verification, and the
+baseline length is measured by depth.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class InitialPairSelector:
     ) -> list[VerifiedPair]:
         """Rank the image pairs for initialization (COLMAP's ``FindInitialImagePair``).
 
-        Image pairs are ranked by their number of matches. The pairs with most matches are ranked
-        again by the support of their relative poses (option ``num_compared``).
+        Image pairs are ranked by their number of matches. The ``num_compared`` image pairs with
+        most matches are ranked again by the support of their relative poses.
 
         Args:
             pose_estimator: Pose estimator on a scene without registered images.
@@ -144,7 +144,7 @@ def estimate_initial_pairs(
         pose_estimator: Pose estimator on a scene without registered images.
         pair: The verified pair.
         options: Options of the collection of 2D-3D correspondences.
-        refine: Also refine the relative poses by bundle adjustment.
+        refine: Refine the estimated relative poses by bundle adjustment.
     """
     estimate = pose_estimator.estimate_poses if refine else pose_estimator.estimate_unrefined_poses
     return [

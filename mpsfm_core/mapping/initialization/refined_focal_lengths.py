@@ -1,4 +1,4 @@
-"""Transfer of refined focal lengths from one mapper run to the next."""
+"""Transfer of refined focal lengths from one mapper run to the problem of the next run."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def apply_refined_focal_lengths(
 def _apply_shared_focals(
     problem: MappingProblem, model: Reconstruction
 ) -> tuple[MappingImage, ...]:
-    """Return the images with the refined focal lengths that changed by ``MIN_FOCAL_CHANGE``."""
+    """Return the images with focal lengths that refinement changed by ``MIN_FOCAL_CHANGE``."""
     cameras = {
         problem.images[image.index].shared_camera: image.camera
         for image in model.images
@@ -81,8 +81,8 @@ def estimate_relative_poses(problem: MappingProblem, changed: Bool, seed: int) -
     """Return the problem with new relative poses of the pairs of changed images.
 
     Args:
-        problem: The mapping problem with changed intrinsics or keypoints.
-        changed: (n,) bool mask of the changed images.
+        problem: Mapping problem with changed intrinsics or keypoints of some images.
+        changed: (n,) bool mask of the images with changed intrinsics or keypoints.
         seed: Seed of RANSAC.
     """
     pairs = tuple(

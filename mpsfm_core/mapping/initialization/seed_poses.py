@@ -16,8 +16,8 @@ def select_seed_images(mapping: MappingResult, min_points: int) -> list[Register
 
     Args:
         mapping: The earlier result.
-        min_points: Number of points with at least three observations that a selected image must
-            observe.
+        min_points: Minimum number of points with at least three observations that a selected image
+            observes.
     """
     return [
         image
@@ -35,8 +35,8 @@ def apply_seed_poses(
     """Return the problem with the poses of the seed images as known poses.
 
     Known poses of images without a seed pose stay unchanged. All images that share the camera of a
-    seed image take the focal length of the seed images. Seed images with another focal length than
-    most seed images of their camera get their own camera.
+    seed image take the focal length of the seed images. A seed image gets its own camera if its
+    focal length differs from that of most seed images of its camera.
     """
     poses = {seed.index: (seed.rotation, seed.translation) for seed in seed_images}
     refined: dict[tuple[int, PinholeCamera], Counter[PinholeCamera]] = {}

@@ -1,7 +1,7 @@
 """Measurement of the noise of depth priors from the agreement of image pairs.
 
-A depth prior declares a variance for each pixel. The depth of a matched keypoint is projected into
-the other image of the pair, and compared with the depth prior of that image. The
+A depth prior declares a variance for each pixel. The depth prior at a matched keypoint is projected
+into the other image of the pair, and compared with the depth prior of the other image. The
 differences between projected and prior depth show whether the declared variance is too large or too
 small, and how much errors of neighboring pixels correlate.
 
@@ -26,7 +26,7 @@ CELLS = 4
 """Rows and columns of a grid of image cells; errors of depth in the same cell are treated as
 correlated. [ours]"""
 MIN_RESIDUALS = 25
-"""Minimum number of depth residuals for a measurement of the noise. With fewer residuals, the
+"""Minimum number of depth residuals for a measurement of the noise. With fewer depth residuals, the
 declared variance of the depth prior applies. [ours]"""
 MIN_INDEPENDENT = 0.05
 """Minimum share of the variance of depth that is independent between pixels. [ours]"""
@@ -35,12 +35,12 @@ POSE_UNKNOWNS = 6
 MULTIPLIER_RANGE = (0.1, 10.0)
 """Range of the factor between the measured and the declared standard deviation of depth. [ours]"""
 MIN_CONSTRAINED_ANGLE_DEG = 2.0
-"""Minimum triangulation angle of a point that rays constrain well without depth. Observations in
-two images suffice, because a wrong pose moves all points of an image, while an error of a few
-points is an error of the prior. [ours]"""
+"""Minimum triangulation angle of a point that rays constrain well without depth. Observations of a
+point in two images suffice, because a wrong pose moves all points of an image, while a depth prior
+that only a few points contradict is wrong at these points. [ours]"""
 NUM_NEIGHBORS = 7
-"""Number of nearest well-constrained points whose median error measures the depth prior. The
-median changes if at least four of the seven points contradict the depth prior. [ours]"""
+"""Number of nearest well-constrained points whose median error measures the depth prior. The median
+error changes if at least four of the seven points contradict the depth prior. [ours]"""
 MAX_NEIGHBOR_DISTANCE = 1 / 8
 """Maximum distance between a pixel and a well-constrained point, relative to the width of the depth
 map. Errors of depth priors do not correlate at larger distances. [ours]"""
@@ -73,7 +73,7 @@ class DepthNoise(NamedTuple):
         because an outlier differs from its neighbors.
         """
         if self.design_effect == 1.0:
-            return 1.0  # the depth errors are independent, or were not measured
+            return 1.0  # depth errors are independent, or were not measured
         independent = max(1.0 - self.correlation, MIN_INDEPENDENT)
         return float(np.sqrt(independent / self.design_effect))
 
@@ -125,7 +125,7 @@ def measure_local_depth_noise(
 
     The depth error at a grid node is the median error of the nearest well-constrained points. The
     median error counts as one observation, and ``min_factor`` as a second observation (a unit
-    information prior). A missing neighbor counts as a depth error of ``min_factor``.
+    information prior). A missing nearest point counts as a depth error of ``min_factor``.
 
     Args:
         scene: The scene.

@@ -114,9 +114,9 @@ class Refiner:
 
         Args:
             image: A registered image.
-            others: Images whose mean scale a metric prior is compared with. Points whose scale
-                differs from the mean by more than ``MAX_DEPTH_RATIO`` are ignored. If no points
-                remain, the image takes the mean scale.
+            others: Images whose mean depth scale is compared with that of a metric prior. Points
+                whose scale differs from the mean scale by more than ``MAX_DEPTH_RATIO`` are
+                ignored. If all points are ignored, the image takes the mean scale.
         """
         scene = self.scene
         depth_map = scene.maps[image]
@@ -184,7 +184,7 @@ class Refiner:
         parallel_map(lambda image: self._integrate(image, *covariances), images)
 
     def refine_depth(self, images: list[int]) -> None:
-        """Measure the depth noise, and refine the depth maps of images with the current points."""
+        """Measure depth noise, and refine the depth maps of images with the current points."""
         self._measure_noise()
         self.integrate(images)
 
@@ -205,10 +205,12 @@ class Refiner:
         Args:
             variable: Images to adjust.
             local: Keep points with long tracks fixed (local bundle adjustment).
-            focal: Also refine guessed intrinsics that the observations determine.
+            focal: Refine guessed intrinsics that the observations determine, in addition to poses
+                and points.
             reprojection_scale: Factor on the scale of the reprojection loss.
             depth_scale: Factor on the scale of the depth loss.
-            max_iterations: Maximum number of iterations, or None to use the option.
+            max_iterations: Maximum number of bundle adjustment iterations, or None to use the
+                option.
         """
         scene, tracks = self.scene, self.scene.tracks
         observations = tracks.observations()
@@ -332,7 +334,7 @@ class Refiner:
         self.adapts_reprojection_loss = False
 
     def state_dict(self) -> StateDict:
-        """Return the noise measurements and the fixed poses for a checkpoint."""
+        """Return the depth noise measurements and the fixed poses for a checkpoint."""
         return {
             "fixed": self.fixed,
             "noise": list(self.noise),
@@ -342,7 +344,7 @@ class Refiner:
         }
 
     def load_state_dict(self, state: StateDict) -> None:
-        """Restore the noise measurements and the fixed poses from a checkpoint."""
+        """Restore the depth noise measurements and the fixed poses from a checkpoint."""
         self.fixed = state["fixed"]
         self.noise = DepthNoise(*state["noise"])
         self._integrator_noise = DepthNoise(*state["integrator_noise"])
@@ -383,7 +385,7 @@ class Refiner:
             self.loss_scale = measure_loss_scale(self.scene, bundle.reprojection_scale)
 
     def _measure_noise(self) -> None:
-        """Measure the depth noise, and discard depth integrators that assumed another noise."""
+        """Measure the depth noise, and discard depth integrators built for other noise."""
         if not self.options.measure_depth_noise:
             return
         self.noise = measure_depth_noise(self.scene)
@@ -429,7 +431,7 @@ class Refiner:
         return keypoints, z
 
     def _depth_observations(self, observations: Int64, refined: bool) -> tuple[Float64, Float64]:
-        """Return log depth of depth maps at observations, NaN if unusable, and its std."""
+        """Return log depth at observations, NaN if unusable, and the std of log depth."""
         scene, tracks = self.scene, self.scene.tracks
         _, z = scene.project(observations, tracks.xyz[tracks.point_of[observations]])
         if refined:
@@ -454,10 +456,10 @@ class Refiner:
         """Return the expected change of the log depth scales of images, and its prior std.
 
         Metric depth priors share one unit, so their log scales are expected to equal the mean log
-        scale of the registered images. A mean, unlike a median, keeps the free unit of the world
-        constant. The standard deviation is the spread of the log scales of the registered images,
-        with the declared noise as one more sample (a unit information prior). The log scale of a
-        relative depth prior has an infinite standard deviation.
+        scale of the registered images. The mean log scale, unlike the median, keeps the free unit
+        of the world constant. The standard deviation is the spread of the log scales of the
+        registered images, with the declared noise as one more sample (a unit information prior).
+        The log scale of a relative depth prior has an infinite standard deviation.
 
         Returns:
             Expected changes (m,) of the log scales, and standard deviations (m,).

@@ -1,10 +1,11 @@
-"""Self-calibration decisions about the guessed intrinsics that bundle adjustment estimates.
+"""Self-calibration, which accepts or refuses intrinsics that bundle adjustment estimates.
 
 Bundle adjustment estimates log focal lengths with a normal prior, whose standard deviation depends
 on the source of the guess (EXIF, a network, or a default). A camera takes the estimated focal
-length if the observations determine it better than the prior, and if a lens of this focal length
-exists. Cameras that keep the guess are fixed, and the remaining focal lengths are estimated again.
-The same rule decides about the radial distortion of cameras with a refined focal length.
+length if the observations determine the focal length better than the prior, and if a lens of this
+focal length exists. Guessed focal lengths that a camera keeps are fixed, and the remaining focal
+lengths are estimated again. The radial distortion of a camera with a refined focal length also
+takes an estimate that is well determined and plausible.
 """
 
 from __future__ import annotations
@@ -21,19 +22,18 @@ from mpsfm_core.optimize.bundle_adjustment import BundleProblem, BundleResult, a
 from mpsfm_core.optimize.options import BundleOptions
 
 MAX_STD_RATIO = 0.5
-"""Ratio of posterior and prior standard deviation of a parameter above which a camera keeps the
-guess. At a ratio of 0.5, the observations add three times the information of the prior.
-[ours]"""
+"""Ratio of posterior and prior standard deviation above which an intrinsic parameter keeps its
+guess. At a ratio of 0.5, the observations add three times the information of the prior. [ours]"""
 RADIAL_PRIOR_STD = 0.1
-"""Standard deviation of the zero-mean prior on the radial distortion. Phones and zoom lenses stay
-below 0.05, action cameras below 0.3 in magnitude. [ours]"""
+"""Standard deviation of the zero-mean prior on the radial distortion. The radial distortion of
+phones and zoom lenses stays below 0.05 in magnitude, that of action cameras below 0.3. [ours]"""
 MAX_RADIAL = 0.6
-"""Largest plausible magnitude of the radial distortion; SIMPLE_RADIAL does not describe stronger
-distortion. [ours]"""
+"""Largest plausible magnitude of the radial distortion, because SIMPLE_RADIAL does not describe
+stronger distortion. [ours]"""
 
 
 def has_guessed_camera(scene: Scene, images: Int64) -> Bool:
-    """Return a bool mask (m,) of the images whose focal length is a guess."""
+    """Return a bool mask (m,) of the given images whose focal length is a guess."""
     known = [scene.problem.images[image].focal_known for image in images]
     return ~np.array(known, dtype=np.bool_)
 
@@ -48,17 +48,17 @@ def calibrate_cameras(
 ) -> BundleResult:
     """Run bundle adjustment with guessed intrinsics, and apply well-determined estimates.
 
-    The radial distortion of a camera becomes variable after its focal length is refined, because it
-    would otherwise compensate a wrong focal length. A parameter whose estimate is refused keeps the
-    guess, and bundle adjustment is repeated with this parameter fixed. The outcome of each camera
-    is recorded in the scene.
+    The radial distortion of a camera becomes variable after its focal length is refined, because
+    radial distortion would otherwise compensate a wrong focal length. An intrinsic parameter whose
+    estimate is implausible or undetermined keeps the guess, and bundle adjustment is repeated with
+    this parameter fixed. The outcome of each camera is recorded in the scene.
 
     Args:
         scene: The scene, which receives the refined intrinsics.
         problem: The bundle adjustment problem with constant intrinsics.
         options: Options of bundle adjustment.
         representatives: (k,) index of one image of each camera of the problem.
-        refine_distortion: Also refine radial distortions.
+        refine_distortion: Refine radial distortions in addition to focal lengths.
     """
     images = [scene.problem.images[image] for image in representatives]
     guessed_radials = np.array([image.radial for image in images])
@@ -99,7 +99,7 @@ def _decide(
     representatives: Int64,
     problem: BundleProblem,
 ) -> tuple[Bool, Bool]:
-    """Record the outcome of each variable parameter, and return the refused parameters.
+    """Record the outcome of each variable intrinsic parameter, and return the refused ones.
 
     If the focal length of a camera with variable radial distortion is refused, only the radial
     distortion is fixed at first, because the focal length may be determined without distortion.
@@ -111,7 +111,8 @@ def _decide(
     refuses_focal, refuses_radial = np.zeros((2, len(images)), dtype=np.bool_)
     for row in map(int, np.flatnonzero(problem.variable_focal)):
         image, focal_px = images[row], float(result.intrinsics[row, 0])
-        # the prior variance bounds the posterior variance, also if the reduced system was singular
+        # the posterior variance is at most the prior variance, also if the reduced camera system is
+        # singular
         std = min(float(result.std_log_focals[row]), image.focal_log_std)
         equivalent_mm = compute_equivalent_mm(focal_px, *image.camera.size)
         outcome = decide_focal_outcome(equivalent_mm, std, image.focal_log_std)
@@ -130,7 +131,7 @@ def _decide(
 
 
 def _start_at(problem: BundleProblem, result: BundleResult) -> BundleProblem:
-    """Return the problem with the parameters of a result as initial values."""
+    """Return the bundle adjustment problem with the parameters of a result as initial values."""
     return replace(
         problem,
         rotations=result.rotations,
@@ -148,7 +149,7 @@ def decide_focal_outcome(
     """Decide whether a camera takes its estimated focal length.
 
     Args:
-        equivalent_mm: The estimated focal length as 35 mm equivalent.
+        equivalent_mm: Estimated focal length as 35 mm equivalent.
         posterior_std: Posterior standard deviation of the log focal length, given observations and
             prior.
         prior_std: Prior standard deviation of the log focal length.
@@ -165,7 +166,7 @@ def decide_radial_outcome(radial: float, posterior_std: float) -> CalibrationOut
 
     Args:
         radial: The estimated coefficient.
-        posterior_std: Posterior standard deviation of the coefficient.
+        posterior_std: Posterior standard deviation of the radial distortion coefficient.
     """
     if abs(radial) > MAX_RADIAL:
         return CalibrationOutcome.OUT_OF_RANGE

@@ -40,7 +40,7 @@ def rank_next_images(
         options: Registration options, where ``next_view`` selects the ranking criterion.
 
     Returns:
-        Candidate images, each with the registered image that it matches best.
+        Candidate images, best first, each with its best matching registered image.
     """
     images = np.flatnonzero(candidates & ~scene.registered)
     registered = scene.registered_images()

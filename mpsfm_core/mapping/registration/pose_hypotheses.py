@@ -33,22 +33,22 @@ from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import triangulate_midpoints
 
 MIN_CORRESPONDENCES = 4
-"""Minimum number of correspondences for PnP, three for the solutions and one to select the correct
-solution."""
+"""Minimum number of correspondences for PnP, three for up to four solutions, and one to select the
+correct solution."""
 PNP_CONFIDENCE = 0.99999
 """Confidence of the RANSAC of PnP. [COLMAP, reference]"""
 PNP_TRIALS = (100, 10_000)
 """Minimum and maximum number of RANSAC trials of PnP. [COLMAP, reference]"""
 ESSENTIAL_TRIALS = (50, 500)
-"""Minimum and maximum number of RANSAC trials for the essential matrix, few because other subsets
-of the matches are also tried. [ours]"""
+"""Minimum and maximum number of RANSAC trials for the essential matrix, few trials because other
+subsets of the matches are also tried. [ours]"""
 FOCAL_RANGE = (0.4, 10.0)
 """Smallest and largest focal length to try, relative to the longer side of the image. [ours]"""
 MAX_FOCAL_DEVIATION = 3.0
 """Largest deviation of a focal length to try from its prior, in standard deviations. [ours]"""
 MAX_FOCAL_CORRESPONDENCES = 200
-"""Approximate number of correspondences that choose between focal lengths; raising it is slower.
-[ours]"""
+"""Approximate number of correspondences by which a focal length is selected; raising the number is
+slower. [ours]"""
 FOCAL_STEP = 1.2
 """Largest ratio of consecutive focal lengths to try. PnP tolerates focal length errors of half of
 this ratio on a logarithmic scale. [ours]"""
@@ -108,8 +108,7 @@ def sample_focal_lengths(image: MappingImage) -> Float64:
     """Sample focal lengths to try for an image, on a logarithmic grid around its prior.
 
     Args:
-        image: The image with its focal length prior (``focal_prior_px`` and
-            ``focal_log_std``).
+        image: Image with a focal length prior (``focal_prior_px`` and ``focal_log_std``).
 
     Returns:
         (m,) ascending focal lengths ``fx`` in pixels, within ``MAX_FOCAL_DEVIATION`` and
@@ -126,16 +125,16 @@ def sample_focal_lengths(image: MappingImage) -> Float64:
 
 
 class PoseWithFocal(NamedTuple):
-    """Absolute pose that was estimated together with the focal length."""
+    """Absolute pose of an image, estimated together with the focal length."""
 
     pose: Pose
     """``cam_from_world``."""
     camera: PinholeCamera
-    """Camera with the estimated focal length."""
+    """Camera of the image, with the estimated focal length."""
 
     @property
     def focal_px(self) -> float:
-        """Estimated ``fx`` in pixels."""
+        """Estimated focal length ``fx`` in pixels."""
         return self.camera.fx
 
 
@@ -149,8 +148,8 @@ def estimate_pose_with_focal(
 ) -> PoseWithFocal | None:
     """Estimate an absolute pose and the focal length.
 
-    PnP runs with each focal length. The focal length with most inliers is refined together with its
-    pose.
+    PnP runs with each of the ``focal_lengths``. The focal length with the most PnP inliers is
+    refined together with its pose.
 
     Args:
         camera: Camera of the image, whose aspect ratio and principal point are used.
@@ -161,7 +160,8 @@ def estimate_pose_with_focal(
         seed: Seed of RANSAC.
 
     Returns:
-        Pose and camera, or None if PnP fails or the focal length leaves the range.
+        Pose and camera of the image, or None if PnP fails or the focal length leaves the range of
+        ``focal_lengths``.
     """
     best: tuple[pycolmap.Camera, dict[str, Any]] | None = None
     aspect = camera.fy / camera.fx
@@ -182,7 +182,7 @@ def estimate_pose_with_focal(
         pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=True),
     )
     min_px, max_px = focal_lengths[[0, -1]] * [1 / FOCAL_STEP, FOCAL_STEP]
-    focal_px = float(trial.params[0])  # the refinement changes the focal length of the camera
+    focal_px = float(trial.params[0])  # changed by pose refinement
     if refined is None or not min_px <= focal_px <= max_px:
         return None
     pose = _pose_from_rigid3d(refined["cam_from_world"])
@@ -230,9 +230,9 @@ class PoseHypothesisGenerator:
     """Generator of pose hypotheses of one image from its correspondences."""
 
     scene: Scene
-    """The scene with the registered images."""
+    """Scene with the registered images."""
     image: int
-    """The image to register."""
+    """Index of the image to register."""
     correspondences: PoseCorrespondences
     """2D-3D correspondences of the image."""
     options: RegistrationOptions
@@ -263,8 +263,8 @@ class PoseHypothesisGenerator:
     def generate_from_halves(self) -> Iterator[HypothesisEstimator]:
         """Yield pose estimators that use random halves of the matches with one reference image.
 
-        The reference image with the most correspondences is used. The probability of drawing a
-        match is proportional to its weight.
+        Only matches with the reference image with the most correspondences are drawn. The
+        probability of drawing a match is proportional to its weight.
         """
         correspondences = self.correspondences
         if len(correspondences.keypoints) < MIN_CORRESPONDENCES:
@@ -289,7 +289,7 @@ class PoseHypothesisGenerator:
         return PoseHypothesis(*pose, "PnP") if pose else None
 
     def _estimate_pnp_with_focal(self) -> PoseHypothesis | None:
-        """Estimate pose and focal length by PnP on points that calibrated cameras triangulated."""
+        """Estimate an image's pose and focal length by PnP on points from calibrated images."""
         scene, options, correspondences = self.scene, self.options, self.correspondences
         is_determined = scene.has_determined_focal(correspondences.references)
         correspondences = correspondences.select(correspondences.triangulated & is_determined)
@@ -363,7 +363,7 @@ class PoseHypothesisGenerator:
         return self._to_world(reference, (relative[0], relative[1] * length), "essential matrix")
 
     def _use_network_pose(self, reference: int) -> PoseHypothesis | None:
-        """Use the pose that a multi-view network predicts relative to the reference image.
+        """Generate a hypothesis from the pose that a multi-view network predicts for the image.
 
         Both images must have been processed by the network together, so that their predicted poses
         share a frame and a unit.

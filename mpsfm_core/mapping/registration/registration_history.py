@@ -53,8 +53,8 @@ class RegistrationHistory:
     def is_exhausted(self, image: int, references: list[int]) -> bool:
         """Return True if pose estimation from these reference images would repeat the last attempt.
 
-        The first pose estimations of an image differ, because each draws other random halves of the
-        matches.
+        The first pose estimations of an image differ, because each estimation draws other random
+        halves of the matches.
         """
         is_resampled = self._num_searches[image] >= self._options.max_resampled_attempts
         last = self._last_attempts.get(image)
@@ -72,7 +72,7 @@ class RegistrationHistory:
         self._contradicting[registered_image].add(new_image)
 
     def pop_contradicted_image(self, registered: Bool) -> tuple[int, int] | None:
-        """Return the registered image that the most rejected images contradict, and their number.
+        """Return the registered image that the most rejected images contradict, and how many do.
 
         If the depth of a new and a registered image contradict each other, the pose of the
         registered image may be wrong. Each registered image is returned at most once. The
@@ -116,7 +116,7 @@ class RegistrationHistory:
         self.clear_pose_rejections()
 
     def state_dict(self) -> StateDict:
-        """Return the recorded attempts and rejections for a checkpoint."""
+        """Return the recorded registration attempts and rejections for a checkpoint."""
         return {
             "excluded_references": self.excluded_references,
             "num_searches": list(self._num_searches.items()),
@@ -135,7 +135,7 @@ class RegistrationHistory:
         }
 
     def load_state_dict(self, state: StateDict) -> None:
-        """Restore the recorded attempts and rejections from a checkpoint."""
+        """Restore the recorded registration attempts and rejections from a checkpoint."""
         self.excluded_references = state["excluded_references"]
         self._num_searches.update(state["num_searches"])
         for attempt in state["last_attempts"]:

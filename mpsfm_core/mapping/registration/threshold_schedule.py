@@ -69,11 +69,11 @@ class ThresholdSchedule:
         self._num_relaxations = 0
 
     def state_dict(self) -> StateDict:
-        """Return the present step of the schedule for a checkpoint."""
+        """Return the present step of the threshold schedule for a checkpoint."""
         return {"num_relaxations": self._num_relaxations}
 
     def load_state_dict(self, state: StateDict) -> None:
-        """Restore the present step of the schedule from a checkpoint."""
+        """Restore the present step of the threshold schedule from a checkpoint."""
         self._num_relaxations = state["num_relaxations"]
 
     @property

@@ -12,10 +12,10 @@ class CalibrationOutcome(IntEnum):
     """Decision of self-calibration about the focal length or radial distortion of a camera."""
 
     NOT_ESTIMATED = 0
-    """The parameter is known, or bundle adjustment did not estimate the parameter."""
+    """The intrinsic parameter is known, or bundle adjustment did not estimate the parameter."""
     REFINED = 1
-    """The camera takes the estimate of bundle adjustment."""
+    """The camera takes the value that bundle adjustment estimated for the intrinsic parameter."""
     NOT_OBSERVABLE = 2
-    """The observations do not determine the parameter, so the camera keeps the guess."""
+    """The observations do not determine the intrinsic parameter, so the camera keeps the guess."""
     OUT_OF_RANGE = 3
-    """The estimate is not plausible, so the camera keeps the guess."""
+    """The estimated intrinsic parameter is not plausible, so the camera keeps the guess."""

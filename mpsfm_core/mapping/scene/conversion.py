@@ -25,12 +25,12 @@ def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | No
 
     Args:
         scene: The scene.
-        keep_units: Do not apply the estimated scale, because known poses define the unit of the
-            world.
+        keep_units: Do not apply the estimated metric scale, because known poses define the unit of
+            the world.
 
     Returns:
-        The estimated scale, ``trusted`` if it is to be applied, or None without metric depth
-        priors.
+        Estimated metric scale, ``trusted`` if the scale is to be applied, or None without metric
+        depth priors.
     """
     images = [int(i) for i in scene.registered_images()]
     maps = [scene.maps[i] for i in images if scene.maps[i].active and scene.maps[i].prior.metric]
@@ -49,7 +49,7 @@ def convert_scene(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
 
     Args:
         scene: The scene, from whose tracks the rows of deleted points are removed.
-        keep_units: Keep the unit of the world instead of scaling to meters.
+        keep_units: Keep the unit of the world instead of scaling the reconstruction to meters.
     """
     scene.tracks.compact()
     metric = estimate_metric_scale(scene, keep_units=keep_units)
@@ -110,7 +110,7 @@ def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> R
 
 
 def _get_focal_reason(scene: Scene, index: int) -> Reason | None:
-    """Return the reason why a focal length is not refined, or None if it is refined."""
+    """Return the reason why a camera's focal length is not refined, or None if it is refined."""
     if scene.problem.images[index].focal_known:
         return CameraReason.KNOWN.because()
     outcome = CalibrationOutcome(int(scene.focal_outcome[index]))
@@ -132,7 +132,7 @@ def _get_focal_reason(scene: Scene, index: int) -> Reason | None:
 
 
 def _get_radial_reason(scene: Scene, index: int) -> Reason | None:
-    """Return the reason why a radial distortion is not refined, or None if refined or known."""
+    """Return why a camera's radial distortion is not refined, or None if refined or known."""
     outcome = CalibrationOutcome(int(scene.radial_outcome[index]))
     if scene.problem.images[index].focal_known or outcome == CalibrationOutcome.REFINED:
         return None

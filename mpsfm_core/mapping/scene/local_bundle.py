@@ -11,8 +11,8 @@ from mpsfm_core.mapping.scene.scene import Scene
 def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: Float64) -> list[int]:
     """Return an image and the registered images that share most 3D points with the image.
 
-    If fewer than ``num_neighbors`` images share points, the best matching images are added.
-    COLMAP's ``FindLocalBundle`` also ranks by shared points.
+    If fewer than ``num_neighbors`` images share points, the images with the most matches are added.
+    COLMAP's ``FindLocalBundle`` also ranks images by the number of shared points.
     """
     tracks, graph = scene.tracks, scene.graph
     points = tracks.point_of[graph.keypoints_of(image)]

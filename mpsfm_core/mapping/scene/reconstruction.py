@@ -53,16 +53,17 @@ class RegisteredImage:
     focal_reason: Reason | None = None
     """Reason (``CameraReason``) why the focal length is not refined, or None if it is refined."""
     radial: float = 0.0
-    """Radial distortion coefficient (SIMPLE_RADIAL) of the original image. The mapper refines the
-    coefficient that was removed from the view."""
+    """Radial distortion coefficient (SIMPLE_RADIAL) of the original image. The keypoints were
+    undistorted with an initial coefficient, which the mapper refines."""
     radial_std: float | None = None
-    """Posterior standard deviation of the radial distortion, or None if not estimated."""
+    """Posterior standard deviation of the radial distortion, or None if the mapper did not estimate
+    the distortion."""
     radial_reason: Reason | None = None
     """Reason (``CameraReason``) why the radial distortion is not refined, or None if it is
     refined or known."""
 
     def state_dict(self) -> StateDict:
-        """Return the image for a checkpoint."""
+        """Return the state of the registered image for a checkpoint."""
         parts = {"camera": {**vars(self.camera)}, "depth": {**vars(self.depth)}}
         reasons = {
             "focal_reason": self.focal_reason and self.focal_reason.to_json(),
@@ -72,7 +73,7 @@ class RegisteredImage:
 
     @classmethod
     def from_state_dict(cls, state: StateDict) -> RegisteredImage:
-        """Restore an image from a checkpoint."""
+        """Restore a registered image from a checkpoint."""
         parts = {"camera": PinholeCamera(**state["camera"]), "depth": DepthPrior(**state["depth"])}
         reasons = {
             name: state[name] and reason_from_json(CameraReason, state[name])
@@ -86,8 +87,8 @@ class MetricScale:
     """Estimate of meters per world unit, from the scales of metric depth priors or from GPS."""
 
     metres_per_unit: float
-    """Meters per world unit before the reconstruction was scaled by this factor (if
-    ``trusted``)."""
+    """Estimated meters per world unit of the mapper, by which a ``trusted`` scale has scaled the
+    reconstruction."""
     spread: float
     """Robust relative standard deviation (1.4826 MAD) of the metric scales estimated by the
     images."""
@@ -157,13 +158,13 @@ class MappingReport:
     """Number of mapper runs with different seeds."""
 
     def state_dict(self) -> StateDict:
-        """Return the report for a checkpoint."""
+        """Return the mapper report for a checkpoint."""
         reasons = {name: reasons_to_json(getattr(self, name)) for name in _REASON_FIELDS}
         return {**vars(self), **reasons}
 
     @classmethod
     def from_state_dict(cls, state: StateDict) -> MappingReport:
-        """Restore a report from a checkpoint."""
+        """Restore a mapper report from a checkpoint."""
         reasons = {name: reasons_from_json(state[name]) for name in _REASON_FIELDS}
         return cls(**{**state, **reasons})
 
@@ -186,11 +187,11 @@ def find_explained_matches(
     A match is explained if both keypoints observe the same 3D point.
 
     Args:
-        images: Registered images of a reconstruction of the problem.
+        images: Registered images of a reconstruction.
         problem: Mapping problem with images and verified pairs.
 
     Yields:
-        The pair, and a (m,) bool mask of its matches.
+        The image pair, and a (m,) bool mask of its explained matches.
     """
     point_ids = {image.index: image.point_ids for image in images}
     for pair in problem.pairs:

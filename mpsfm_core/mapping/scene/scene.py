@@ -44,7 +44,7 @@ class Scene:
 
     Args:
         problem: Images with depth and normal priors, and geometrically verified matches.
-        weigh_by_score: Weight matches by their scores, whereas False weights all matches equally.
+        weigh_by_score: True weights matches by their scores, False weights all matches equally.
 
     Attributes:
         graph: Correspondence graph, whose global keypoint numbers index all keypoint arrays.
@@ -177,7 +177,7 @@ class Scene:
         return intrinsics
 
     def has_free_focal(self, image: int) -> bool:
-        """Return whether a focal length is a guess and no registered image shares the camera."""
+        """Return whether the focal length is a guess and no registered image shares the camera."""
         shares_camera = self.camera_of == self.camera_of[image]
         is_guess = not self.problem.images[image].focal_known
         return is_guess and not bool((shares_camera & self.registered).any())
@@ -212,7 +212,7 @@ class Scene:
             image: Index of an image that was taken by the camera.
             outcome: The decision.
             log_std: Posterior standard deviation of the log focal length.
-            estimate_px: Estimated ``fx`` in pixels, also an implausible one.
+            estimate_px: Estimated focal length ``fx`` in pixels, also an implausible one.
         """
         shares_camera = self.camera_of == self.camera_of[image]
         self.focal_outcome[shares_camera] = outcome
@@ -225,7 +225,7 @@ class Scene:
         rows = self.graph.keypoints_of(image)
         given = self.problem.images[image]
         focal_px, center = self.intrinsics[image, :2], self.intrinsics[image, 2:]
-        # exact copies, because a resumed mapper starts from the keypoints of the problem
+        # copy the keypoints of the problem exactly, because a resumed mapper starts from them
         if radial == given.radial and (self.intrinsics[image] == given.camera.params).all():
             self.keypoints[rows] = given.keypoints
         elif radial == 0.0:
@@ -361,7 +361,7 @@ class Scene:
                 self.set_radial_outcome(image.index, outcome, image.radial_std, image.radial)
 
     def _distort_keypoints(self) -> None:
-        """Restore the radial distortion that was removed from the keypoints of the images."""
+        """Distort the keypoints by the radial distortion that was removed from them."""
         for image in map(int, np.flatnonzero(self.radial)):
             rows = self.graph.keypoints_of(image)
             focal_px, center = self.intrinsics[image, :2], self.intrinsics[image, 2:]
@@ -390,7 +390,7 @@ class Scene:
         )
 
     def restore(self, snapshot: Snapshot) -> None:
-        """Roll back the scene to an earlier state."""
+        """Roll back the scene to the state of an earlier snapshot."""
         self.rotations = snapshot.rotations.copy()
         self.translations = snapshot.translations.copy()
         self.registered = snapshot.registered.copy()
@@ -444,7 +444,7 @@ def _depth_groups(problem: MappingProblem) -> Int64:
 
 
 def _shared_cameras(problem: MappingProblem) -> Int64:
-    """Number the cameras, which images with equal number and estimated intrinsics share."""
+    """Number the cameras; images with equal number share estimated intrinsics."""
     numbers: dict[object, int] = {}
     keys = [
         number if image.focal_known else image.shared_camera
