@@ -20,12 +20,12 @@ from mpsfm_core.providers.protocols import (
 
 @dataclass(frozen=True, eq=False)
 class ProviderInstance:
-    """Factory that always returns the same provider object, which one thread at a time uses."""
+    """Provider factory that always returns the same object, which one thread at a time uses."""
 
     provider: object
 
     def __call__(self, options: Options | None, context: ProviderContext) -> object:
-        """Return the provider object."""
+        """Return the provider object, whatever the provider context."""
         return self.provider
 
 
@@ -33,17 +33,19 @@ def spec_of_instance(kind: Kind, provider: Any) -> ProviderSpec:
     """Describe a provider object, so that a registry can list it.
 
     The attributes ``capabilities``, ``calibration`` and ``tags`` of the object are the fields of
-    its :class:`~mpsfm_core.ProviderSpec`. A matcher without ``capabilities`` matches features.
+    its :class:`~mpsfm_core.ProviderSpec`. A matcher object without the attribute ``capabilities``
+    matches features.
 
     Args:
         kind: Kind of the provider, such as ``depth``.
-        provider: Object with the method of the protocol of its kind.
+        provider: Provider object with the method that the protocol of the kind requires, such as
+            ``predict``.
 
     Returns:
-        Specification, whose name is derived from the class of the object.
+        Specification of the provider, whose name is derived from the class of the object.
 
     Raises:
-        ProviderError: The object is a class or lacks the method of its kind.
+        ProviderError: The provider object is a class, or lacks the method that the kind requires.
     """
     methods = [name for name in vars(PROTOCOLS[kind]) if not name.startswith("_")]
     if isinstance(provider, type):

@@ -29,8 +29,8 @@ class ProviderConfig(Options):
     """
 
     use: str
-    """Name of the provider, as in the output of ``mpsfm plugins list``. ``DISTRIBUTION:NAME``
-    chooses between pip packages that contain providers of the same name."""
+    """Name of the provider, as in the output of ``mpsfm plugins list``. The form
+    ``DISTRIBUTION:NAME`` chooses between pip packages that contain providers of the same name."""
     fallback: tuple[str, ...] = ()
     """Names of fallback providers, tried in this order if the provider ``use`` is unavailable. A
     provider is unavailable if its plugin or weights are missing, or if it rejects the options."""

@@ -102,7 +102,7 @@ class _Entry:
     hint: str = ""
     """Advice for the user on how to make the provider available."""
     is_versioned: bool = True
-    """False if the provider is defined in this process, without a version of its code."""
+    """False if the provider is an object or function of this process without a version."""
 
     @property
     def label(self) -> str:
@@ -200,12 +200,12 @@ class Registry:
             )
 
     def extended(self, spec: ProviderSpec) -> Registry:
-        """Return a registry that also has a provider of the calling program.
+        """Return a copy of the registry, with an additional provider of the calling program.
 
-        The name of the provider gets a number if it is taken.
+        The name of the provider gets a number if another provider has the same name.
 
         Args:
-            spec: Specification of the provider.
+            spec: Specification of the additional provider.
         """
         names = {entry.spec.name for entry in self._entries if entry.spec.kind == spec.kind}
         free = (f"{spec.name}-{number}" if number > 1 else spec.name for number in count(1))
@@ -258,12 +258,13 @@ class Registry:
         """Return hashes of a provider's code and versions of its required packages.
 
         Returns:
-            Hash or version by module, or None if the code cannot be identified. The code of a
-            callable factory in this process has no identity unless it is registered with a version.
+            Hash or version by module name, or None if the code of the provider cannot be
+            identified. The code of a factory function in this process is only identified by a
+            version with which the function is registered.
         """
         entry = self._entry(kind, name)
         factory = entry.spec.factory
-        if hasattr(factory, "code_keys"):  # a provider of another Python environment
+        if hasattr(factory, "code_keys"):  # the provider runs in another Python environment
             keys: dict[str, str] | None = factory.code_keys()
             return keys
         found: dict[str, str | None] = {}

@@ -1,7 +1,8 @@
 """Hash of the source code that computes provider results, as a part of cache keys.
 
 The version of a package does not identify its code if the package is installed in editable mode or
-is installed again without a new version. The hash covers the files of the package instead.
+is installed again without a new version. Therefore the source hash covers the files of the package
+instead of its version.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from importlib import metadata
 from pathlib import Path
 
 _STARTED = time.time()
-"""Time at which this process imported MP-SfM, in seconds since the epoch."""
+"""Time at which this process imported MP-SfM, in seconds since 1970."""
 _MAX_FILE_BYTES = 1 << 20
 """Maximum size of a hashed file; larger files are weights, which cache keys contain by URI."""
 _CORE = "mpsfm_core"
@@ -27,7 +28,7 @@ def hash_source(module: str) -> str | None:
     """Hash the files of the package that contains a module, without importing the module.
 
     Args:
-        module: Name of a module, such as ``my_depth.model``.
+        module: Name of a module in the hashed package, such as ``my_depth.model``.
 
     Returns:
         SHA-256 in hex, or None if the code in memory may differ from the files, because a file of
@@ -49,7 +50,7 @@ def hash_source(module: str) -> str | None:
 
 @functools.cache
 def hash_module(module: str) -> str:
-    """Return the SHA-256 of the file of a module of MP-SfM, as read at the first call."""
+    """Return the SHA-256 of the source file of an MP-SfM module, as read at the first call."""
     spec = importlib.util.find_spec(module)
     assert spec is not None and spec.origin is not None
     return hashlib.sha256(Path(spec.origin).read_bytes()).hexdigest()
@@ -62,7 +63,8 @@ def hash_requirement(module: str) -> str | None:
         module: Import name of the package, such as ``kornia``.
 
     Returns:
-        Version without local part such as ``+cpu``, or the result of :func:`hash_source`.
+        Version of the package without local part such as ``+cpu``, or the result of
+        :func:`hash_source`.
     """
     try:
         distribution = metadata.distribution(module)
@@ -80,8 +82,8 @@ def hash_requirement(module: str) -> str | None:
 def _find_package(module: str) -> tuple[str, Path | None]:
     """Return the name and the folder or file of the package that contains a module.
 
-    The package is the outermost one with an ``__init__.py``, or the innermost one for the modules
-    of MP-SfM. The path is None for a module without a file.
+    The returned package is the outermost one with an ``__init__.py``, or the innermost one for the
+    modules of MP-SfM. The returned path is None for a module without a file.
     """
     parts = module.split(".")
     names = [".".join(parts[:length]) for length in range(1, len(parts) + 1)]

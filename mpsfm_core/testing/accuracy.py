@@ -31,9 +31,10 @@ MASK_TOLERANCE = 0.05
 """Largest accepted ratio of wrong mask pixels, among pixels at least two pixels away from the
 border of a surface."""
 _MASK_SHIFT_PX = 6
-"""Largest shift of a mask in pixels that is measured."""
+"""Largest shift in pixels between the true mask and a mask that is measured."""
 _MASK_GAIN = 0.7
-"""Ratio of wrong pixels after and before shifting the true mask, below which a mask is shifted."""
+"""Ratio of wrong pixels of a mask after and before shifting the true mask, below which the mask
+counts as shifted."""
 _MIN_HOLE_PIXELS = 100
 MATCH_TOLERANCE_STD = 3.0
 """Largest accepted median distance of matches from their true positions, in multiples of the
@@ -128,13 +129,13 @@ def require_small_shift(
 
 
 def match_points(case: ContractCase, a: Example, b: Example, answer: PairMatches) -> DenseMatches:
-    """Return matches as pixel coordinates: dense matches, or the keypoints of sparse matches."""
+    """Return matches as pixel coordinates, which for sparse matches are their keypoints."""
     features = None if answer.dense is not None else case.extract_features(a.view, b.view)
     return point_matches(answer, features)
 
 
 def point_matches(answer: PairMatches, features: tuple[Features, Features] | None) -> DenseMatches:
-    """Return matches as pixel coordinates: dense matches, or the keypoints of sparse matches."""
+    """Return matches as pixel coordinates, which for sparse matches are their keypoints."""
     if answer.dense is not None:
         return answer.dense
     assert answer.sparse is not None and features is not None
@@ -169,7 +170,7 @@ def _compare_matches(case: ContractCase, example: Example, answer: PairMatches) 
 
 
 def _require_mask_not_shifted(mask: Bool, example: Example) -> None:
-    """Require that no shifted copy of the true mask fits the mask much better at the holes.
+    """Require that no shifted true mask fits the output mask much better at the holes.
 
     A mask that excludes a margin around each hole fits the true mask best, and a mask of a coarse
     network fits the true and the shifted masks about equally well.

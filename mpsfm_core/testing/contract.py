@@ -68,9 +68,9 @@ class CheckResult:
     id: str
     """Id of the check, such as ``depth-is-z``."""
     status: Status
-    """Outcome of the contract check. A check is skipped (``skip``) if it does not apply, and
-    ``unmeasured`` if it applies but the ground truth is unknown. A failure that the plugin declares
-    as expected is ``xfail``."""
+    """Outcome of the contract check, such as ``pass`` or ``fail``. A check is skipped (``skip``) if
+    it does not apply, and ``unmeasured`` if the check applies but the ground truth is unknown. A
+    failure that the plugin declares as expected is ``xfail``."""
     message: str
     """Reason why the check failed or was skipped, or the remark of a check that passed."""
     seconds: float
@@ -284,7 +284,8 @@ def find_providers(registry: Registry, name: str) -> list[tuple[Kind, str]]:
         if line.available or is_named:
             providers.append((line.kind, line.name))
         else:
-            # Raises ProviderError with the reason unless only the name clashes.
+            # Raise ProviderError with the reason, unless several packages have a provider of this
+            # name.
             qualified = f"{line.distribution}:{line.name}"
             registry.spec(line.kind, qualified)
             providers.append((line.kind, qualified))

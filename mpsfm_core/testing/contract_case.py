@@ -131,7 +131,7 @@ class ContractCase:
         self._features: WeakKeyDictionary[View, Features] = WeakKeyDictionary()
         self._example: Example | None = None
         self.process_before = read_process_settings()
-        """Settings of this process before the first instance of the provider was created."""
+        """Global settings of this process before the first instance of the provider was created."""
 
     @property
     def truth_source(self) -> TruthSource:
@@ -167,7 +167,7 @@ class ContractCase:
             is_painted = self.truth_source == "painted" or self._ground_truth is not None
             appearance: Appearance = "painted" if is_painted else "textured"
             outdoor = self.kind in ("depth", "normals", "multiview", "mask")
-            # The holes of a mask are visible in painted views only.
+            # Providers can see the holes of a mask in painted views only.
             has_holes = outdoor and (self.kind != "mask" or self.truth_source != "image")
             self._example = (
                 outdoor_example(appearance, holes=has_holes)
@@ -287,9 +287,9 @@ class ContractCase:
         return provider.predict(view)
 
     def to_pickle(self) -> tuple[Any, ...]:
-        """Return what :func:`restore_case` needs in another process.
+        """Return the values from which :func:`restore_case` creates the case in another process.
 
-        The files that the function ``prepare`` of the ContractSetup wrote exist there as well.
+        The other process can read the files that ``ContractSetup.prepare`` wrote.
         """
         spec = replace(self.spec, contract=None, weights=())
         source = "none" if self.truth_source == "prepared" else self.truth_source
@@ -297,7 +297,7 @@ class ContractCase:
         return spec, setup, self._folder, self.kind, self._device
 
     def wrong_inputs(self) -> list[str]:
-        """Return what was wrong in the views and depth that a wrapper passed to its provider."""
+        """Return the errors of views and depth priors that a wrapper passed to its provider."""
         return [] if self._ground_truth is None else self._ground_truth.wrong_inputs
 
     def calibration(self) -> Any:

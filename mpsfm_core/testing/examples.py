@@ -32,11 +32,12 @@ FOCAL_RATIO = 0.75
 """Ratio of the mean of ``fx`` and ``fy`` to the image width of the outdoor views. A small test
 network that estimates the focal length returns this ratio times the longer side."""
 _FY_RATIO = 0.75
-"""Ratio ``fy / fx``, far from 1 so that a mix-up of both is measurable."""
+"""Ratio ``fy / fx`` of example views, far from 1 so that swapped focal lengths are measurable."""
 _SKY = ((120, 170, 235), (200, 220, 245))
 """RGB of the sky at the upper and lower border of a textured synthetic view."""
 _HOLES = ((-0.42, -0.05, -0.28, 0.12), (0.33, 0.21, 0.52, 0.34), (-0.1, 0.38, 0.04, 0.47))
-"""Rectangles (left, top, right, bottom) without ground truth, as slopes x / z and y / z."""
+"""Rectangles (left, top, right, bottom) of example views without ground truth, in slopes x / z and
+y / z."""
 _COS_MAX_CREASE = np.cos(np.deg2rad(20.0))
 """Smallest cosine between neighboring normals on a smooth surface, that of 20 degrees."""
 
@@ -157,7 +158,7 @@ class Example:
     def with_common_camera(self) -> Example:
         """Return the synthetic view with a centered principal point and square pixels.
 
-        Networks that estimate a focal length predict one value for such cameras.
+        Networks that estimate a focal length predict one value for cameras with square pixels.
         """
         width, height = self.camera.size
         focal = (self.camera.fx + self.camera.fy) / 2
@@ -180,7 +181,7 @@ class Example:
         return replace(self, name=f"{left}-{top}-{width}x{height}/{self.name}", camera=cropped)
 
     def _is_hole(self, xy: Float64) -> Bool:
-        """Return which pixels (n, 2) lie in one of the rectangles without ground truth."""
+        """Return a mask (n,) of the pixels (n, 2) in rectangles without ground truth."""
         camera = self._unmirrored_camera
         slopes = (xy.reshape(-1, 2) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
         inside = [
@@ -211,7 +212,7 @@ def outdoor_example(
 
     Args:
         look: Colors of the view, painted or textured.
-        size: Width and height in pixels.
+        size: Width and height of the view in pixels.
         holes: True removes the ground truth in some rectangles on the surfaces.
     """
     scene = AnalyticScene(
@@ -232,8 +233,8 @@ def distant_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Exa
     """Return a synthetic view with depth from 0.2 to 80 m: two balls before a wall far away.
 
     Args:
-        look: Colors of the view; painted colors encode depth up to 10 m only.
-        size: Width and height in pixels.
+        look: Kind of colors of the view; painted colors encode depth up to 10 m only.
+        size: Width and height of the view in pixels.
     """
     scene = AnalyticScene(
         (
@@ -254,7 +255,7 @@ def indoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Exam
 
     Args:
         look: Colors of the view, painted or textured.
-        size: Width and height in pixels.
+        size: Width and height of the view in pixels.
     """
     scene = replace(room_scene(), texture=Texture(waves_per_octave=8))
     camera = _off_centre_camera(size, 0.9)

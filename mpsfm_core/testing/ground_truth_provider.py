@@ -25,7 +25,7 @@ class GroundTruthOptions(Options):
     scale: float = 1.0
     """Factor by which the true depth is multiplied."""
     reduction: int = 1
-    """Factor by which the returned map is smaller than the view."""
+    """Factor by which the returned depth or normal map is smaller than the view."""
 
 
 class GroundTruth:
@@ -40,7 +40,7 @@ class GroundTruth:
         self.received_depth: list[bool] = []
         """True for each call of the normals provider that received a depth prior."""
         self.wrong_inputs: list[str] = []
-        """What was wrong in the cameras and depth priors that the wrapper passed on."""
+        """Errors of the cameras and depth priors that the wrapper passed to the provider."""
         self._examples: list[Example] = []
 
     def add_example(self, example: Example) -> None:

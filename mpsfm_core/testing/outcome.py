@@ -8,9 +8,9 @@ class CheckFailed(Exception):
 
 
 class CheckUndecided(CheckFailed):
-    """The provider's output does not suffice for the check, which counts as a failure.
+    """The provider's output does not suffice for a contract check, which counts as a failure.
 
-    A plugin declares a legitimate reason in ``ContractSetup.expected_failures``.
+    If the reason is legitimate, the plugin declares it in ``ContractSetup.expected_failures``.
     """
 
     def __init__(self, reason: str) -> None:

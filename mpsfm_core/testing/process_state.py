@@ -23,24 +23,24 @@ _SEED = 271828
 """Seed of the global random numbers during a check, which no provider's own seed reproduces."""
 _ENVIRONMENT = "environment variables"
 _THREADS = ("the threads of OpenCV", "the threads of torch")
-"""Numbers of threads, which a provider may set to that of its context."""
+"""Settings of the number of threads, which a provider may set to the number in its context."""
 _NUM_THREADS = 3
 _TORCH_NUMBERS = "the random numbers of torch"
 
 
 @dataclass(frozen=True)
 class ProcessSettings:
-    """Values of global state by the name that messages use."""
+    """Values of the global process state, by the name that messages use."""
 
     values: dict[str, Any]
     environment: dict[str, str]
     """Environment variables of the process."""
 
     def changes(self, later: ProcessSettings, *, without_torch_numbers: bool = False) -> str:
-        """Describe the first value that differs later, or return an empty text.
+        """Describe the first value that differs in a later state, or return an empty string.
 
         Args:
-            later: Values that were read later.
+            later: Values of the later process state.
             without_torch_numbers: True ignores torch's random numbers, because the constructors of
                 torch's layers draw random weights.
         """
@@ -59,7 +59,7 @@ class ProcessSettings:
 
 
 def read_process_settings() -> ProcessSettings:
-    """Read settings that importing a library does not change."""
+    """Read the global settings of the process that importing a library does not change."""
     torch: Any = sys.modules.get("torch")
     is_loaded = torch is not None and hasattr(torch, "is_grad_enabled")
     root = logging.getLogger()
@@ -83,7 +83,7 @@ def read_process_settings() -> ProcessSettings:
 
 
 def read_process_state() -> ProcessSettings:
-    """Read all global state, including random numbers, environment variables and files."""
+    """Read the global process state with random numbers, environment variables and files."""
     torch: Any = sys.modules.get("torch")
     cv2: Any = sys.modules.get("cv2")
     settings = read_process_settings()
@@ -105,13 +105,14 @@ def read_process_state() -> ProcessSettings:
 
 @contextmanager
 def known_process_state(before: ProcessSettings) -> Iterator[None]:
-    """Undo earlier changes of environment and random numbers, and restore them afterwards.
+    """Reset environment and random numbers in a ``with`` block, so that changes are visible.
 
-    A change that a provider makes again in each call is visible in the block. The working directory
-    is an empty folder.
+    Changes that a provider made before the block do not hide changes that the provider repeats in
+    each call. The working directory in the block is an empty folder. Environment and random numbers
+    are restored after the block.
 
     Args:
-        before: Settings before the provider was created.
+        before: Global settings before the provider was created.
     """
     environment, folder = dict(os.environ), Path.cwd()
     cv2: Any = sys.modules.get("cv2")

@@ -12,10 +12,10 @@ from mpsfm_core.testing.painted_views import NORMALS_STD, RELATIVE_STD
 
 STD_FACTOR = 1.25
 """Largest accepted ratio between the returned std and the std that the test network reports. A std
-of 0.25 m that is returned as a variance of 0.25 m^2 gives a ratio of 2."""
+of 0.25 m that is returned as a variance of 0.25 m^2 gives an std ratio of 2."""
 STD_SPREAD_FACTOR = 1.5
 """Largest accepted ratio between the returned std and the reported std at the 10 % and 90 %
-quantiles of all pixels. A mirrored or averaged std gives a ratio of 2 where depth varies."""
+quantiles of all pixels. A mirrored or averaged std gives an std ratio of 2 where depth varies."""
 
 
 def require_reported_std(variance: Float32, expected_std: Float64) -> str:
@@ -26,7 +26,7 @@ def require_reported_std(variance: Float32, expected_std: Float64) -> str:
         expected_std: Standard deviations (n,) that the test network reports.
 
     Returns:
-        Text with the median ratio between returned and expected standard deviations.
+        Message with the median ratio between returned and expected standard deviations.
 
     Raises:
         CheckFailed: the median ratio of the standard deviations is above :data:`STD_FACTOR` or
@@ -47,7 +47,7 @@ def require_reported_std(variance: Float32, expected_std: Float64) -> str:
 
 
 def require_depth_std(prior: DepthPrior, example: Example) -> str:
-    """Require the variance of depth that a test network reports, if there is a variance."""
+    """Require the depth variance that a test network reports, if the output has a variance."""
     if prior.variance is None:
         return "no variance"
     where = map_errors.select_comparable(prior.valid, example.truth(prior.shape))
@@ -56,7 +56,7 @@ def require_depth_std(prior: DepthPrior, example: Example) -> str:
 
 
 def require_normals_std(prior: NormalPrior, example: Example) -> str:
-    """Require the variance of normals that a test network reports, if there is a variance."""
+    """Require the normal variance that a test network reports, if the output has a variance."""
     if prior.variance is None:
         return "no variance"
     where = map_errors.select_comparable(prior.valid, example.truth(prior.shape))

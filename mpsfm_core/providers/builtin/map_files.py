@@ -68,7 +68,7 @@ def _find_ignoring_case(candidates: list[Path]) -> Path | None:
 def read_upright_arrays(
     options: FileOptions, path: Path, main: str, view: View
 ) -> tuple[dict[str, NDArray[Any]], int]:
-    """Read the named arrays of a map file, and rotate them upright as the view.
+    """Read the named arrays of a map file, and rotate the arrays upright as the view.
 
     Args:
         options: Orientation of the map files.
@@ -78,7 +78,7 @@ def read_upright_arrays(
 
     Returns:
         Arrays of the file by name, and the EXIF orientation by which the grids of the arrays were
-        rotated, 1 for upright maps. Vectors in the arrays are not rotated.
+        rotated, 1 for upright maps. Vectors in the arrays, such as normals, are not rotated.
     """
     arrays = read_arrays(path, main)
     height, width = (*arrays[main].shape, 0, 0)[:2]

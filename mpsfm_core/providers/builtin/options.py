@@ -65,8 +65,8 @@ class FileOptions(Options):
     suffixes ``.npz``, ``.npy``, ``.exr``, ``.png``, ``.tif`` and ``.tiff``."""
     orientation: MapOrientation = "auto"
     """Orientation of the map files of photos that EXIF rotates, either ``stored`` (before EXIF
-    rotation) or ``upright`` (after). The value ``auto`` compares the aspect ratios, and uses
-    ``stored`` if both fit [COLMAP, which ignores EXIF orientation]."""
+    rotation) or ``upright`` (after). The value ``auto`` compares the aspect ratios of map and
+    photo, and uses ``stored`` if both orientations fit [COLMAP, which ignores EXIF orientation]."""
 
 
 class DepthFileOptions(FileOptions):

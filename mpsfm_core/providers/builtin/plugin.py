@@ -17,8 +17,8 @@ from mpsfm_core.providers.builtin.options import (
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 FLAT_CALIBRATION = DepthCalibration(relative_std=0.5)
-"""Uncertainty of the plane that replaces a missing depth map. A relative std from 0.3 to 0.5 gives
-the same poses, 1.0 gives worse poses. [tuned: sample scene]"""
+"""Depth uncertainty of the plane that replaces a missing depth map. The mapper estimates equal
+poses for a relative std from 0.3 to 0.5, and worse poses for 1.0. [tuned: sample scene]"""
 FROM_DEPTH_CALIBRATION = NormalCalibration(std_scale=1.0, std_floor_deg=1.0)
 """Uncertainty of normals that are fitted to depth maps, whose fit predicts the variance."""
 

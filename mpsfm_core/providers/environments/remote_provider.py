@@ -190,7 +190,7 @@ class _Factory:
         return RemoteProvider(self.location, values, context)
 
     def code_keys(self) -> dict[str, str] | None:
-        """Return hashes of the provider's code, see :meth:`Registry.code_keys`."""
+        """Return hashes of the remote provider's code, as :meth:`Registry.code_keys` does."""
         keys: dict[str, str] | None = self.location.ask("code_keys")
         return keys
 

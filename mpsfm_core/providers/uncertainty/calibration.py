@@ -43,7 +43,7 @@ class DepthCalibration(Options):
     use_network_variance: bool = True
     """False ignores the depth variance that the network predicts."""
     shift: float = 0.0
-    """Offset of predicted depth or inverse depth, in multiples of its median over the depth map.
+    """Offset of predicted depth or inverse depth, in multiples of the median over the depth map.
     Metric networks predict depth with the offset 0."""
     shift_space: Literal["depth", "disparity"] = "depth"
     """Quantity to which the offset ``shift`` is added, either depth or, for networks that predict

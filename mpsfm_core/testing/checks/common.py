@@ -126,10 +126,10 @@ def check_deterministic(case: ContractCase) -> None:
 
 
 def check_no_state(case: ContractCase) -> None:
-    """Require that the output does not depend on other calls, earlier or later.
+    """Require that the output for a view does not depend on earlier or later calls.
 
-    A run calls a provider for the images in any order. An output that shares memory with a buffer
-    of the provider changes in later calls.
+    A reconstruction calls a provider for the images in any order. An output that shares memory with
+    a buffer of the provider changes in later calls.
     """
     views = [case.example, case.example.sized(104, 120), case.example.partner]
     alone = [case.run(view, case.create_provider()) for view in views]
@@ -287,10 +287,10 @@ def check_portrait(case: ContractCase) -> str:
 
 
 def check_large_view(case: ContractCase) -> str:
-    """Require the usual accuracy for a view of 2.2 megapixels, or 12.2 for masks.
+    """Require the usual accuracy for a view of 2.2 megapixels, or of 12.2 for masks.
 
-    Photos of users are larger than the input of a network. The large view repeats the pixels of a
-    small view, so that the ground truth is known.
+    Photos of users are usually larger than the input of a network. The large view repeats the
+    pixels of a small view, so that the ground truth is known.
     """
     if case.kind in ("features", "matcher", "retrieval"):
         raise CheckSkipped("'features-large-view' and 'matcher-many-features' use larger inputs")

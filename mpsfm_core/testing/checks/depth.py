@@ -39,8 +39,8 @@ network with a canonical camera model has a depth ratio of 1.5. A depth ratio of
 network ignores the focal length, and 0.67 that depth shrinks instead of growing."""
 
 _FOCAL_GROWTH = (1.5, 2.7)
-"""Accepted range of the ratio of the focal lengths that are estimated for a view of twice the size
-and for the view."""
+"""Accepted range of the ratio between the focal lengths that a provider estimates for a view of
+twice the size and for the view."""
 _MAX_FOCAL_FACTOR = 1.2
 """Largest accepted ratio between the estimated and the true focal length."""
 _ANGLE_RANGE_DEG = (1.0, 170.0)
@@ -231,8 +231,8 @@ def check_depth_calibration(case: ContractCase) -> None:
 def check_depth_range(case: ContractCase) -> str:
     """Require the usual accuracy for near and distant surfaces, from 0.3 to 75 m.
 
-    This check detects clipped, saturated and quantized depth. Colors encode depth up to 10 m only,
-    so the check does not apply to ``truth_source="painted"``.
+    The check ``depth-range`` detects clipped, saturated and quantized depth. Colors of views encode
+    depth up to 10 m only, so ``depth-range`` does not apply to ``truth_source="painted"``.
     """
     case.require_truth("prepared", "image")
     example = distant_example("textured")

@@ -30,20 +30,21 @@ of the textured part because detectors respond to its border."""
 _MIN_LARGE_RATIO = 0.1
 """Smallest accepted ratio of keypoints in each textured corner of the large view."""
 _MIN_COVERING = 40
-"""Number of keypoints above which the coverage of a view is checked."""
+"""Minimum number of keypoints for which the coverage of a view is checked."""
 _MIN_COVERED_CELLS = 7
 _MIN_SIDE_RATIO = 0.05
 """Smallest accepted ratio of keypoints in the outer third of each side of a textured view. The
-ratio is 0.33 for keypoints that are spread evenly, and 0.2 for SIFT."""
+ratio in an outer third is 0.33 for evenly spread keypoints, and 0.2 for SIFT."""
 _MIN_ORDER = 0.4
 """Smallest accepted probability that a keypoint with contrast has a higher score than one without.
-The probability is 0.5 for meaningless scores and 0 for inverted scores."""
+Meaningless scores give a probability of 0.5, inverted scores a probability of 0."""
 _SCALE_RANGE = (1.4, 2.8)
-"""Accepted growth of keypoint scales in a view of twice the size."""
+"""Accepted range of the growth factor of keypoint scales in a view of twice the size."""
 _MAX_STD_FACTOR = 3.0
-"""Largest accepted ratio of the measured keypoint error and ``std_px``; 0.03 for SIFT."""
+"""Largest accepted ratio of the measured keypoint error and ``std_px``, which is 0.03 for SIFT."""
 _MAX_ERROR_PX = 6.0
-"""Distance in pixels above which a descriptor match is wrong and not inaccurate."""
+"""Keypoint distance in pixels above which a descriptor match counts as wrong instead of
+inaccurate."""
 _MIN_CORRECT_RATIO = 0.3
 """Smallest accepted ratio of correct descriptor matches (mutual nearest neighbors within three
 standard deviations of the true position). The ratio of correct matches is 0.6 for SIFT and 0.01 for
@@ -55,7 +56,7 @@ def check_features_axes(case: ContractCase) -> str:
 
     The textured part is a low and wide area in the upper right or lower left corner, so that
     keypoints with swapped x and y are outside. Keypoints of a resized, padded, cropped or rotated
-    image that are not mapped back are outside as well.
+    image that are not mapped back are outside of the textured part as well.
     """
     case.require_truth("image", "prepared")
     width, height = case.example.camera.size
@@ -100,7 +101,7 @@ def check_features_coverage(case: ContractCase) -> str:
 def check_features_scores(case: ContractCase) -> str:
     """Require higher scores where the texture has more contrast.
 
-    A limit on the number of features keeps those with the highest scores.
+    A limit on the number of features keeps the features with the highest scores.
     """
     case.require_truth("image", "prepared")
     view = case.example.view
@@ -125,7 +126,7 @@ def check_features_scores(case: ContractCase) -> str:
 
 
 def check_features_scales(case: ContractCase) -> str:
-    """Require scales in pixels of the view, which double in a view of twice the size."""
+    """Require keypoint scales in pixels, which double in a view of twice the size."""
     case.require_truth("image")
     width, height = case.example.camera.size
     large = case.example.sized(2 * width, 2 * height)
@@ -143,7 +144,8 @@ def check_features_scales(case: ContractCase) -> str:
         pairs.append(features.scales[near] / small_features.scales[row])
     if len(pairs) < _MIN_COUNT:
         raise CheckSkipped(f"only {len(pairs)} keypoints repeat in a view of twice the size")
-    # A point can have features of several scales, of which one must be twice as large.
+    # A keypoint can have features of several scales, one of which must be twice as large in the
+    # view of twice the size.
     best = np.array([ratio[np.abs(np.log(ratio / 2)).argmin()] for ratio in pairs])
     factor = float(np.median(best))
     if not _SCALE_RANGE[0] < factor < _SCALE_RANGE[1]:
@@ -152,9 +154,9 @@ def check_features_scales(case: ContractCase) -> str:
 
 
 def check_features_std(case: ContractCase) -> str:
-    """Require a ``std_px`` that is not far smaller than the measured error of matched keypoints.
+    """Require a ``std_px`` that is not far below the measured error of matched keypoints.
 
-    A ``std_px`` in pixels of a reduced image is too small.
+    A ``std_px`` that is measured in pixels of a reduced image is too small.
     """
     case.require_truth("image")
     first, second = case.run(case.example), case.run(case.example.partner)
@@ -275,7 +277,7 @@ CHECKS = (
 
 
 def _require_same_points(case: ContractCase, other: Example) -> str:
-    """Require that descriptors which are mutual nearest neighbors show the same points."""
+    """Require that mutual nearest neighbors of descriptors are keypoints of the same points."""
     a: Features = case.run(case.example)
     b: Features = case.run(other)
     _require_enough(a)
@@ -292,7 +294,7 @@ def _require_same_points(case: ContractCase, other: Example) -> str:
 
 
 def _blank_outside(view: View, *, upper_right: bool) -> tuple[View, tuple[int, int, int, int]]:
-    """Blank a view outside of one corner; return it and (left, top, right, bottom)."""
+    """Blank a view outside of one corner; return the view and (left, top, right, bottom)."""
     width, height = view.camera.size
     left, top, right, bottom = int(0.45 * width), 0, width, int(0.45 * height)
     if not upper_right:

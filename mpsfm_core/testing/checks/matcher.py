@@ -28,16 +28,17 @@ NUM_MANY_FEATURES = 4096
 LARGE_SIZE = (1200, 900)
 """Width and height in pixels of the views with many features."""
 MIN_COVERING = 40
-"""Number of matches above which their coverage is checked."""
+"""Minimum number of matches for which the coverage of the views is checked."""
 _MIN_COVERED_CELLS = 6
 _MIN_USED_RATIO = 0.9
-"""Smallest accepted ratio of the largest matched feature index and the number of features."""
+"""Smallest accepted ratio of the largest feature index in a match and the number of features."""
 _MAX_SCORE_LOSS = 0.01
 """Largest accepted excess of the mean score of unreliable matches over that of reliable ones. The
-excess is 0 for meaningless scores and negative for all tested matchers."""
+score excess is 0 for meaningless scores, and negative for all tested matchers."""
 _MIN_CORRECT_RATIO_OF_SIZES = 0.3
 """Smallest accepted ratio of correct matches for views of different sizes, which a matcher resizes
-by different factors. The ratio is near 0 if points are in pixels of the other view."""
+by different factors. The ratio of correct matches is near 0 if matched points are in pixels of the
+other view."""
 _MIN_CORRECT_RATIO = 0.5
 """Smallest accepted ratio of correct matches for an image pair with a small baseline. The ratio of
 correct matches is 0.99 for nearest neighbors of SIFT and 0.96 for LighterGlue."""
@@ -56,11 +57,11 @@ def check_matcher_order(case: ContractCase) -> str:
 
 
 def check_matcher_sizes(case: ContractCase) -> str:
-    """Require correct matches of views with different sizes, in both orders.
+    """Require correct matches of two views with different sizes, in both orders.
 
     The second view is a wide, a portrait or a larger rectangle of a neighboring view, at the same
     scale. A dense matcher that resizes each view to one size and is not invariant to scale has to
-    match one of these pairs.
+    match at least one of the pairs of views.
     """
     case.require_truth("image")
     width, height = case.example.camera.size
@@ -116,7 +117,7 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
         )
         matches = match_points(case, small, case.example, case.run_on_pair(small, case.example))
         residual = matches.points_b - ratio * matches.points_a
-        # Integer pixel centers in both views shift the residual by this length.
+        # Integer pixel centers in both views shift the residual of a match by this length.
         expected = 0.5 * (ratio - 1)
         where = f"between a view and its copy at {numerator}/{denominator} of the size"
         text = _describe_residual(residual, matches.std_px, expected, where, counts)
@@ -169,8 +170,8 @@ def check_matcher_few_features(case: ContractCase) -> None:
 def check_matcher_many_features(case: ContractCase) -> str:
     """Require correct matches of 4096 and 4200 features in views of 1200 x 900 pixels.
 
-    Real images have about 4096 features. A fixed buffer or a size limit of the matching network
-    must not end a run, and must not leave the last features without matches.
+    Real images have about 4096 features each. A fixed buffer or a size limit of the matching
+    network must not end a run, and must not leave the last features without matches.
     """
     if not case.declares("sparse"):
         raise CheckSkipped("the matcher needs no features")
@@ -200,8 +201,9 @@ def check_matcher_many_features(case: ContractCase) -> str:
 def check_matcher_scores(case: ContractCase) -> str:
     """Require higher scores of reliable matches than of unreliable ones.
 
-    One half of the second view has strong noise. Scores of matches there, and of wrong matches,
-    must not be higher. Equal scores of all matches are allowed.
+    One half of the second view has strong noise. Scores of matches in the noisy half, and of wrong
+    matches, must not be higher than scores of other matches. Equal scores of all matches are
+    allowed.
     """
     case.require_truth("image")
     a, b = case.example, case.example.partner
@@ -309,7 +311,7 @@ def _take_first(features: Features, count: int) -> Features:
 def _describe_residual(
     residual: Float64, std_px: float, expected: float, where: str, counts: list[int]
 ) -> str:
-    """Require a small median residual (n, 2) in pixels, or return "" if there are few matches."""
+    """Require a small median of match residuals (n, 2) in pixels; skip if there are few matches."""
     near = np.abs(residual).max(axis=1) < 4 * max(1.0, std_px)
     counts.append(int(near.sum()))
     if near.sum() < MIN_MATCHES:
@@ -324,7 +326,7 @@ def _describe_residual(
 
 
 def _match_rotated(case: ContractCase) -> DenseMatches:
-    """Match the example with itself, rotated by 180 degrees."""
+    """Match the example view with a copy that is rotated by 180 degrees."""
     view = case.example.view
     rotated = replace(view, name="rotated.png", image=np.ascontiguousarray(view.image[::-1, ::-1]))
     answer = validation.run_matcher(case.spec, case.provider, (view, rotated), None)
@@ -333,7 +335,7 @@ def _match_rotated(case: ContractCase) -> DenseMatches:
 
 
 def _match_with_noise(case: ContractCase, a: Example, b: Example, amplitude: int) -> DenseMatches:
-    """Match two views, the second with noise in its left half."""
+    """Match two views, the second of which has noise in its left half."""
     noise = np.random.default_rng(0).normal(0, amplitude, b.view.image.shape)
     noise[:, b.camera.width // 2 :] = 0
     image = np.clip(b.view.image + noise, 0, 255).astype(np.uint8)
@@ -344,7 +346,7 @@ def _match_with_noise(case: ContractCase, a: Example, b: Example, amplitude: int
 
 
 def _noise_views(shift: Float64) -> tuple[View, View]:
-    """Return two rectangles (1200 x 900) of one random texture, the second moved by ``shift``."""
+    """Return two views of 1200 x 900 pixels of one random texture, shifted by ``shift``."""
     import cv2  # The import is local, because pytest loads this module when it collects tests.
 
     width, height = LARGE_SIZE
@@ -374,12 +376,12 @@ def _require_many_correct(rows: Int64, features: tuple[Features, Features], shif
 
 
 def _pad(features: Features, count: int, view: View) -> Features:
-    """Repeat features with small random changes, or drop some, so that there are ``count``."""
+    """Repeat features with small random changes, or drop features, to get ``count`` features."""
     if not len(features):
         return features
     rng = np.random.default_rng(0)
     extra = np.arange(max(count - len(features), 0)) % len(features)
-    # In random order, so that matches of any rows are equally likely.
+    # The features are in random order, so that matches of any rows are equally likely.
     rows = rng.permutation(np.concatenate([np.arange(len(features)), extra]))[:count]
     keypoints = features.keypoints[rows] + rng.uniform(-0.5, 0.5, (len(rows), 2))
     descriptors = features.descriptors[rows]

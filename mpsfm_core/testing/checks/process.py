@@ -1,7 +1,7 @@
 """Contract checks of what a provider does to the process in which it runs.
 
-A run calls many providers in one process, in several threads and in worker processes. A provider
-must therefore neither change state that other providers use nor depend on such state.
+A reconstruction calls many providers in one process, in several threads and in worker processes. A
+provider must therefore neither change process state that other providers use nor depend on it.
 """
 
 from __future__ import annotations
@@ -33,14 +33,16 @@ from mpsfm_core.testing.process_state import (
 
 MAX_CONSTRUCTION_S = 20.0
 """Time limit in seconds to construct a provider. Networks with 1 GB of weights need 5 s on a CPU;
-the limit allows for a busy machine. A plugin declares a longer time in ``expected_failures``."""
+the limit allows for a busy machine. A plugin whose provider needs more time declares this in
+``expected_failures``."""
 MAX_CALL_S = 20.0
 """Time limit in seconds for one call with a view of 192 x 144 pixels. The largest networks need 5 s
 on a CPU."""
 _NUM_WARM_CALLS = 3
 _NUM_MEMORY_CALLS = 27
 _MEMORY_TIME_S = 1.5
-"""Time in seconds after which the memory check makes no further calls, at least 4 in all."""
+"""Time in seconds after which the check ``memory-released`` makes no further calls, after at least
+4 calls."""
 _MAX_RETAINED_BYTES = 20_000
 """Bytes of Python and numpy memory that a call of a provider may retain. The pixels of a view have
 at least 83 kB, so a retained view is detected; caches of the Python interpreter grow by less than 4
@@ -53,8 +55,8 @@ memory pools of onnxruntime and torch grow by less than 20 MB after the first th
 def check_second_process(case: ContractCase) -> str:
     """Require the same output in another process, with another seed of Python's hash function.
 
-    Workers of an executor and a repeated run are other processes. The check is skipped if the
-    factory cannot be imported there.
+    Workers of an executor and repeated reconstructions are other processes. The check is skipped if
+    another process cannot import the factory.
     """
     example = case.example
     expected = case.run(example)
@@ -103,11 +105,11 @@ path.with_suffix(".answer").write_bytes(pickle.dumps(found))
 
 
 def check_global_state(case: ContractCase) -> None:
-    """Require that a provider leaves the state of the process as it was.
+    """Require that a provider does not change the global state of the process.
 
-    The state includes the random numbers of Python, numpy and torch, environment variables, the
-    working directory, threads, warning filters and error handling of numpy. Other providers of the
-    run depend on this state.
+    The global state includes the random numbers of Python, numpy and torch, environment variables,
+    the working directory, threads, warning filters and error handling of numpy. Other providers in
+    the process depend on the global state.
     """
     case.prepare(case.example, case.example.partner)
     auxiliary = case.make_auxiliary_input(case.example.view, case.example)
@@ -141,8 +143,8 @@ def check_standard_output(case: ContractCase) -> None:
 def check_memory_released(case: ContractCase) -> str:
     """Require that memory, open files and threads do not grow with the number of views.
 
-    The check makes 30 calls, or fewer if a call takes long. The memory is that of Python and numpy;
-    growth of the whole process is reported above 40 MB only.
+    The check makes 30 calls, or fewer if a call takes long. The measured memory is that of Python
+    and numpy. Growth of the memory of the whole process is reported above 40 MB only.
     """
     num_views = _NUM_WARM_CALLS + _NUM_MEMORY_CALLS
     examples = [_rename_example(case.example, f"memory/{i}.png") for i in range(num_views)]
@@ -188,8 +190,8 @@ def check_memory_released(case: ContractCase) -> str:
 def check_speed(case: ContractCase) -> str:
     """Require that construction and calls take less than 20 s, and report their time.
 
-    A run constructs a provider per thread and calls it for every image. Declare an expected failure
-    with the reason if a provider needs more time.
+    A reconstruction constructs one provider per thread and calls the provider for every image. If a
+    provider needs more time, declare an expected failure with the reason.
     """
     started = time.perf_counter()
     provider = case.create_provider()
@@ -222,7 +224,7 @@ PROCESS_CHECKS = (
 
 def _rename_example(example: Example, name: str) -> Example:
     renamed = replace(example, name=name)
-    # Reuse the rendered images, because they do not depend on the name.
+    # Reuse the rendered images, because the images do not depend on the name of the provider.
     renamed.__dict__.update(view=replace(example.view, name=name), partner=example.partner)
     return renamed
 

@@ -65,7 +65,7 @@ def check_retrieval_overlap(case: ContractCase) -> str:
 def check_retrieval_sizes(case: ContractCase) -> str:
     """Require a higher similarity to a smaller, larger or cropped copy than to another scene.
 
-    Photos of one scene have different sizes, and portrait format.
+    Photos of one scene may have different sizes and landscape or portrait format.
     """
     case.require_truth("image", "prepared")
     width, height = case.example.camera.size

@@ -15,10 +15,11 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 _STD_RANGE = (0.5, 4.0)
 """Accepted range of the ratio between the std of the wrapper and of the wrapped provider. The mean
-of two predictions can halve the variance, and their difference increases it."""
+of two predictions can halve the variance, and the difference of two predictions increases the
+variance."""
 _MAX_STD_SPREAD = 1.7
-"""Largest accepted ratio between the 90 % and 10 % quantiles of these ratios. The wrapped std
-varies by a factor of 3."""
+"""Largest accepted ratio between the 90 % and 10 % quantiles of the std ratio of wrapper and
+wrapped provider. The std of the wrapped provider varies by a factor of 3."""
 _MAX_FILLED_RATIO = 0.05
 """Largest accepted ratio of pixels without a value that a wrapper makes valid."""
 
@@ -83,7 +84,8 @@ def check_wrapper_hands_on_depth(case: ContractCase) -> None:
 def check_wrapper_variance(case: ContractCase) -> str:
     """Require a variance in the unit and at the pixels of the wrapped provider's variance.
 
-    A wrapper may increase the variance, but the std of the wrapped provider has to remain visible.
+    A wrapper may increase the variance, but the pattern of the wrapped provider's variance has to
+    remain visible.
     """
     inner, answer = _run_inner(case), case.run(case.example)
     if answer.variance is None or answer.shape != inner.shape:
@@ -109,7 +111,7 @@ def check_wrapper_low_resolution(case: ContractCase) -> str:
 
 
 def check_wrapper_validity(case: ContractCase) -> str:
-    """Require invalid pixels where the wrapped provider has no value."""
+    """Require that a wrapper returns invalid pixels where the wrapped provider has no value."""
     inner, answer = _run_inner(case), case.run(case.example)
     if answer.shape != inner.shape:
         raise CheckSkipped("the map of the wrapper has another size")
@@ -120,7 +122,7 @@ def check_wrapper_validity(case: ContractCase) -> str:
 
 
 def check_wrapper_inputs(case: ContractCase) -> None:
-    """Require that the wrapped provider receives camera and depth of the view that it receives.
+    """Require that the wrapped provider receives the camera and depth prior of its input view.
 
     If a wrapper mirrors the view, the principal point and the depth prior have to be mirrored.
     """
