@@ -129,7 +129,7 @@ class ActiveProvider:
         return result
 
     def count_cached(self, key: str) -> None:
-        """Count a result from the cache, once per key."""
+        """Count a provider result that was read from the cache, once per cache key."""
         with self._lock:
             self.usage.cached += key not in self._known
             self._known.add(key)

@@ -1,4 +1,4 @@
-"""Signs in the extracted data that a provider is wrong for every image of a run."""
+"""Checks of the keypoints of all images of a run for errors of the features provider."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from mpsfm_core.data.mapping_problem import MappingImage
 _MIN_IMAGES = 3
 _MIN_KEYPOINTS = 50
 _MAX_EXTENT = 0.8
-"""Extent of all keypoints, as a ratio of the image size, below which the rest is not covered."""
+"""Maximum right and lower end of all keypoints, relative to image size, that causes a warning."""
 _MAX_MARGIN = 0.1
-"""Distance of the first keypoint from the left and upper border, as a ratio of the image size.
-Objects in the image center leave a larger margin."""
+"""Maximum left and upper margin of the keypoints, relative to image size, that causes a warning.
+An object in the image center has a larger margin, and therefore causes no warning."""
 
 
 def find_partial_coverage(images: Sequence[MappingImage], provider: str) -> str:
     """Describe keypoints that cover only the upper left part of every image.
 
-    Keypoints in pixels of a reduced or cropped image, and those of the first tile, have this
-    distribution. The mapper would place all images wrongly with such keypoints.
+    A wrong provider returns keypoints in pixels of a reduced or cropped image, or only of the first
+    tile of an image. Keypoints in wrong pixels give wrong poses of all images.
 
     Args:
         images: Images with their keypoints.

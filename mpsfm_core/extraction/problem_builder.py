@@ -60,7 +60,8 @@ def build_problem(
 
     Args:
         cameras: Pinhole camera of each image by name, or the result of
-            :func:`mpsfm_core.load_images`. The mapping problem has its images in the same order.
+            :func:`mpsfm_core.load_images`. The images of the mapping problem have the order of
+            ``cameras``.
         matches: Result of :func:`mpsfm_core.match_images`, or matches by pair of image names. The
             matches of a pair are (m, 2) indices of keypoints, :class:`~mpsfm_core.SparseMatches`
             with scores, or a :class:`~mpsfm_core.VerifiedPair`. Pairs that are not yet verified are

@@ -53,8 +53,8 @@ class CameraEntry:
     images: frozenset[str] | None
     """Names of the images of the camera, None for all images that no other camera lists."""
     is_stored: bool = False
-    """True if the camera is for pixels before EXIF rotation when its size fits both orientations
-    [COLMAP]."""
+    """True if a camera, whose size fits the image before and after EXIF rotation, describes the
+    image before EXIF rotation [COLMAP]."""
 
 
 @dataclass(frozen=True)

@@ -126,9 +126,9 @@ def orient_masks(
     """Determine the orientation of masks, and find entirely black masks.
 
     A mask fits its image before or after EXIF rotation. If the mask size fits only one of the two
-    orientations, the size decides. Masks that fit both follow the majority of the masks whose size
-    decides, else count as not rotated [COLMAP mask_path]. An EXIF orientation in the mask file has
-    precedence over both rules.
+    orientations, the size decides. Masks that fit both orientations follow the majority of the
+    masks whose size decides, or count as not rotated if there is no majority [COLMAP mask_path]. An
+    EXIF orientation in the mask file has precedence over the mask size and the majority.
 
     Args:
         masks: paths of mask files by image name.

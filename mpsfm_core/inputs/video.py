@@ -50,7 +50,7 @@ _MIN_POINTS = 20
 _MAX_CANDIDATES = 300
 """Maximum number of candidate frames in memory, ten seconds of most videos."""
 _MIN_FRAME_RATIO = 0.9
-"""Minimum share of the frames in the video header; below it the video counts as cut off."""
+"""Minimum ratio of decoded frames to the frame count in the header of an undamaged video."""
 _JPEG_QUALITY = 95
 """JPEG quality of the selected frames, from 0 to 100."""
 
@@ -164,13 +164,13 @@ class _Chooser:
             return
         way = self._track.follow(frame.gray, self.options)
         if way < _EARLY_RATIO:
-            self._candidates.clear()  # the camera has returned to the last frame
+            self._candidates.clear()  # the camera is again at the selected frame
             if (
                 len(self.chosen) == 1
                 and frame.sharpness > self._track.sharpness
                 and way < _EARLY_RATIO / 2
             ):
-                self.chosen.clear()  # prefer a sharper first frame of the place
+                self.chosen.clear()  # replace the first frame by a sharper one
                 self._take(frame)
             return
         self._candidates.append((way, frame))

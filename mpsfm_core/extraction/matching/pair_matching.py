@@ -53,7 +53,7 @@ class CandidateMatches:
     std_px: float
     """Standard deviation of the sampled ``points``, pixels."""
     precision: tuple[float, float] = (0.0, 0.0)
-    """Mean inverse variance of the depth that the matcher predicts for each image, or 0."""
+    """Mean inverse variance of the depth that the matcher predicts per image, 0 without depth."""
 
     def __len__(self) -> int:
         return len(self.sparse) + len(self.points.scores)

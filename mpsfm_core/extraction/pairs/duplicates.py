@@ -15,10 +15,10 @@ from scipy.sparse import csr_array
 from mpsfm_core.data import Features, Float64, Int64, VerifiedPair
 
 MIN_SHARED_RATIO = 0.3
-"""Minimum ratio of keypoints at equal pixels, above chance, of two duplicates. The measured ratio
-is 0.5 to 1 for edited copies, and below 0.1 for images of different views. [ours]"""
+"""Minimum ratio of the keypoints of two duplicates that are at equal pixels, beyond chance. The
+measured ratio is 0.5 to 1 for edited copies, and below 0.1 for images of different views. [ours]"""
 MIN_KEYPOINTS = 50
-"""Minimum number of keypoints by which the keypoints at equal pixels are divided."""
+"""Minimum denominator of the ratio of keypoints at equal pixels, for images with few keypoints."""
 
 
 def find_duplicates(
@@ -78,7 +78,7 @@ def restrict_matches(
 
 
 def _measure_shared_ratios(keypoints: Sequence[Float64], size: tuple[int, int]) -> Float64:
-    """Return the ratio (n, n) of keypoints at equal pixels above chance for pairs of n images.
+    """Return the ratio (n, n) of keypoints at equal pixels, beyond chance, of n x n images.
 
     Keypoint coordinates are rounded down to pixels. The expected ratio of randomly distributed
     keypoints is 0.

@@ -114,5 +114,5 @@ class GroupPriors:
 
 
 def consecutive_groups(images: Sequence[int], size: int) -> list[Group]:
-    """Split the image sequence into groups of ``size``, for use before matching."""
+    """Split an image sequence into groups of ``size`` consecutive images."""
     return [tuple(images[start : start + size]) for start in range(0, len(images), size)]

@@ -119,7 +119,7 @@ def check_depth_source(config: Config, registry: Registry) -> None:
 
 
 def _best_pairs(candidates: list[CandidateMatches]) -> dict[int, tuple[CandidateMatches, int]]:
-    """Return the pair with the most precise depth of each image, and the image's index in it."""
+    """Return the pair with the most precise depth of each image, and its index 0 or 1 there."""
     best: dict[int, tuple[float, CandidateMatches, int]] = {}
     for matches in candidates:
         for side, image in enumerate(matches.pair):
