@@ -56,8 +56,8 @@ class MappingImage:
     known_pose: Pose | None = None
     """Known camera pose ``cam_from_world`` that the user provides, or None."""
     depth_group: int | None = None
-    """Group number of the image; images of a group share one unknown depth scale. With None, the
-    depth map of the image has its own scale."""
+    """Group number of the image; images of a group share one unknown depth scale. Without group
+    number (None), the depth map of the image has its own scale."""
     proposed_pose: Pose | None = None
     """Pose ``cam_from_group`` that a multi-view network predicts, in the unit of its depth maps."""
 

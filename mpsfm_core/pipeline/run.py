@@ -126,8 +126,8 @@ def reconstruct(
         output: Result folder, used by one run at a time, or None to write nothing.
         config: Name of a shipped configuration, a YAML file, or a loaded configuration.
         intrinsics: Camera intrinsics as ``intrinsics.yaml``, a COLMAP model or ``transforms.json``.
-            If missing, focal lengths are taken from ``poses``, else from EXIF, else estimated by
-            the depth provider, else set to a default.
+            Without ``intrinsics``, focal lengths are taken from ``poses``, else from EXIF, else
+            estimated by the depth provider, else set to a default.
         image_list: Text file with one image name per line, by default all images of the folder.
         poses: COLMAP model or ``transforms.json`` with poses of some or all images;
             ``mapping.known_poses`` chooses whether known poses are fixed or refined.

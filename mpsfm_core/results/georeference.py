@@ -72,8 +72,8 @@ def georeference(
 
     Returns:
         The reconstruction in meters east, north, up of the median GPS position, and the alignment.
-        Instead, a reason if the GPS positions are too few, spread too little for their noise, or
-        mostly disagree.
+        If the GPS positions are too few, spread too little for their noise, or mostly disagree, the
+        reason is returned instead.
     """
     by_name = {image.name: image for image in reconstruction.confirmed_images}
     located = [name for name in by_name if name in positions]

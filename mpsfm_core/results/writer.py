@@ -110,7 +110,7 @@ def write_results(
         seed: random seed of the selection of pixels for ``dense.ply``.
 
     Returns:
-        The content of ``summary.json``.
+        Content of the written file ``summary.json``.
 
     Raises:
         OSError: as :func:`mpsfm_core.support.files.replace_entries`.
