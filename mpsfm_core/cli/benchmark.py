@@ -59,7 +59,7 @@ def benchmark(
         tuple[str, str] | None,
         typer.Option(
             metavar="A B",
-            help="Compare two finished benchmarks instead: DIR, or DIR:METHOD for one method.",
+            help="Compare two finished benchmarks instead: DIR, DIR:CONFIG or DIR:METHOD.",
         ),
     ] = None,
     quiet: Quiet = False,

@@ -44,7 +44,7 @@ class AucDifference:
     scene: str
     """Name of the scene."""
     config: str
-    """Name of the configuration."""
+    """Name of the configuration, or the names of both configurations if they differ."""
     bucket: str
     """Overlap bucket of the test sets, such as ``leq5``."""
     method: str
@@ -65,23 +65,29 @@ def read_benchmark(place: str) -> dict[str, list[BenchmarkRecord]]:
     """Read the records of a benchmark folder and group the records by method.
 
     Args:
-        place: ``DIR`` for all methods of a benchmark, or ``DIR:METHOD`` for one method, with key
-            ``*`` in the result.
+        place: ``DIR`` for all records of a benchmark, ``DIR:CONFIG`` for one configuration, or
+            ``DIR:METHOD`` for one method, with key ``*`` in the result.
 
     Raises:
-        InputError: The folder has no benchmark records, or the method does not exist.
+        InputError: The folder has no benchmark records, or no such configuration or method.
     """
-    folder, colon, method = place.rpartition(":")
+    folder, colon, name = place.rpartition(":")
     if not colon or Path(place).is_dir():
-        folder, method = place, ""
+        folder, name = place, ""
+    records = read_records(Path(folder))
+    configs = dict.fromkeys(record.config for record in records)
     sides: dict[str, list[BenchmarkRecord]] = {}
-    for record in read_records(Path(folder)):
-        sides.setdefault(record.label, []).append(record)
-    if not method:
+    for record in records:
+        if name not in configs or record.config == name:
+            sides.setdefault(record.label, []).append(record)
+    if not name or name in configs:
         return sides
-    if method not in sides:
-        raise InputError(f"{folder}: no method {method!r}; it has {', '.join(sides)}")
-    return {"*": sides[method]}
+    if name not in sides:
+        raise InputError(
+            f"{folder}: no configuration or method {name!r}; it has the configurations "
+            f"{', '.join(configs)} and the methods {', '.join(sides)}"
+        )
+    return {"*": sides[name]}
 
 
 def compare_benchmarks(
@@ -94,6 +100,8 @@ def compare_benchmarks(
 ) -> list[AucDifference]:
     """Compute the AUC differences for each common scene, configuration, bucket and method.
 
+    If each benchmark has a single configuration, the configurations may differ.
+
     Args:
         first: Records of the first benchmark by method.
         second: Records of the second benchmark by method.
@@ -105,14 +113,15 @@ def compare_benchmarks(
         InputError: The benchmarks have no test set and method in common.
     """
     rng = np.random.default_rng(seed)
+    by_config = max(len(_configs(first)), len(_configs(second))) > 1
     differences = []
     for method in first:
         if method not in second:
             continue
-        matched = _match_records(first[method], second[method])
+        matched = _match_records(first[method], second[method], by_config)
         for (scene, config, bucket), pairs in matched.items():
             errors = [tuple(_unordered_errors(r, convention) for r in pair) for pair in pairs]
-            group = (scene, config, bucket, _method_name(method, pairs[0]))
+            group = (scene, config, bucket, _join(pairs[0][0].label, pairs[0][1].label))
             differences.append(_compute_difference(group, errors, convention, resamples, rng))
     if not differences:
         raise InputError("the two benchmarks have no test set and method in common")
@@ -123,11 +132,11 @@ def format_differences(
     differences: Sequence[AucDifference], convention: PoseConvention = CONVENTIONS["paper"]
 ) -> str:
     """Format a Markdown table of AUC differences below the name of the AUC convention."""
-    head = ["scene", "bucket", "method", "sets", "drawn"]
+    head = ["scene", "configuration", "bucket", "method", "sets", "drawn"]
     head += [f"AUC@{t}°" for t in THRESHOLDS_DEG]
     lines = [head, ["---"] * len(head)]
     for d in differences:
-        cells = [d.scene, d.bucket, d.method, str(d.sets), d.unit]
+        cells = [d.scene, d.config, d.bucket, d.method, str(d.sets), d.unit]
         for t in THRESHOLDS_DEG:
             (a, b), (low, high) = d.auc[t], d.interval[t]
             cells.append(f"{a:.1f} → {b:.1f} ({low:+.1f} .. {high:+.1f}, p {d.p_value[t]:.2g})")
@@ -147,21 +156,29 @@ _SetErrors = tuple[Float64, ...]
 
 
 def _match_records(
-    first: Iterable[BenchmarkRecord], second: Iterable[BenchmarkRecord]
+    first: Iterable[BenchmarkRecord], second: Iterable[BenchmarkRecord], by_config: bool
 ) -> dict[tuple[str, str, str], list[tuple[BenchmarkRecord, BenchmarkRecord]]]:
-    """Match the records of two benchmarks by scene, configuration, bucket and image names."""
-    others = {record.name[:3]: record for record in second}
+    """Match records by scene, test set, image names and, if ``by_config``, configuration."""
+
+    def key(record: BenchmarkRecord) -> tuple[str, str, str]:
+        return record.scene, record.config if by_config else "", record.set_name
+
+    others = {key(record): record for record in second}
     matched: dict[tuple[str, str, str], list[tuple[BenchmarkRecord, BenchmarkRecord]]] = {}
     for record in first:
-        other = others.get(record.name[:3])
+        other = others.get(key(record))
         if other is not None and set(other.truth) == set(record.truth):
-            group = record.scene, record.config, record.bucket
+            group = record.scene, _join(record.config, other.config), record.bucket
             matched.setdefault(group, []).append((record, other))
     return matched
 
 
-def _method_name(method: str, pair: tuple[BenchmarkRecord, BenchmarkRecord]) -> str:
-    return f"{pair[0].label} → {pair[1].label}" if method == "*" else method
+def _configs(sides: Mapping[str, Sequence[BenchmarkRecord]]) -> set[str]:
+    return {record.config for records in sides.values() for record in records}
+
+
+def _join(first: str, second: str) -> str:
+    return first if first == second else f"{first} → {second}"
 
 
 def _unordered_errors(record: BenchmarkRecord, convention: PoseConvention) -> Float64:

@@ -17,7 +17,13 @@ from mpsfm_core.evaluation.report import ALL_SCENES, build_rows, format_markdown
 
 
 def records(
-    noise_deg: float, *, sets: int = 8, label: str = "ours", seed: int = 0, scene: str = "room"
+    noise_deg: float,
+    *,
+    sets: int = 8,
+    label: str = "ours",
+    seed: int = 0,
+    scene: str = "room",
+    config: str = "c",
 ) -> list[BenchmarkRecord]:
     """Return records of five cameras whose orientations have errors of about ``noise_deg``."""
     truth_rng, rng = np.random.default_rng(99), np.random.default_rng(seed)
@@ -29,7 +35,7 @@ def records(
         poses = {n: (turns[i] @ r, turns[i] @ t) for i, (n, (r, t)) in enumerate(truth.items())}
         made.append(
             BenchmarkRecord(
-                scene, "c", "leq10", f"leq10-{number:02d}", label, "", poses, truth, 4, 2.0, 1.0
+                scene, config, "leq10", f"leq10-{number:02d}", label, "", poses, truth, 4, 2.0, 1.0
             )
         )
     return made
@@ -79,6 +85,17 @@ def test_compare_benchmarks_uses_common_sets() -> None:
         compare_benchmarks({"ours": records(1.0)}, {"colmap": records(1.0)})
 
 
+def test_compare_benchmarks_compares_configurations(tmp_path: Path) -> None:
+    for record in records(3.0) + records(0.5, seed=1, config="sift"):
+        write_record(tmp_path, record)
+    sides = [read_benchmark(f"{tmp_path}:{name}") for name in ("c", "sift")]
+    [change] = compare_benchmarks(*sides, resamples=400)
+    assert (change.config, change.method, change.sets) == ("c → sift", "ours", 8)
+    assert change.interval[5][0] > 10
+    with pytest.raises(InputError, match="no test set and method in common"):
+        compare_benchmarks(read_benchmark(str(tmp_path)), {"ours": records(1.0, config="demo")})
+
+
 def test_benchmark_command_compares_folders_and_methods(tmp_path: Path) -> None:
     for record in records(3.0) + records(0.5, seed=1, label="colmap"):
         write_record(tmp_path / "a", record)
@@ -87,12 +104,12 @@ def test_benchmark_command_compares_folders_and_methods(tmp_path: Path) -> None:
     both = ["benchmark", "--compare", str(tmp_path / "a"), str(tmp_path / "b")]
     result = CliRunner().invoke(build_app(), both)
     assert result.exit_code == 0
-    assert "| room | leq10 | ours | 8 | sets |" in result.stdout
+    assert "| room | c | leq10 | ours | 8 | sets |" in result.stdout
     assert "convention `paper`" in result.stdout and "colmap" not in result.stdout
     within = ["benchmark", "--compare", f"{tmp_path / 'a'}:ours", f"{tmp_path / 'a'}:colmap"]
     result = CliRunner().invoke(build_app(), within)
     assert "ours → colmap" in result.stdout
-    with pytest.raises(InputError, match="no method 'openmvg'; it has"):
+    with pytest.raises(InputError, match="no configuration or method 'openmvg'; it has"):
         read_benchmark(f"{tmp_path / 'a'}:openmvg")
     with pytest.raises(InputError, match="no benchmark results"):
         read_benchmark(str(tmp_path))
