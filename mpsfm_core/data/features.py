@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from mpsfm_core.data.arrays import (
     Float32,
@@ -47,6 +47,38 @@ class Features:
                 require_finite(self, name)
         if not (np.isfinite(self.std_px) and self.std_px > 0):
             raise DataError("std_px", "must be positive")
+
+    @classmethod
+    def from_arrays(
+        cls,
+        keypoints: ArrayLike,
+        descriptors: ArrayLike | None = None,
+        scores: ArrayLike | None = None,
+        scales: ArrayLike | None = None,
+        std_px: float = 1.0,
+    ) -> Features:
+        """Build features from arrays of any number type.
+
+        Args:
+            keypoints: (n, 2) positions of the keypoints in COLMAP pixels.
+            descriptors: (n, d) descriptors, or None for a matcher that needs no descriptors.
+            scores: (n,) detection scores, or None.
+            scales: (n,) scales in pixels, or None.
+            std_px: Std of the localization noise of a keypoint in pixels.
+
+        Raises:
+            DataError: An array has a wrong shape, or contains NaN or infinity.
+        """
+        xy = np.asarray(keypoints, np.float64)
+        if descriptors is None:
+            descriptors = np.empty((len(xy), 0))
+        return cls(
+            xy,
+            np.asarray(descriptors, np.float32),
+            None if scores is None else np.asarray(scores, np.float32),
+            None if scales is None else np.asarray(scales, np.float32),
+            std_px,
+        )
 
     def __len__(self) -> int:
         return len(self.keypoints)

@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from mpsfm_core.data import Bool, Features
+from mpsfm_core.data.errors import InputError
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.geometry import sample_nearest
@@ -109,6 +110,12 @@ class GivenFeatures:
     """Feature source with features that the caller computed."""
 
     def __init__(self, names: list[str], features: Mapping[str, Features]) -> None:
+        for name, given in features.items():
+            if not isinstance(given, Features):
+                raise InputError(
+                    f"features of {name!r}: expected mpsfm_core.Features, got "
+                    f"{type(given).__name__}; use Features.from_arrays(keypoints, descriptors)"
+                )
         self._features = [features.get(name, NO_FEATURES) for name in names]
 
     def extract(self) -> list[Features]:

@@ -121,6 +121,11 @@ class _Builder:
         self._masks = masks
         if isinstance(cameras, ImageSet):
             self._cameras = {image.name: image.pinhole for image in cameras}
+        elif not isinstance(cameras, Mapping):
+            raise InputError(
+                "cameras: expected a camera for each image name, such as {'a': camera, 'b': camera}"
+                f", got {type(cameras).__name__}"
+            )
         else:
             self._cameras = {name: _pinhole(name, camera) for name, camera in cameras.items()}
         self.names = list(self._cameras)

@@ -278,8 +278,8 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
     ),
     CameraReason.DISTORTION_NOT_ESTIMATED: (
         "distortion not estimated",
-        "Bundle adjustment did not estimate the radial distortion, because the focal length is a "
-        "guess.",
+        "Bundle adjustment estimates the radial distortion only if the focal length is refined and "
+        "at least three photos share the camera.",
         "Give the camera with --intrinsics if its lens distorts.",
     ),
     CameraReason.DISTORTION_NOT_OBSERVABLE: (

@@ -168,6 +168,18 @@ def test_wrong_arrays_are_explained(known: Any) -> None:
         with pytest.raises(mpsfm.InputError) as caught:
             mpsfm.build_problem(cameras, **arguments)
         assert message in str(caught.value)
+    one_camera: Any = cameras[a]
+    with pytest.raises(mpsfm.InputError, match="a camera for each image name"):
+        mpsfm.build_problem(one_camera, {})
+
+
+def test_features_are_built_from_arrays_of_any_type(images: Any) -> None:
+    features = mpsfm.Features.from_arrays(np.ones((2, 2), np.float32), np.eye(2, dtype=np.float64))
+    assert features.keypoints.dtype == np.float64 and features.descriptors.dtype == np.float32
+    assert mpsfm.Features.from_arrays([[1, 2]]).descriptors.shape == (1, 0)
+    tuples: Any = {images.names[0]: (features.keypoints, features.descriptors)}
+    with pytest.raises(mpsfm.InputError, match=r"got tuple; use Features\.from_arrays"):
+        mpsfm.match_images(images, tuples)
 
 
 def test_model_without_images_has_pinhole_cameras(known: Any) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Int64, MappingImage
 from mpsfm_core.geometry.focal_length import compute_equivalent_mm, is_plausible_equivalent
-from mpsfm_core.mapping.scene.calibration_outcome import CalibrationOutcome
+from mpsfm_core.mapping.scene.calibration_outcome import MIN_FOCAL_IMAGES, CalibrationOutcome
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, BundleResult, adjust_bundle
 from mpsfm_core.optimize.options import BundleOptions
@@ -49,9 +49,11 @@ def calibrate_cameras(
     """Run bundle adjustment with guessed intrinsics, and apply well-determined estimates.
 
     The radial distortion of a camera becomes variable after its focal length is refined, because
-    radial distortion would otherwise compensate a wrong focal length. An intrinsic parameter whose
-    estimate is implausible or undetermined keeps the guess, and bundle adjustment is repeated with
-    this parameter fixed. The outcome of each camera is recorded in the scene.
+    radial distortion would otherwise compensate a wrong focal length. A camera of fewer than
+    ``MIN_FOCAL_IMAGES`` images keeps its radial distortion, because systematic errors of few images
+    resemble distortion. An intrinsic parameter whose estimate is implausible or undetermined keeps
+    the guess, and bundle adjustment is repeated with this parameter fixed. The outcome of each
+    camera is recorded in the scene.
 
     Args:
         scene: The scene, which receives the refined intrinsics.
@@ -63,7 +65,8 @@ def calibrate_cameras(
     images = [scene.problem.images[image] for image in representatives]
     guessed_radials = np.array([image.radial for image in images])
     focal = has_guessed_camera(scene, representatives)
-    may_distort = focal & refine_distortion
+    num_images = np.bincount(problem.camera_of_image, minlength=len(images))
+    may_distort = focal & refine_distortion & (num_images >= MIN_FOCAL_IMAGES)
     radial = may_distort & (scene.focal_outcome[representatives] == CalibrationOutcome.REFINED)
     problem = replace(
         problem,

@@ -115,7 +115,7 @@ class Reconstruction:
 
     @property
     def poses(self) -> dict[str, Pose]:
-        """Poses ``cam_from_world`` of the registered images, by image name."""
+        """Poses ``cam_from_world`` as (rotation (3, 3), translation (3,)), by image name."""
         return {image.name: (image.rotation, image.translation) for image in self.images}
 
     def num_multi_view_points(self) -> Int64:

@@ -70,6 +70,13 @@ def test_reconstruct_with_radial_distortion_refines_shared_camera(
         assert rotation_angle_deg(relative @ true_relative.T) < 0.3
 
 
+def test_reconstruct_with_one_image_per_camera_keeps_pinhole_cameras(room: MappingProblem) -> None:
+    problem = guess_focals(distort(room, -0.05), [0.9, 0.95, 1.0, 1.05, 1.1])
+    for image in reconstruct(problem).reconstructions[0].images:
+        assert image.radial == 0 and image.focal_reason is None
+        assert image.radial_reason == CameraReason.DISTORTION_NOT_ESTIMATED.because()
+
+
 def test_reconstruct_of_partly_undistorted_views_refines_the_original_distortion(
     room: MappingProblem,
 ) -> None:
