@@ -207,8 +207,8 @@ class MappingOptions(Options):
     """Share of the summed match scores whose keypoints must observe common 3D points, so that no
     further mapper run is needed. [tuned: benchmarks.accuracy]"""
     register_tentatively: bool = False
-    """Register images that cannot be verified in the best supported poses. Such images observe no
-    points, and ``summary.json`` lists them as unconfirmed."""
+    """Register images that cannot be verified in the best supported poses. Unverified images
+    observe no points, and ``summary.json`` lists these images as unconfirmed."""
     initialization: InitializationOptions = InitializationOptions()
     """Options of the initialization."""
     registration: RegistrationOptions = RegistrationOptions()

@@ -194,9 +194,9 @@ def find_contradicted_cuts(
 ) -> list[ContradictedCut]:
     """Find cuts of the match graph whose matches mostly contradict the poses of the images.
 
-    Candidates are the cuts at the edges of the maximum spanning tree of explained matches. These
-    cuts include every part of the model that a single pair connects to the rest. The matches of all
-    image pairs across a cut are counted.
+    Candidates are the cuts at the edges of the maximum spanning tree of explained matches. The
+    candidate cuts include every part of the model that a single pair connects to the rest. The
+    matches of all image pairs across a cut are counted.
 
     Args:
         registered: (n,) bool.

@@ -258,7 +258,7 @@ def check_pickles(case: ContractCase) -> None:
 def check_offline(case: ContractCase) -> None:
     """Require that a provider opens no network connection once its weights are local.
 
-    The check detects sockets opened by Python code, not those of native libraries.
+    The check ``offline`` detects sockets opened by Python code, not sockets of native libraries.
     """
     case.provider  # noqa: B018 - the attribute access downloads the weights if necessary
     with _forbid_sockets() as attempts:
@@ -295,7 +295,7 @@ def check_large_view(case: ContractCase) -> str:
     if case.kind in ("features", "matcher", "retrieval"):
         raise CheckSkipped("'features-large-view' and 'matcher-many-features' use larger inputs")
     if case.setup.prepare is not None or case.spec.kind == "wrapper":
-        raise CheckSkipped("the output belongs to the prepared files of small views")
+        raise CheckSkipped("the ground truth of the provider is prepared for small views only")
     factor = 21 if case.kind == "mask" else 9
     small, auxiliary = case.example, case.make_auxiliary_input(case.example.view, case.example)
     image = small.view.image.repeat(factor, axis=0).repeat(factor, axis=1)

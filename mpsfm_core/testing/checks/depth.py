@@ -99,8 +99,8 @@ def check_depth_channel_order(case: ContractCase) -> None:
 def check_depth_pixel_convention(case: ContractCase) -> str:
     """Require that the value at [row, col] belongs to the point (col + 0.5, row + 0.5).
 
-    This check detects half-pixel shifts, corner-aligned resizing, cropped or padded borders, and
-    depth maps that do not cover the whole view.
+    The check ``depth-pixel-convention`` detects half-pixel shifts, corner-aligned resizing, cropped
+    or padded borders, and depth maps that do not cover the whole view.
     """
     case.require_truth("painted", "prepared", "image")
     prior = _run(case)
@@ -111,7 +111,7 @@ def check_depth_pixel_convention(case: ContractCase) -> str:
 def check_depth_orientation(case: ContractCase) -> None:
     """Require that rows of the map go down and columns go right in the view.
 
-    This check detects transposed, mirrored and rotated depth maps.
+    The check ``depth-orientation`` detects transposed, mirrored and rotated depth maps.
     """
     case.require_truth("painted", "prepared", "image")
     prior = _run(case)
@@ -165,7 +165,7 @@ def check_depth_same_in_larger_view(case: ContractCase) -> str:
     large = case.example.sized(2 * width, 2 * height)
     small, prior = _run(case), first_depth(case.run(large))
     if not (small.metric and prior.metric):
-        raise CheckSkipped("depth that is not metric has another unit in every map")
+        raise CheckSkipped("depth that is not metric has a different unit in every depth map")
     medians = [
         float(np.median(map_errors.log_errors(p, e, any_scale=False)))
         for p, e in ((small, case.example), (prior, large))

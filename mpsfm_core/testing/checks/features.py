@@ -165,7 +165,7 @@ def check_features_std(case: ContractCase) -> str:
     offset = (second.keypoints[columns] - true.xy_b)[true.visible]
     offset = offset[np.linalg.norm(offset, axis=1) < _MAX_ERROR_PX * max(1.0, first.std_px)]
     if len(offset) < 2 * _MIN_COUNT:
-        raise CheckUndecided(f"only {len(offset)} keypoints match")
+        raise CheckUndecided(f"only {len(offset)} keypoints match, too few to measure std_px")
     # The median absolute deviation of a normal distribution is 0.67 of its std.
     error = float(np.median(np.abs(offset)) / 0.6745)
     factor = error / float(np.hypot(first.std_px, second.std_px))
@@ -191,7 +191,7 @@ def check_features_pixel_convention(case: ContractCase) -> str:
     offsets = _offsets_to_nearest(found.keypoints, back, radius) / 2
     if len(offsets) < max(_MIN_COUNT, _MIN_REPEATED_RATIO * len(found)):
         text = f"{len(offsets)} of {len(found)} keypoints"
-        raise CheckUndecided(f"the detector repeats only {text} in the rotated view")
+        raise CheckUndecided(f"the detector finds only {text} again in the rotated view")
     x, y = offsets.mean(axis=0)
     text = f"shifted by ({x:+.2f}, {y:+.2f}) px"
     limit = PIXEL_TOLERANCE * max(1.0, found.std_px)

@@ -311,7 +311,7 @@ def _take_first(features: Features, count: int) -> Features:
 def _describe_residual(
     residual: Float64, std_px: float, expected: float, where: str, counts: list[int]
 ) -> str:
-    """Require a small median of match residuals (n, 2) in pixels; skip if there are few matches."""
+    """Require a small median of match residuals (n, 2) in pixels, unless there are few matches."""
     near = np.abs(residual).max(axis=1) < 4 * max(1.0, std_px)
     counts.append(int(near.sum()))
     if near.sum() < MIN_MATCHES:

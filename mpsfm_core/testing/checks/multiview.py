@@ -125,7 +125,8 @@ def check_multiview_pose_unit(case: ContractCase) -> str:
 def check_multiview_intrinsics(case: ContractCase) -> str:
     """Require predicted intrinsics in pixels of each view.
 
-    This check detects intrinsics in pixels of the network's input grid or of another view.
+    The check ``multiview-intrinsics`` detects intrinsics in pixels of the network's input grid or
+    of another view.
     """
     if not case.declares("proposes-intrinsics"):
         raise CheckSkipped("the provider does not declare 'proposes-intrinsics'")

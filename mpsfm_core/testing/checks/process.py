@@ -56,7 +56,7 @@ def check_second_process(case: ContractCase) -> str:
     """Require the same output in another process, with another seed of Python's hash function.
 
     Workers of an executor and repeated reconstructions are other processes. The check is skipped if
-    another process cannot import the factory.
+    another process cannot import the factory of the provider.
     """
     example = case.example
     expected = case.run(example)
@@ -143,8 +143,9 @@ def check_standard_output(case: ContractCase) -> None:
 def check_memory_released(case: ContractCase) -> str:
     """Require that memory, open files and threads do not grow with the number of views.
 
-    The check makes 30 calls, or fewer if a call takes long. The measured memory is that of Python
-    and numpy. Growth of the memory of the whole process is reported above 40 MB only.
+    The check ``memory-released`` makes 30 calls of the provider, or fewer if a call takes long. The
+    measured memory is that of Python and numpy. Growth of the memory of the whole process is
+    reported above 40 MB only.
     """
     num_views = _NUM_WARM_CALLS + _NUM_MEMORY_CALLS
     examples = [_rename_example(case.example, f"memory/{i}.png") for i in range(num_views)]
