@@ -41,7 +41,7 @@ def images(solved, tmp_path: Path) -> ImageSet:
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         cv2.imwrite(str(path), cv2.cvtColor(view.image, cv2.COLOR_RGB2BGR))
-        pinhole = undistort_camera(GUESS, 0.0)
+        pinhole = undistort_camera(GUESS)
         sources.append(SourceImage(name, path, GUESS, pinhole, "default", "0"))
     return ImageSet(sources, InputOptions())
 

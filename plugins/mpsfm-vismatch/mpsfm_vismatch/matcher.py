@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import numpy as np
 import torch
 from scipy.spatial import cKDTree
@@ -34,6 +37,19 @@ keypoint positions are a quarter pixel too small.
 """
 
 
+@contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """Seed the random numbers of numpy and torch, and restore their earlier states at the end."""
+    state = np.random.get_state()
+    try:
+        with torch.random.fork_rng():
+            np.random.seed(seed)
+            torch.manual_seed(seed)
+            yield
+    finally:
+        np.random.set_state(state)
+
+
 class DenseMatcher:
     """Dense matcher that returns all matches of a network, with score 1 if it predicts none."""
 
@@ -55,9 +71,7 @@ class DenseMatcher:
 
     def _matched(self, *views: View) -> DenseMatches:
         images = [self._shown(view) for view in views]
-        np.random.seed(self._seed)  # some matching networks sample matches randomly
-        torch.manual_seed(self._seed)
-        with inference():
+        with inference(), _seeded(self._seed):  # some matching networks sample matches randomly
             output = self._matcher(*images)
         points = [
             self._in_view(view, image, output[f"matched_kpts{side}"])
