@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, TypeAlias
 
 import typer
 
+PhotosOrVideo: TypeAlias = Annotated[Path, typer.Argument(help="Folder of photos, or a video.")]
+ImageList: TypeAlias = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="Use only these photos, one name per line.")
+]
 ConfigName: TypeAlias = Annotated[
     str,
     typer.Option(

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
-from mpsfm_core.cli.arguments import Quiet
+from mpsfm_core.cli.arguments import ImageList, Quiet
 
 if TYPE_CHECKING:
     from mpsfm_core.calibration.calibrate import CalibrationResult
@@ -50,9 +50,7 @@ def calibrate(
             help="Read cameras from intrinsics.yaml or a COLMAP model; default: --model, EXIF.",
         ),
     ] = None,
-    image_list: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Use only these photos, one name per line.")
-    ] = None,
+    image_list: ImageList = None,
     alignment: Annotated[
         list[str] | None,
         typer.Option(

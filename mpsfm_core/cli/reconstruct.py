@@ -10,8 +10,10 @@ import typer
 
 from mpsfm_core.cli.arguments import (
     ConfigName,
+    ImageList,
     Offline,
     Overrides,
+    PhotosOrVideo,
     Quiet,
     ViewerName,
     config_overrides,
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def reconstruct(
-    images: Annotated[Path, typer.Argument(help="Folder of photos, or a video.")],
+    images: PhotosOrVideo,
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Write the results here.")
     ],
@@ -44,9 +46,7 @@ def reconstruct(
             help="Photos of a folder or the set share a camera, or none; default: by EXIF.",
         ),
     ] = None,
-    image_list: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Use only these photos, one name per line.")
-    ] = None,
+    image_list: ImageList = None,
     poses: Annotated[
         Path | None,
         typer.Option(

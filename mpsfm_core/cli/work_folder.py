@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mpsfm_core.cli.arguments import ConfigName, Offline, Overrides, Quiet, config_overrides
+from mpsfm_core.cli.arguments import (
+    ConfigName,
+    ImageList,
+    Offline,
+    Overrides,
+    PhotosOrVideo,
+    Quiet,
+    config_overrides,
+)
 from mpsfm_core.cli.errors import handle_sigterm
 
 if TYPE_CHECKING:
@@ -17,7 +25,7 @@ Work = Annotated[Path, typer.Argument(metavar="WORK", help="Folder of mpsfm extr
 
 
 def extract(
-    images: Annotated[Path, typer.Argument(help="Folder of photos, or a video.")],
+    images: PhotosOrVideo,
     work: Annotated[
         Path, typer.Option("--output", "-o", metavar="WORK", help="Write the work folder here.")
     ],
@@ -29,9 +37,7 @@ def extract(
             help="Read cameras from intrinsics.yaml, a COLMAP model or transforms.json.",
         ),
     ] = None,
-    image_list: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Use only these photos, one name per line.")
-    ] = None,
+    image_list: ImageList = None,
     overrides: Overrides = None,
     offline: Offline = False,
     quiet: Quiet = False,
