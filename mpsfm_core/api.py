@@ -50,7 +50,6 @@ from mpsfm_core.inputs import images as image_inputs
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
-from mpsfm_core.mapping.depth_map_refinement import refine_depth_maps
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.pipeline.provider_resolution import resolve_providers
@@ -59,6 +58,7 @@ from mpsfm_core.providers.registry import Registry
 from mpsfm_core.results.colmap_model import build_pinhole_model, reconstruction_from_model
 from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.refined_views import (
+    refine_reconstructions,
     undistort_cameras,
     undistort_images,
     undistort_problem,
@@ -339,11 +339,9 @@ def undistort_views(
     if refined is images:
         return result, problem, images
     problem = undistort_problem(images, refined, problem)
-    parts = (
-        refine_depth_maps(problem, undistort_cameras(refined, part), options or MapperOptions())
-        for part in result.reconstructions
-    )
-    return replace(result, reconstructions=tuple(parts)), problem, refined
+    options = options or MapperOptions()
+    parts = refine_reconstructions(refined, problem, result.reconstructions, options)
+    return replace(result, reconstructions=parts), problem, refined
 
 
 def to_colmap(

@@ -36,7 +36,6 @@ from mpsfm_core.inputs.matches import (
 from mpsfm_core.inputs.models import describe_name_difference, match_names, read_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
-from mpsfm_core.mapping.depth_map_refinement import refine_depth_maps
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
 from mpsfm_core.mapping.options import MapperOptions
@@ -52,7 +51,8 @@ from mpsfm_core.report.page import write_report
 from mpsfm_core.results.georeference import georeference
 from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.refined_views import (
-    undistort_cameras,
+    refine_reconstructions,
+    take_refined_camera,
     undistort_images,
     undistort_problem,
 )
@@ -424,10 +424,7 @@ class _Run:
                 images, config, self._registry, extraction, unconstrained, self._stages
             )
         refined = undistort_images(images, extraction.problem, mapping.reconstructions)
-        seeds = [
-            replace(seed, camera=refined[seed.index].pinhole) if seed.radial else seed
-            for seed in seeds
-        ]
+        seeds = [take_refined_camera(refined, seed) for seed in seeds]
         problem = undistort_problem(images, refined, extraction.problem)
         changed = np.array([new is not old for new, old in zip(refined, images, strict=True)])
         problem = estimate_relative_poses(problem, changed, config.runtime.seed)
@@ -451,11 +448,8 @@ class _Run:
         """Refine depth maps again in views that are undistorted with the refined cameras."""
         options = self._config.mapper_options()
         with self._stages.stage("mapping"):
-            parts = (
-                refine_depth_maps(problem, undistort_cameras(refined, part), options)
-                for part in mapping.reconstructions
-            )
-            return replace(mapping, reconstructions=tuple(parts))
+            parts = refine_reconstructions(refined, problem, mapping.reconstructions, options)
+            return replace(mapping, reconstructions=parts)
 
     def _georeference(self, images: ImageSet, mapping: MappingResult) -> MappingResult:
         """Align reconstructions with GPS positions, if enough images have a position."""

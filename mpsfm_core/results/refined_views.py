@@ -27,6 +27,8 @@ from mpsfm_core.data import (
 from mpsfm_core.geometry import pixel_centers, project, scale_pixels
 from mpsfm_core.geometry.distortion import undistort_rays
 from mpsfm_core.inputs.images import ImageSet, SourceImage
+from mpsfm_core.mapping.depth_map_refinement import refine_depth_maps
+from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 MIN_VALID_WEIGHT = 0.999
@@ -87,11 +89,33 @@ def undistort_cameras(refined: ImageSet, reconstruction: Reconstruction) -> Reco
         refined: Images with the cameras that :func:`undistort_images` estimated.
         reconstruction: One component of the result of the mapper.
     """
-    images = (
-        replace(image, camera=refined[image.index].pinhole) if image.radial else image
-        for image in reconstruction.images
+    images = tuple(take_refined_camera(refined, image) for image in reconstruction.images)
+    return replace(reconstruction, images=images)
+
+
+def take_refined_camera(refined: ImageSet, image: RegisteredImage) -> RegisteredImage:
+    """Replace the camera of an image with estimated distortion by that of its refined view."""
+    return replace(image, camera=refined[image.index].pinhole) if image.radial else image
+
+
+def refine_reconstructions(
+    refined: ImageSet,
+    problem: MappingProblem,
+    reconstructions: Sequence[Reconstruction],
+    options: MapperOptions,
+) -> tuple[Reconstruction, ...]:
+    """Replace cameras by those of the refined views, and refine the depth maps in these views.
+
+    Args:
+        refined: Images with the cameras that :func:`undistort_images` estimated.
+        problem: Mapping problem that :func:`undistort_problem` transferred to the refined views.
+        reconstructions: Components that the mapper reconstructed.
+        options: Options of the mapper.
+    """
+    return tuple(
+        refine_depth_maps(problem, undistort_cameras(refined, part), options)
+        for part in reconstructions
     )
-    return replace(reconstruction, images=tuple(images))
 
 
 def _refined_camera(source: SourceImage, registered: RegisteredImage) -> pycolmap.Camera:
