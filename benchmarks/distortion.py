@@ -30,7 +30,8 @@ from mpsfm_core.inputs.undistortion import resize_camera
 from mpsfm_core.results.colmap_model import write_model
 
 NUM_BISECTIONS = 40
-"""Number of bisections that find the shortest focal length without blank pixels."""
+"""Number of bisection steps in the search for the shortest focal length with which a resampled
+image has no blank pixels."""
 
 
 def main() -> None:

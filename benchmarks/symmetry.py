@@ -5,9 +5,9 @@
 The first table (*placed*) checks images at given poses, with refined depth. The depth check
 compares each view at its true pose with all other views. The depth check also compares each view at
 the corresponding wrong pose in the other room with the views of the other room and of the corridor.
-The second table (*mapped*) runs the whole mapper, with and without the depth check. The registered
-pose of an image is wrong if it is nearer to the corresponding position in the other room than to
-the true position, relative to the first pair.
+The second table (*mapped*) lists results of the whole mapper, with and without the depth check. A
+registered image counts as wrong if it is nearer to the corresponding position in the other room
+than to its true position. Positions are relative to the first pair.
 """
 
 from __future__ import annotations

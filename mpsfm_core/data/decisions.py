@@ -157,9 +157,10 @@ class DoubtReason(ReasonCode):
     FEW_POINTS = ("few-points", "num_images", "min_points")
     """``num_images`` images observe fewer than ``min_points`` 3D points."""
     FEW_EXPLAINED_MATCHES = ("few-explained-matches", "num_images", "min_ratio")
-    """For ``num_images`` images, the model explains a smaller ratio of matches than
+    """Of the matches of ``num_images`` images, the model explains less than the ratio
     ``min_ratio``."""
     GPS_MISFIT = ("gps-misfit", "num_inliers", "num_positions")
+    """Only ``num_inliers`` of ``num_positions`` GPS positions fit the camera centers."""
     UNKNOWN_FOCAL_LENGTH = ("unknown-focal-length", "num_images")
     """``num_images`` images have a guessed focal length that bundle adjustment did not refine."""
 

@@ -111,7 +111,7 @@ def is_plain_rgb(data: bytes) -> bool:
 
 
 def has_alpha(data: bytes) -> bool:
-    """Return whether a PNG or WebP image has an alpha channel."""
+    """Return True if an encoded PNG or WebP image stores transparency in an alpha channel."""
     if data[:8] == b"\x89PNG\r\n\x1a\n":
         return len(data) > 25 and data[25] in (4, 6)
     return data[8:16] == b"WEBPVP8X" and len(data) > 20 and bool(data[20] & 0x10)

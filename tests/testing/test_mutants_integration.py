@@ -298,7 +298,7 @@ def test_matchers(caught: Callable[..., None], factory: type, check: str, messag
 
 
 class UnitOfLateViews(ref.ToldGroup):
-    """Fault: the views of a second chunk of 4 have another unit."""
+    """Fault: the depth of the fifth and later views of a group has another unit."""
 
     def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
         group = super().predict_group(views)

@@ -140,7 +140,7 @@ def _decompress(
 
 
 def _infer_size(count: int, size: tuple[int, int]) -> tuple[int, int]:
-    """Return (width, height) of a map with the aspect ratio of its image and ``count`` pixels."""
+    """Return (width, height) of a depth map of ``count`` values, shaped as an image of ``size``."""
     width = round(float(np.sqrt(count * size[0] / size[1])))
     return width, count // max(width, 1)
 

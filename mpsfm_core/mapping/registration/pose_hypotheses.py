@@ -125,7 +125,7 @@ def sample_focal_lengths(image: MappingImage) -> Float64:
 
 
 class PoseWithFocal(NamedTuple):
-    """Absolute pose of an image, estimated together with the focal length."""
+    """Result of PnP with unknown focal length, which is the pose and the camera of an image."""
 
     pose: Pose
     """``cam_from_world``."""
@@ -230,7 +230,7 @@ class PoseHypothesisGenerator:
     """Generator of pose hypotheses of one image from its correspondences."""
 
     scene: Scene
-    """Scene with the registered images."""
+    """Current reconstruction, in which the other images are already registered."""
     image: int
     """Index of the image to register."""
     correspondences: PoseCorrespondences

@@ -20,7 +20,8 @@ FLAT_CALIBRATION = DepthCalibration(relative_std=0.5)
 """Depth uncertainty of the plane that replaces a missing depth map. The mapper estimates equal
 poses for a relative std from 0.3 to 0.5, and worse poses for 1.0. [tuned: sample scene]"""
 FROM_DEPTH_CALIBRATION = NormalCalibration(std_scale=1.0, std_floor_deg=1.0)
-"""Uncertainty of normals that are fitted to depth maps, whose fit predicts the variance."""
+"""Calibration of normals that are fitted to depth maps. The variance that the fit predicts is kept,
+but the standard deviation is at least 1 degree."""
 
 _LICENSE = "Apache-2.0"
 

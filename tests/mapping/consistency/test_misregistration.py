@@ -83,7 +83,7 @@ def test_unregistered_image_separates_two_images_that_it_matches(
 def test_part_on_one_pair_against_more_matches_of_others_is_split(
     num_supporting: int, is_detected: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A planar pair holds images 3 and 4 in a wrong pose, which several pairs contradict."""
+    """Images 3 and 4 are registered by one planar pair, and several other pairs contradict it."""
     explained = symmetric(5, {(0, 1): 900, (1, 2): 800, (3, 4): 1700, (2, 4): num_supporting})
     contradicting = symmetric(5, {(0, 3): 77, (1, 3): 153, (2, 3): 223, (1, 4): 53})
     detected = detect(explained + contradicting, explained, np.ones(5, np.bool_), monkeypatch)
