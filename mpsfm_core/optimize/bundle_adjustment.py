@@ -16,7 +16,7 @@ optimized individually with fixed cameras.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -82,6 +82,19 @@ class BundleResult:
     cost."""
     message: str
     """Reason why the Levenberg-Marquardt solver stopped."""
+
+
+def start_at(problem: BundleProblem, result: BundleResult) -> BundleProblem:
+    """Return the bundle adjustment problem with the parameters of a result as initial values."""
+    return replace(
+        problem,
+        rotations=result.rotations,
+        translations=result.translations,
+        log_scales=result.log_scales,
+        intrinsics=result.intrinsics,
+        radial=result.radial,
+        points=result.points,
+    )
 
 
 def adjust_bundle(problem: BundleProblem, options: BundleOptions | None = None) -> BundleResult:

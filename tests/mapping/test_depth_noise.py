@@ -106,7 +106,7 @@ def test_too_few_common_points_leave_the_declaration() -> None:
 
 @pytest.mark.parametrize("views", [2, 3])
 def test_noise_is_measured_where_a_prior_is_off(views: int) -> None:
-    """Depth 20 % too far in one spot; around it, and where no points are, the declaration holds."""
+    """The prior is 20 % too far in one spot, and its declared std is right everywhere else."""
 
     def spot(_: np.random.Generator, shape: tuple[int, int]) -> Float64:
         y, x = np.mgrid[: shape[0], : shape[1]] / shape[1]

@@ -1,4 +1,4 @@
-"""What bundle adjustment works beside, and how the scales of priors hold together."""
+"""Bundle adjustment of depth scales: priors on scales, the unit of the world, refined depth."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
 def mapped(declared_depth_std: float, *, nearer: float = 1.0) -> Component:
-    """Three registered images, in metres; the prior of the last one is so many times too near."""
+    """Register three images; the depth prior of the last is too near by the factor ``nearer``."""
     problem = make_mapping_problem(
         room_scene(), CAMERA, arc_poses(3, 14.0), declared_depth_std=declared_depth_std
     )
@@ -64,7 +64,7 @@ def test_a_metric_prior_has_the_scale_of_the_others_where_nothing_else_tells(met
 
 
 def test_a_wrong_scale_is_found_at_once_and_then_stays() -> None:
-    """Depth far better than rays: scales and points estimated in turn would hold each other."""
+    """Scales and points are adjusted together, because depth is far more precise than keypoints."""
     group = mapped(0.001)
     maps, refiner = group.scene.maps, group.refiner
     right = [depth_map.scale for depth_map in maps]
@@ -78,7 +78,7 @@ def test_a_wrong_scale_is_found_at_once_and_then_stays() -> None:
 
 
 def test_the_unit_of_the_world_stays_where_one_scale_is_unlike_the_others() -> None:
-    """What is expected of scales must not pull at all of them: nothing else holds the unit."""
+    """The prior on scales does not change all scales, which would change the unit of the world."""
     group = mapped(0.01, nearer=1.3)
     maps = group.scene.maps
     before = np.array([depth_map.scale for depth_map in maps])

@@ -13,6 +13,7 @@ from mpsfm_core.optimize.bundle_adjustment import (
     BundleProblem,
     BundleResult,
     adjust_bundle,
+    start_at,
 )
 from mpsfm_core.optimize.options import Loss
 from tests.optimize.bundle_reference import (
@@ -71,8 +72,7 @@ def test_same_optimum_as_ceres_with_scales_of_depth(std: float, expected: float 
 
 
 def with_scales(problem: BundleProblem, std: float, expected: float | None) -> BundleProblem:
-    """All scales but the third's are to be found, also of the image whose pose is held; the depth
-    of each image is off by 10 %."""
+    """Return the problem with 10 % depth error per image, and variable scales except the third."""
     count = len(problem.rotations)
     rng = np.random.default_rng(0)
     off = rng.normal(0, 0.1, count)
@@ -87,7 +87,7 @@ def with_scales(problem: BundleProblem, std: float, expected: float | None) -> B
 
 
 def test_scales_of_exact_depth_are_found() -> None:
-    """Beside the first image's, which is held."""
+    """All scales except that of the first image are variable."""
     truth = exact(make_problem(6, 200, 4))
     off = np.array([0.0, 0.1, -0.2, 0.3, 0.0, -0.1])
     wrong = replace(truth, obs_log_depth=truth.obs_log_depth + off[truth.obs_image])
@@ -200,16 +200,7 @@ def test_adjust_bundle_with_radial_distortion_reaches_ceres_optimum(
 
 
 def test_adjust_bundle_with_exact_distorted_observations_recovers_two_cameras() -> None:
-    truth = make_problem(6, 200, 5)
-    truth = replace(
-        truth,
-        intrinsics=np.repeat(truth.intrinsics, 2, axis=0),
-        camera_of_image=np.arange(6) % 2,
-        radial=np.array([-0.1, 0.05]),
-        variable_focal=np.ones(2, dtype=np.bool_),
-        variable_radial=np.ones(2, dtype=np.bool_),
-    )
-    truth = exact(truth)
+    truth = exact(with_two_cameras(make_problem(6, 200, 5)))
     start = replace(
         perturb(truth, 0, 0.5),
         intrinsics=truth.intrinsics * [[1.05, 1.05, 1, 1], [0.97, 0.97, 1, 1]],
@@ -228,6 +219,18 @@ def test_adjust_bundle_with_constant_radial_distortion_keeps_it() -> None:
     np.testing.assert_allclose(result.points, truth.points, atol=1e-5)
 
 
+def with_two_cameras(problem: BundleProblem) -> BundleProblem:
+    """Return the problem with two alternating cameras of unknown focal length and distortion."""
+    return replace(
+        problem,
+        intrinsics=np.repeat(problem.intrinsics, 2, axis=0),
+        camera_of_image=np.arange(len(problem.rotations)) % 2,
+        radial=np.array([-0.1, 0.05]),
+        variable_focal=np.ones(2, dtype=np.bool_),
+        variable_radial=np.ones(2, dtype=np.bool_),
+    )
+
+
 def distorted(problem: BundleProblem, radial: float) -> BundleProblem:
     """The problem with observations of a camera with radial distortion, and the same noise."""
     noise = whitened_residuals(problem, robust=False)[:, :2]
@@ -241,28 +244,14 @@ def test_adjust_bundle_intrinsic_stds_match_the_dense_hessian(
     dense_poses: int, prior_std: float
 ) -> None:
     """The inverse of J^T J by finite differences over poses, points and two cameras."""
-    problem = make_problem(4, 40, 4)
     problem = replace(
-        problem,
-        intrinsics=np.repeat(problem.intrinsics, 2, axis=0),
-        camera_of_image=np.arange(4) % 2,
-        radial=np.array([-0.1, 0.05]),
-        variable_focal=np.ones(2, dtype=np.bool_),
-        variable_radial=np.ones(2, dtype=np.bool_),
+        with_two_cameras(make_problem(4, 40, 4)),
         prior_std_log_focals=prior_std,
         prior_std_radial=prior_std,
     )
     options = TIGHT.model_copy(update={"dense_poses": dense_poses})
     result = adjust_bundle(problem, options)
-    solved = replace(
-        problem,
-        rotations=result.rotations,
-        translations=result.translations,
-        intrinsics=result.intrinsics,
-        radial=result.radial,
-        points=result.points,
-    )
-    information = dense_information(solved)
+    information = dense_information(start_at(problem, result))
     information[-4:, -4:] += np.eye(4) / prior_std**2
     expected = np.sqrt(np.diagonal(np.linalg.inv(information))[-4:])
     np.testing.assert_allclose(result.std_log_focals, expected[:2], rtol=0.01)

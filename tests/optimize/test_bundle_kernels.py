@@ -50,8 +50,7 @@ def small_problem() -> BundleProblem:
 
 
 def moved(p: PreparedBundle, delta: Float64, points: Float64) -> kernels.BundleParameters:
-    """The state moved by a camera-side vector, of which what is held stays, and point displacements
-    (p, 3)."""
+    """Add a step of the variable camera parameters and point displacements (p, 3) to the state."""
     delta = delta.copy()
     delta[: p.held.size][p.held.ravel()] = 0.0
     trial = kernels.BundleParameters(*(array.copy() for array in p.state))

@@ -1,4 +1,4 @@
-"""The multigrid solver: right solutions, a symmetric positive preconditioner, speed that holds."""
+"""The multigrid solver: solutions, symmetric positive preconditioner, and convergence."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -46,7 +46,7 @@ def depth_like_planes(size: int) -> Planes:
 
 
 def heavy_planes(shape: tuple[int, int], seed: int) -> Planes:
-    """Strong couplings cut into strips, a weak mass, and single pixels that are held firmly."""
+    """Return strong, partly cut couplings of pixels, and weak data terms, a few of them strong."""
     rng = np.random.default_rng(seed)
     east, south = 1e5 * np.exp(rng.normal(size=(2, *shape)))
     east[rng.random(shape) < 0.4] *= 1e-20

@@ -18,7 +18,12 @@ from mpsfm_core.data import Bool, Int64, MappingImage
 from mpsfm_core.geometry.focal_length import compute_equivalent_mm, is_plausible_equivalent
 from mpsfm_core.mapping.scene.calibration_outcome import MIN_FOCAL_IMAGES, CalibrationOutcome
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.optimize.bundle_adjustment import BundleProblem, BundleResult, adjust_bundle
+from mpsfm_core.optimize.bundle_adjustment import (
+    BundleProblem,
+    BundleResult,
+    adjust_bundle,
+    start_at,
+)
 from mpsfm_core.optimize.options import BundleOptions
 
 MAX_STD_RATIO = 0.5
@@ -84,7 +89,7 @@ def calibrate_cameras(
             problem = replace(problem, radial=radials)
             focal, radial = focal & ~refuses_focal, radial & may_distort
         elif (may_distort & ~radial).any():
-            problem = _start_at(problem, result)
+            problem = start_at(problem, result)
             radial = may_distort
         else:
             break
@@ -131,19 +136,6 @@ def _decide(
             refuses_radial[row] = outcome != CalibrationOutcome.REFINED
             refuses_focal[row] = False
     return refuses_focal, refuses_radial
-
-
-def _start_at(problem: BundleProblem, result: BundleResult) -> BundleProblem:
-    """Return the bundle adjustment problem with the parameters of a result as initial values."""
-    return replace(
-        problem,
-        rotations=result.rotations,
-        translations=result.translations,
-        log_scales=result.log_scales,
-        intrinsics=result.intrinsics,
-        radial=result.radial,
-        points=result.points,
-    )
 
 
 def decide_focal_outcome(
