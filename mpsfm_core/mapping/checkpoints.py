@@ -56,7 +56,7 @@ class Checkpointer:
         self._store = store
 
     def load(self) -> MapperProgress:
-        """Load the last mapper checkpoint, or return no mapper runs if none is readable."""
+        """Load the mapper runs of the last checkpoint, or no runs without a readable checkpoint."""
         if self._store is not None and (arrays := self._store.load()) is not None:
             try:
                 state = unflatten_state(arrays)

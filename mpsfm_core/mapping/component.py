@@ -237,8 +237,8 @@ class Component:
         Args:
             candidates: (n,) bool mask of the images that may be registered.
             save_checkpoint: Function that is called after each image registration.
-            wide: If an image cannot be registered by the local bundle of its best match, use its
-                best matching images before the acceptance thresholds relax.
+            wide: If the local bundle of the best match cannot register an image, its best matching
+                images are used before the acceptance thresholds relax.
         """
         while self.registration.register_next_image(candidates, wide=wide):
             self.maintenance.refine_if_grown()
@@ -247,11 +247,11 @@ class Component:
     def reregister_images(self, candidates: Bool) -> None:
         """Deregister misregistered images and register them with other reference images.
 
-        The new poses are kept if no image is lost, more matches observe common 3D points, and the
-        images are no longer misregistered. New poses are tried once for each set of misregistered
-        images. If the new poses are not kept, images that one pair connects to the model and
-        several pairs contradict are deregistered. Images with a known pose stay registered, unless
-        the known poses are only initial guesses.
+        The poses of re-registered images are kept if no image is lost, more matches observe common
+        3D points, and the images are no longer misregistered. Each set of misregistered images is
+        re-registered at most once. If re-registration fails, images are deregistered that only one
+        image pair connects to the model and several image pairs contradict. Images with a known
+        pose stay registered, unless the known poses are only initial guesses.
 
         Args:
             candidates: (n,) bool mask of the images that may be registered.
@@ -280,7 +280,7 @@ class Component:
             self._event_log.scene_changed(self.scene)
 
     def _split_off(self, detection: Misregistration) -> None:
-        """Deregister images that one pair connects to the model and several pairs contradict.
+        """Deregister images whose pose one image pair supports and several image pairs contradict.
 
         The deregistered images may form another component.
         """

@@ -1,4 +1,4 @@
-"""Log of a mapper run that forwards events and collects rejection reasons and times."""
+"""Log of a mapper run, which sends progress events and collects rejection reasons and times."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ class EventLog:
         self._events.image_registered(images[image].name, count, len(images))
 
     def scene_changed(self, scene: Scene) -> None:
-        """Forward a change of the scene, which is only copied if a receiver requests the copy."""
+        """Notify the event receiver of a scene change, and copy the scene only on its request."""
         self._events.scene_changed(lambda: capture_scene_state(scene))
 
     def rejected(self, image: int, reason: Reason) -> None:
-        """Record and forward the reason why an image was rejected or deregistered."""
+        """Record why an image was rejected or deregistered, and notify the event receiver."""
         name = self._problem.images[image].name
         self.image_reasons[name] = reason
         self._events.image_rejected(name, reason)
@@ -62,7 +62,7 @@ class EventLog:
             self._counts[step] += 1
 
     def report(self, models: Iterable[Reconstruction]) -> MappingReport:
-        """Return the report of the run, with rejection reasons of images outside ``models``."""
+        """Return the report of the run, with the rejection reasons of images outside ``models``."""
         names = {image.name for model in models for image in model.images}
         reasons = {name: reason for name, reason in self.image_reasons.items() if name not in names}
         return MappingReport(reasons, self._pair_reasons, dict(self._seconds), dict(self._counts))

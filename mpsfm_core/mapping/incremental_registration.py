@@ -44,9 +44,9 @@ class IncrementalRegistration:
         """Register the next image, and relax the thresholds until an image is registered.
 
         Args:
-            candidates: (n,) bool mask of the images that this call may register.
-            wide: If an image cannot be registered by the local bundle of its best match, use its
-                best matching images before the acceptance thresholds relax.
+            candidates: (n,) bool mask of the images that may be registered.
+            wide: If the local bundle of the best match cannot register an image, its best matching
+                images are used before the acceptance thresholds relax.
 
         Returns:
             False if no image can be registered at the most relaxed thresholds.
@@ -142,7 +142,7 @@ class IncrementalRegistration:
     def _estimate_poses(
         self, image: int, references: list[int], correspondences: PoseCorrespondences
     ) -> list[ScoredPose]:
-        """Estimate poses of an image, best first, including the best pose of its last attempt."""
+        """Estimate poses of an image, best first, and add the best pose of the last attempt."""
         options, history = self._options.registration, self._history
         poses = []
         last_pose = history.get_last_pose(image)
@@ -168,7 +168,7 @@ class IncrementalRegistration:
             image: Index of the image to register.
             references: Registered images whose matches determine the pose of the image.
             refine_globally: Refine all registered images before the depth check. Because global
-                refinement is slow, the pose needs a high inlier ratio.
+                refinement is slow, only poses with a high inlier ratio are tried.
 
         Returns:
             None if the image is registered, else the rejection reason of the image, with the scene

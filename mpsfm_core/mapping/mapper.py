@@ -127,8 +127,8 @@ def _apply_refined_focals(
 class Mapper:
     """One run of the mapper with one seed.
 
-    A run continues with identical results from a checkpoint of the attributes between two image
-    registrations.
+    From a checkpoint of the attributes between two image registrations, a mapper run continues with
+    identical results.
 
     Attributes:
         component: The current component.
@@ -210,7 +210,7 @@ class Mapper:
     def reconstruct_components(
         self, save_checkpoint: Callable[[], None] = do_nothing
     ) -> list[Reconstruction]:
-        """Reconstruct components until no image remains or none can be initialized."""
+        """Reconstruct components until no image remains or no component can be initialized."""
         max_components = self.options.max_components
         while self._num_components < max_components:
             if not self.reconstruct_component(save_checkpoint):
@@ -249,7 +249,7 @@ class Mapper:
         return Component(self._weighted_problem, self.options, self._pair_selector, self.event_log)
 
     def _initialize(self) -> bool:
-        """Initialize the component from global poses, or else from an image pair.
+        """Initialize the component from globally averaged poses, or else from an image pair.
 
         If the first global initialization fails, a second one uses match scores reweighted by depth
         checks of image pairs.

@@ -173,8 +173,8 @@ class ModelMaintenance:
 
         Args:
             image: The image.
-            max_violations: Largest share of pixels with contradicting depth, before thresholds
-                relax.
+            max_violations: Largest accepted share of pixels with contradicting depth, before
+                thresholds relax.
 
         Returns:
             None if the depth of the image is consistent, else the rejection reason.
@@ -192,7 +192,7 @@ class ModelMaintenance:
         return ImageReason.CONTRADICTS_IMAGE.because(violation_ratio=ratio, other_image=other)
 
     def confirm(self, image: int) -> None:
-        """Report a verified registration, and allow previously rejected poses again."""
+        """Notify the event receiver of a verified registration, and allow rejected poses again."""
         self.history.clear_pose_rejections()
         self.event_log.registered(image, self.size)
         self.event_log.scene_changed(self.scene)
@@ -225,7 +225,7 @@ class ModelMaintenance:
             self.scene.restore(after)
 
     def _find_conflicts(self, images: Int64, limit: float) -> list[tuple[int, float]]:
-        """Find images to deregister so that no depth contradicts ``images``."""
+        """Find images to deregister so that no depth map contradicts the depth of ``images``."""
         if not self.options.consistency.enabled:
             return []
         with self.event_log.timed("depth check"):

@@ -21,7 +21,7 @@ class InitializationOptions(Options):
 
     global_initialization: bool = expert(True)
     """Initialize from averaged poses of all well connected images, or from an image pair if these
-    poses fail verification. False always initializes from an image pair. [tuned:
+    poses fail verification. False initializes every component from an image pair. [tuned:
     benchmarks.ablation]"""
     max_pairs: int = expert(50, ge=1)
     """Maximum number of initial image pairs to try; raising the number takes longer and may
@@ -44,8 +44,8 @@ class RegistrationOptions(Options):
     """Smallest number of inliers of an image pose; raising it registers fewer, more reliable
     images. [COLMAP abs_pose_min_num_inliers]"""
     min_pose_inlier_ratio: float = expert(0.7, ge=0, le=1)
-    """Smallest share of the 2D-3D matches that are inliers; raising it rejects more wrong poses and
-    more images with repeated structure. [tuned: benchmarks.ablation]"""
+    """Smallest inlier ratio of the 2D-3D matches of an image pose; raising it rejects more wrong
+    poses and more images with repeated structure. [tuned: benchmarks.ablation]"""
     max_error_px: float = expert(12.0, gt=0)
     """Largest reprojection error of an inlier of PnP; raising it accepts less accurate points.
     [COLMAP abs_pose_max_error]"""
@@ -102,8 +102,8 @@ class TriangulationOptions(Options):
     """Largest angular error of an observation in a new image, before refinement.
     [COLMAP tri_create_max_angle_error, tri_continue_max_angle_error]"""
     max_error_px: float = Field(4.0, gt=0)
-    """Largest reprojection error of an observation, times the standard deviation of its keypoint;
-    raising it keeps more, but less accurate points. [COLMAP filter_max_reproj_error]"""
+    """Largest reprojection error of an observation, in standard deviations of the keypoint
+    position; raising it keeps more, but less accurate points. [COLMAP filter_max_reproj_error]"""
 
 
 class RefinementOptions(Options):

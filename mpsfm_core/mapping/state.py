@@ -61,7 +61,7 @@ def unflatten_state(arrays: CheckpointArrays) -> StateDict:
         stored = json.loads(arrays[_TREE].tobytes())
         missing = stored["arrays"] - arrays.keys()
         if missing:
-            raise ValueError(f"the array {min(missing)} is missing")
+            raise ValueError(f"the array {min(missing)} is missing in the checkpoint")
         return dict(_join(stored["state"], "", {name: arrays[name] for name in stored["arrays"]}))
     except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
         raise DataError(
@@ -79,7 +79,7 @@ def _separate(value: Any, path: str, arrays: dict[str, NDArray[Any]]) -> Any:
     if isinstance(value, (list, tuple)):
         return [_separate(item, _child(path, row), arrays) for row, item in enumerate(value)]
     if not isinstance(value, _PLAIN):
-        raise TypeError(f"{path}: {type(value).__name__} is no value of a state")
+        raise TypeError(f"{path}: {type(value).__name__} cannot be stored in a checkpoint")
     return value
 
 

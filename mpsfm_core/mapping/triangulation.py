@@ -1,7 +1,7 @@
 """Triangulation of tracks, and lifting of 3D points from depth maps.
 
-The operations are those of COLMAP's ``IncrementalTriangulator`` (``Continue``, ``Create``,
-``Complete``, ``Merge``), vectorized over the edges of the correspondence graph. If the
+The operations on tracks are those of COLMAP's ``IncrementalTriangulator`` (``Continue``,
+``Create``, ``Complete``, ``Merge``), vectorized over the edges of the correspondence graph. If the
 triangulation angle is low, a point is lifted from the depth map instead (paper section 3.2).
 """
 
@@ -268,7 +268,7 @@ def _max_angle_error_px(scene: Scene, image: int, options: TriangulationOptions)
 def _reprojects(
     scene: Scene, source: Int64, target: Int64, points: Float64, max_error_px: float
 ) -> Bool:
-    """Return a mask (m,) of points that project close to both keypoints of their match."""
+    """Return a mask (m,) of the points that project close to both matched keypoints."""
     valid: Bool = np.asarray(np.isfinite(points).all(axis=1))
     for keypoints in (source, target):
         with np.errstate(invalid="ignore"):

@@ -188,5 +188,5 @@ def test_unflatten_state_restores_values_and_layout() -> None:
 
 
 def test_flatten_state_of_unsupported_value_names_its_path() -> None:
-    with pytest.raises(TypeError, match=r"mapper/locks/1: lock is no value of a state"):
+    with pytest.raises(TypeError, match=r"mapper/locks/1: lock cannot be stored in a checkpoint"):
         flatten_state({"mapper": {"locks": [0, threading.Lock()]}})

@@ -10,8 +10,8 @@ occluded. A contradiction of depth maps has one of two causes, wrong depth or a 
   ``L = E_e[exp(-(e' / s')^2 / 2)]`` over the errors ``e`` of the pixel's log depth, where ``e'`` is
   the log-depth difference between the other surface and the shifted pixel, or 0 if the shifted
   pixel is occluded or outside the other image. At wide angles, an error of depth also shifts the
-  pixel laterally in the other image. The likelihood is the expectation over ``e`` instead of the
-  maximum, because some error nearly always shifts the pixel past a depth edge.
+  pixel laterally in the other image. The likelihood ``L`` is the expectation over the depth error
+  ``e`` instead of the maximum, because some error nearly always shifts the pixel past a depth edge.
 
 * The pose of an image may be wrong. A wrong pose makes the depth that the other image has along the
   pixel's ray independent of the pixel's depth.
@@ -20,13 +20,14 @@ A pixel is a violation if its likelihood ``L`` is below that of a depth error of
 standard deviations. The violation ratio (beta in the paper) is the share of violating pixels,
 summed over both directions.
 
-The depth check needs the standard deviation of depth at each pixel, because a good prior can be
-wrong in one spot. Triangulated points that do not depend on the prior measure this standard
-deviation (:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_local_depth_noise`). If nearby
-points contradict the prior, the standard deviation grows and the pixel is no violation. If no
-nearby points contradict the prior, the standard deviation of the whole scene applies. An image
-registered to a look-alike place observes points only on look-alike structure, so structure that
-differs still causes violations.
+The depth check needs the standard deviation of depth at each pixel, because a good depth prior can
+be wrong in a small region. Triangulated points that do not depend on the depth prior measure the
+standard deviation of the prior
+(:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_local_depth_noise`). If nearby points
+contradict the prior, the standard deviation grows and the pixel is no violation. If no nearby
+points contradict the prior, the standard deviation of the whole scene applies. An image registered
+to a look-alike place observes points only on look-alike structure, so structure that differs still
+causes violations.
 
 The depth of an image is compared with all overlapping images, not only with those that share
 points. Images that share points with a misregistered image look alike, so their depth may agree
@@ -61,8 +62,8 @@ NUM_ERROR_STEPS = 4
 PIXEL_STRIDE = 2
 """Distance in pixels between the compared pixels of the subsampled depth maps. [ours]"""
 MIN_SIGNIFICANCE = 3.0
-"""Number of standard deviations between the violation ratio of a quarter of the pixels and its
-limit, beyond which all other pixels are skipped. [ours]"""
+"""Difference between the violation ratio of a quarter of the pixels and its limit, in standard
+deviations of the ratio, beyond which the other pixels are skipped. [ours]"""
 OVERLAP_GRID = 16
 """Columns and rows of the pixel grid that measures the overlap of two images. [ours]"""
 MIN_OVERLAP_RATIO = 0.05
@@ -71,7 +72,7 @@ MIN_OVERLAP_RATIO = 0.05
 
 
 class DepthViolation(NamedTuple):
-    """Largest depth violation between an image and all other images."""
+    """Largest violation ratio between the depth maps of an image and all other images."""
 
     ratio: float
     """Share of pixels with contradicting depth, summed over both images of the pair, in [0, 2]."""
@@ -162,11 +163,11 @@ class DepthConsistencyCheck:
             b: Another registered image.
             std_factor: See :meth:`check_image`.
             limit: Limit to which the violation ratio is compared. Only a quarter of the pixels is
-                measured if their violation ratio is significantly above or below the limit. A limit
-                of NaN measures all pixels.
+                measured if their violation ratio is significantly above or below the limit. With a
+                limit of NaN, all pixels are measured.
             by_target_area: Weight a violating pixel by its area in the other image, at most 1. The
-                weights reduce the influence of near surfaces, which project to few pixels of the
-                other image, and so demand clearer evidence against registered images.
+                area weights reduce the influence of near surfaces that project to few pixels of the
+                other image, so registered images are deregistered only by clearer evidence.
         """
         scene, options = self._scene, self._options
         rotation = scene.rotations[b] @ scene.rotations[a].T
@@ -310,8 +311,8 @@ class _DepthGrid(NamedTuple):
 class _DepthMapState(NamedTuple):
     """Inputs of a subsampled depth map, by which the cache detects that the map is outdated.
 
-    The points that measure the local standard deviation are not compared, because the depth map is
-    refined whenever these points change.
+    The cache does not compare the points that measure the local depth noise, because the depth map
+    is refined whenever these points change.
     """
 
     refined: RefinedDepth | None
@@ -321,7 +322,7 @@ class _DepthMapState(NamedTuple):
 
 
 class ViolationCriteria(NamedTuple):
-    """Criteria for a pixel to count as a violation."""
+    """Criteria for a pixel to count as a violation of depth consistency."""
 
     max_deviation: float
     """Largest deviation that errors of depth explain, in standard deviations of log depth."""
@@ -348,9 +349,9 @@ def compute_violation_ratio(
         grid_b: Subsampled depth map of the second image.
         rotation: (3, 3) ``b_from_a``.
         translation: (3,) ``b_from_a``.
-        criteria: Criteria for a pixel to be a violation.
-        limit: Limit of the violation ratio. Only a quarter of the pixels is measured if their
-            violation ratio is significantly above or below the limit.
+        criteria: Criteria for a pixel to be a violation of depth consistency.
+        limit: Limit with which the caller compares the violation ratio. Only a quarter of the
+            pixels is measured if their violation ratio is significantly above or below the limit.
     """
     inverse_rotation, counts = rotation.T.copy(), np.zeros((2, 2))
     inverse_translation = -inverse_rotation @ translation

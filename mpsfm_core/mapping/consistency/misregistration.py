@@ -4,12 +4,13 @@ A match is explained if both of its keypoints observe the same 3D point. If hard
 pair of registered images is explained, the matches are wrong or one image is misregistered.
 Misregistered images are detected in three ways.
 
-1. First, an image pair may have more unexplained matches than the maximum flow of explained matches
-between its images. The images on the smaller side of the minimum cut may be misregistered. 2.
-Second, two images may match a third image which cannot be registered, so at most one of the two has
-a correct pose. The matches of both images with the third image count as unexplained matches between
-both images. 3. Third, the unexplained matches of one image may clearly outnumber its explained
-matches, summed over all pairs.
+1. An image pair may have more unexplained matches than the maximum flow of explained matches
+   between both images. The images on the smaller side of the minimum cut may be misregistered.
+2. Two images may match a third image that cannot be registered, so at most one of the two has a
+   correct pose. The matches of both images with the third image count as unexplained matches
+   between both images.
+3. The unexplained matches of one image may clearly outnumber its explained matches, summed over all
+   pairs.
 """
 
 from __future__ import annotations
@@ -30,14 +31,15 @@ from mpsfm_core.mapping.scene.scene import Scene
 
 MAX_EXPLAINED_RATIO = 0.25
 """Share of the matches of a pair whose keypoints observe the same 3D point, up to which the matches
-contradict the poses of both images. Correct poses have a share well above 0.5. [ours]"""
+contradict the poses of both images. If both poses are correct, well over half of the matches
+observe common 3D points. [ours]"""
 MIN_SIGNIFICANCE = 0.5
 """Minimum excess of the matches that contradict the pose of an image over those that support it, in
 standard deviations of the excess for random pairs. [tuned: benchmarks.symmetry]"""
 
 
 class Misregistration(NamedTuple):
-    """Images that may be misregistered together."""
+    """Set of images that may be misregistered together."""
 
     images: tuple[int, ...]
     """Indices of the misregistered images, which are the smaller side of a cut of the match
@@ -48,9 +50,9 @@ class Misregistration(NamedTuple):
     """Number of matches that contradict the poses of the misregistered images, minus number of
     matches that support the poses."""
     splits: bool = False
-    """True if one image pair connects the misregistered images to the model and several pairs
-    contradict this pair. The misregistered images are then deregistered unless other poses are
-    found."""
+    """True if only one image pair connects the misregistered images to the model and several image
+    pairs contradict their poses. In this case, the misregistered images are deregistered if
+    re-registration fails."""
 
 
 class ContradictedCut(NamedTuple):
@@ -67,7 +69,7 @@ class ContradictedCut(NamedTuple):
 
     @property
     def has_one_link(self) -> bool:
-        """True if one image pair supports the poses of its images and several contradict them."""
+        """True if one pair across the cut supports the poses and several pairs contradict them."""
         return self.num_supporting_pairs == 1 and self.num_contradicting_pairs > 1
 
 

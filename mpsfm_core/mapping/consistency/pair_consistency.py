@@ -5,12 +5,12 @@ surroundings of look-alike places differ, so a wrong relative pose puts surfaces
 image sees empty space.
 
 1. The relative pose of each verified pair is checked for depth consistency. If the relative pose of
-   a pair is inconsistent, other pose hypotheses are checked in the order of their support. 2. The
-   matches of a pair are weighted by the support of the best depth-consistent pose, relative to the
-   best supported pose. 3. A pair without a depth-consistent pose may still be correct, if few or
-   bad matches make its relative pose inaccurate. A pair without a depth-consistent pose is removed
-   if consistent pairs connect its images by more matches (maximum flow) and imply another relative
-   rotation.
+   a pair is inconsistent, other pose hypotheses are checked in the order of their support.
+2. The matches of a pair are weighted by the support of the best depth-consistent pose, relative to
+   the best supported pose.
+3. A pair without a depth-consistent pose may still be correct, if few or bad matches make its
+   relative pose inaccurate. A pair without a depth-consistent pose is removed if consistent pairs
+   connect its images by more matches (maximum flow) and imply another relative rotation.
 
 Image pairs with fewer matches than a registration needs are not checked.
 """

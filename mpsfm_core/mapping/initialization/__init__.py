@@ -2,7 +2,7 @@
 
 A component is initialized by the first of three methods that succeeds.
 
-1. Images with known poses are registered, also with those of an earlier reconstruction
+1. Images are registered with known poses, or with poses of an earlier reconstruction
    (``seed_poses``).
 2. All well-connected images are registered by rotation averaging, and linear least squares for
    depth scales and positions, from relative poses with baselines measured by depth

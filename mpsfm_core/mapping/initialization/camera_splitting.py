@@ -26,13 +26,14 @@ from mpsfm_core.mapping.registration.pose_hypotheses import (
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 
 MIN_FOCAL_RATIO = 1.05
-"""Ratio of own and shared focal length from which an image gets its own camera. [ours]"""
+"""Ratio between the focal length of an image and that of its shared camera, from which the image
+gets its own camera. [ours]"""
 MIN_SUPPORT_RATIO = 1.2
 """Ratio of the pose supports (MSAC scores) with own and shared focal length from which an image
 gets its own camera. [ours]"""
 MAX_ERROR_PX = 4.0
 """Largest reprojection error of a match that supports a pose, in standard deviations of the
-keypoint position. A wrong focal length only causes errors of a few pixels. [COLMAP
+keypoint position. A wrong focal length causes reprojection errors of only a few pixels. [COLMAP
 filter_max_reproj_error]"""
 MIN_OTHER_IMAGES = 2
 """Minimum number of other images that observe a point, so that the tested image does not determine
@@ -88,7 +89,7 @@ def find_deviating_focals(
 def split_cameras(
     images: Sequence[MappingImage], own_focals: Mapping[int, float]
 ) -> tuple[MappingImage, ...]:
-    """Return the images, and give images with a deviating focal length their own camera.
+    """Return all images, and assign an own camera to images with a deviating focal length.
 
     Args:
         images: All images of the mapping problem.
@@ -108,7 +109,7 @@ def split_cameras(
 def _collect_correspondences(
     problem: MappingProblem, model: Reconstruction
 ) -> dict[int, tuple[Int64, Int64]]:
-    """Return keypoints (m,) and points (m,) of each image, from matches with registered images."""
+    """Return the 2D-3D matches of each image, as rows of keypoints (m,) and of 3D points (m,)."""
     point_ids = {image.index: image.point_ids for image in model.images}
     num_points = len(model.points)
     num_observers = np.zeros(num_points, dtype=np.int64)

@@ -38,8 +38,8 @@ MIN_ANGLE_DEG = 1.5
 """Smallest triangulation angle of a match that measures the baseline of a pair. [COLMAP
 min_angle]"""
 MIN_MATCHES = 10
-"""Minimum number of matches with a triangulation angle above MIN_ANGLE_DEG of a pair that global
-initialization uses. [ours]"""
+"""Minimum number of matches with a triangulation angle above ``MIN_ANGLE_DEG`` for a pair to be
+used in global initialization. [ours]"""
 MAX_ROTATION_ERROR_DEG = 5.0
 """Maximum angle between the measured and the estimated relative rotation of an image pair.
 [ours]"""

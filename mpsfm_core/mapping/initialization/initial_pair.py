@@ -179,7 +179,7 @@ def refine_initial_pairs(
 def _register_each_reference(
     scene: Scene, pair: VerifiedPair, options: RegistrationOptions
 ) -> Iterator[tuple[int, int, PoseCorrespondences]]:
-    """Yield reference image, second image and 2D-3D correspondences for either reference."""
+    """Yield reference image, second image and 2D-3D matches, with either image as reference."""
     empty = scene.snapshot()
     for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
         register_first_image(scene, reference)
@@ -192,8 +192,8 @@ def scale_verified_pair(
 ) -> InitialPair | None:
     """Scale the pose of a verified pair so that triangulated depth agrees with the prior.
 
-    The scale is the median ratio over the points whose triangulation angle is at least
-    ``high_parallax_deg``.
+    The scale is the median ratio of prior and triangulated depth over the points whose
+    triangulation angle is at least ``high_parallax_deg``.
 
     Returns:
         The scaled pose, or None without a translation or a well triangulated point of known depth.

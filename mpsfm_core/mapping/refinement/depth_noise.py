@@ -31,7 +31,7 @@ declared variance of the depth prior applies. [ours]"""
 MIN_INDEPENDENT = 0.05
 """Minimum share of the variance of depth that is independent between pixels. [ours]"""
 POSE_UNKNOWNS = 6
-"""Degrees of freedom of the pose of one more image."""
+"""Degrees of freedom of the pose of an additional image."""
 MULTIPLIER_RANGE = (0.1, 10.0)
 """Range of the factor between the measured and the declared standard deviation of depth. [ours]"""
 MIN_CONSTRAINED_ANGLE_DEG = 2.0
@@ -69,8 +69,8 @@ class DepthNoise(NamedTuple):
     def loss_factor(self) -> float:
         """Factor on the scale of the depth loss, for residuals in units of the corrected std.
 
-        The loss scale refers to the part of the depth error that is independent between neighbors,
-        because an outlier differs from its neighbors.
+        The scale of the depth loss refers to the part of the depth error that is independent
+        between neighboring pixels, because an outlier differs from its neighbors.
         """
         if self.design_effect == 1.0:
             return 1.0  # depth errors are independent, or were not measured
@@ -125,7 +125,8 @@ def measure_local_depth_noise(
 
     The depth error at a grid node is the median error of the nearest well-constrained points. The
     median error counts as one observation, and ``min_factor`` as a second observation (a unit
-    information prior). A missing nearest point counts as a depth error of ``min_factor``.
+    information prior). If fewer than ``NUM_NEIGHBORS`` points are near the node, each missing point
+    counts as a depth error of ``min_factor``.
 
     Args:
         scene: The scene.

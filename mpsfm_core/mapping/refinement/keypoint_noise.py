@@ -106,7 +106,7 @@ def _sample_matches(scene: Scene) -> tuple[Int64, Int64]:
 
 
 def _propagate_variance(scene: Scene, keypoints: Int64, normals: Float64) -> Float64:
-    """Return the variance (m,) of ``ray . normal`` from the noise of the ray's keypoint."""
+    """Propagate the keypoint noise to the variance (m,) of ``ray . normal``."""
     images = scene.graph.image_of[keypoints]
     local = np.einsum("nij,nj->ni", scene.rotations[images], normals)
     slope = local[:, :2] / scene.intrinsics[images, :2]
@@ -116,7 +116,7 @@ def _propagate_variance(scene: Scene, keypoints: Int64, normals: Float64) -> Flo
 
 @cache
 def _log_norms(scale: float) -> Float64:
-    """Integrate each truncated t distribution by the midpoint rule, and return log integrals."""
+    """Return the log integrals of the truncated t distributions (midpoint rule)."""
     num_steps = 4000
     residuals = (np.arange(num_steps) + 0.5) * MAX_RESIDUAL / num_steps
     log_densities = np.log1p((residuals[:, None] / scale) ** 2) * -(DEGREES_OF_FREEDOM + 1) / 2

@@ -58,7 +58,7 @@ MIN_ANCHOR_ANGLE_DEG = 2.0
 """Smallest triangulation angle of a point that constrains depth integration.
 [reference robust_triangles]"""
 MAX_NOISE_CHANGE = 1.25
-"""Change factor of the measured depth noise above which depth integration is set up again.
+"""Factor by which the measured depth noise must change before depth integration is set up again.
 [ours]"""
 MIN_SCALE_POINTS = 20
 """Smallest number of well triangulated points for which the depth scale shared by several images is
@@ -114,8 +114,8 @@ class Refiner:
 
         Args:
             image: A registered image.
-            others: Images whose mean depth scale is compared with that of a metric prior. Points
-                whose scale differs from the mean scale by more than ``MAX_DEPTH_RATIO`` are
+            others: Images whose mean depth scale is compared with the scale of a metric prior.
+                Points whose scale differs from the mean scale by more than ``MAX_DEPTH_RATIO`` are
                 ignored. If all points are ignored, the image takes the mean scale.
         """
         scene = self.scene
@@ -283,7 +283,7 @@ class Refiner:
     def refine_locally(self, image: int) -> None:
         """Adjust the local bundle of an image and update its tracks until few tracks change.
 
-        Only global refinement refines the depth map of the image again.
+        The depth map of the image is only refined again in global refinement.
         """
         options = self.options
         bundle = find_local_bundle(self.scene, image, options.local_images - 1, self.scores)

@@ -64,8 +64,8 @@ class PoseHypothesis(NamedTuple):
     source: str
     """Name of the method that estimated the pose."""
     focal_px: float | None = None
-    """Focal length ``fx`` that was estimated with the pose, or None for the focal length of the
-    scene."""
+    """Focal length ``fx`` that was estimated with the pose, or None if the pose was estimated with
+    the present focal length."""
 
 
 HypothesisEstimator = Callable[[], PoseHypothesis | None]
@@ -182,7 +182,7 @@ def estimate_pose_with_focal(
         pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=True),
     )
     min_px, max_px = focal_lengths[[0, -1]] * [1 / FOCAL_STEP, FOCAL_STEP]
-    focal_px = float(trial.params[0])  # changed by pose refinement
+    focal_px = float(trial.params[0])  # pose refinement changed the focal length of ``trial``
     if refined is None or not min_px <= focal_px <= max_px:
         return None
     pose = _pose_from_rigid3d(refined["cam_from_world"])

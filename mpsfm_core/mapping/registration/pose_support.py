@@ -42,8 +42,8 @@ class ScoredPose:
     inlier_ratio: float
     """Weighted share of the correspondences that are inliers, in [0, 1]."""
     focal_px: float | None = None
-    """Focal length ``fx`` that was estimated with the pose, or None for the focal length of the
-    scene."""
+    """Focal length ``fx`` that was estimated with the pose, or None if the pose was estimated with
+    the present focal length."""
 
     @property
     def hypothesis(self) -> PoseHypothesis:

@@ -51,7 +51,7 @@ class RegistrationHistory:
         return self._last_attempts[image].pose if image in self._last_attempts else None
 
     def is_exhausted(self, image: int, references: list[int]) -> bool:
-        """Return True if pose estimation from these reference images would repeat the last attempt.
+        """Return True if pose estimation from ``references`` would repeat the last attempt.
 
         The first pose estimations of an image differ, because each estimation draws other random
         halves of the matches.

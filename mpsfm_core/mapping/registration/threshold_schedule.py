@@ -34,7 +34,7 @@ class ThresholdSchedule:
         return self._options.min_pose_inlier_ratio / self._factor
 
     def tighten_violations(self, max_violations: float) -> float:
-        """Return the depth violation limit at the present step for an initial limit."""
+        """Tighten the limit of the depth violation ratio to the present step of the schedule."""
         return max_violations / self._factor
 
     def check_support(self, pose: ScoredPose, *, confident: bool = False) -> Reason | None:

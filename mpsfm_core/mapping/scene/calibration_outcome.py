@@ -5,7 +5,7 @@ from __future__ import annotations
 from enum import IntEnum
 
 MIN_FOCAL_IMAGES = 3
-"""Number of registered images from which guessed intrinsics are refined. [ours]"""
+"""Minimum number of registered images for the refinement of guessed intrinsics. [ours]"""
 
 
 class CalibrationOutcome(IntEnum):

@@ -14,7 +14,7 @@ class DepthMap:
     """Depth of an image in world units, from the refined map or else from the scaled prior.
 
     Attributes:
-        prior: Depth prior of the image, in the unit of the prior.
+        prior: Unscaled depth prior of the image.
         normals: Normal prior.
         camera: Intrinsics in pixels of the depth map.
         scale: Scale of the depth prior, in world units per unit of the prior.

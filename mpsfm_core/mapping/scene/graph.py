@@ -17,7 +17,8 @@ class CorrespondenceGraph:
     each match in both directions, sorted by source, so that the edges of an image are one slice.
 
     Attributes:
-        offsets: (n + 1,) int64 global number of the first keypoint of each image, and the total.
+        offsets: (n + 1,) int64 global number of the first keypoint of each image, and the total
+            number of keypoints.
         num_images: Number of images.
         image_of: (k,) int64 image index of each global keypoint.
         source: (e,) int64 global number of the first keypoint of each match.

@@ -87,8 +87,8 @@ class MetricScale:
     """Estimate of meters per world unit, from the scales of metric depth priors or from GPS."""
 
     metres_per_unit: float
-    """Estimated meters per world unit of the mapper, by which a ``trusted`` scale has scaled the
-    reconstruction."""
+    """Estimated meters per world unit of the mapper, with which the reconstruction was scaled if
+    ``trusted``."""
     spread: float
     """Robust relative standard deviation (1.4826 MAD) of the metric scales estimated by the
     images."""
@@ -119,7 +119,7 @@ class Reconstruction:
         return {image.name: (image.rotation, image.translation) for image in self.images}
 
     def num_multi_view_points(self) -> Int64:
-        """Return the number (n,) of each image's points that at least three images observe."""
+        """Count the points (n,) of each image that at least three images observe."""
         observed = [np.unique(image.point_ids[image.point_ids >= 0]) for image in self.images]
         num_views = np.bincount(np.concatenate([*observed, _NO_ROWS]), minlength=len(self.points))
         return np.array([(num_views[rows] >= 3).sum() for rows in observed], dtype=np.int64)

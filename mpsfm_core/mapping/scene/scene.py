@@ -53,8 +53,8 @@ class Scene:
         translations: (n, 3) float64 translation of ``cam_from_world`` of each image.
         registered: (n,) bool mask of the registered images.
         intrinsics: (n, 4) float64 intrinsics fx, fy, cx, cy of each image in pixels.
-        camera_of: (n,) int64 camera index of each image. Images with the same number and
-            estimated focal length share a camera.
+        camera_of: (n,) int64 camera index of each image. Images with the same camera index share
+            estimated intrinsics.
         focal_outcome: (n,) int64 :class:`CalibrationOutcome` of the camera of each image.
         focal_log_std: (n,) float64 posterior standard deviation of the log focal length of each
             image, NaN without an estimate.
@@ -433,7 +433,7 @@ class Scene:
 
 
 def _depth_groups(problem: MappingProblem) -> Int64:
-    """Number the depth groups, where an image without a group is a group of its own."""
+    """Assign a depth group to each image, where an image without a group gets its own."""
     first_single = len(problem.images)
     numbers: dict[int, int] = {}
     keys = [
@@ -444,7 +444,7 @@ def _depth_groups(problem: MappingProblem) -> Int64:
 
 
 def _shared_cameras(problem: MappingProblem) -> Int64:
-    """Number the cameras; images with equal number share estimated intrinsics."""
+    """Assign a camera index to each image, equal for images that share estimated intrinsics."""
     numbers: dict[object, int] = {}
     keys = [
         number if image.focal_known else image.shared_camera
