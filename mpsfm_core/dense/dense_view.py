@@ -63,7 +63,7 @@ class DenseView(PosedGrid):
     """(h, w) natural log of the input depth in world units; holes are filled from neighboring
     pixels."""
     log_std: Float32
-    """(h, w) std of ``log_depth``; ``UNKNOWN_LOG_STD`` in holes."""
+    """(h, w) std of ``log_depth``, which is ``UNKNOWN_LOG_STD`` in holes."""
 
     @classmethod
     def from_view(cls, image: RegisteredImage, view: View, max_size: int) -> DenseView:
@@ -115,9 +115,9 @@ class DenseView(PosedGrid):
 def resample_known_depth(depth: DepthPrior, width: int, height: int) -> tuple[Float32, Float32]:
     """Resample a depth map and its std of log depth to another resolution.
 
-    Linear interpolation across a depth edge would give a depth on neither surface. The depth of the
-    nearest pixel therefore replaces an interpolated depth next to holes, and if both depths differ
-    by more than the std.
+    Linear interpolation across a depth edge would give a depth on neither surface. Next to holes,
+    and where interpolated and nearest depth differ by more than the std, the resampled depth is
+    that of the nearest pixel.
 
     Args:
         depth: Refined depth map with variance.

@@ -62,7 +62,7 @@ _MAX_COST = 0.9
 _MAX_SPLAT_STDS = 1.5
 """Maximum log depth difference between projected neighbor depth and input depth, in stds [ours].
 
-With a larger difference, the projected depth may belong to another surface behind an edge."""
+If the difference is larger, the projected depth may belong to another surface behind an edge."""
 _MAX_SPLAT_VIEWS = 16
 """Maximum number of neighboring views whose depth is projected into a view; bounds the run time."""
 _NUM_CACHED_NEIGHBORHOODS = 4
@@ -140,8 +140,9 @@ def densify(
             nothing).
         store_array: Thread-safe function that stores large arrays, including the returned depth
             maps.
-        poses_use_depth: True if depth priors constrained the poses. The scale of an image pair may
-            then depend on depth priors alone, so a scale variance is added to the depth variance.
+        poses_use_depth: True if depth priors constrained the poses. With depth priors, the scale of
+            an image pair may depend on the priors alone, so a scale variance is added to the depth
+            variance.
 
     Returns:
         The reconstruction with densified depth maps, and a report on source images and stereo

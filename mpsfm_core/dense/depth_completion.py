@@ -3,8 +3,9 @@
 Two assumptions constrain the depth of a pixel without stereo depth. The first assumption is that
 the ratio of input depth to true depth is smooth and close to 1. The second assumption is that
 surfaces are planar, so that inverse depth is linear in the image. The variances of the smoothness
-and the planarity assumption are estimated at pixels with stereo depth. Both assumptions are linear
-in the ratio of input to true depth, so completion is a sparse linear least-squares problem.
+and the planarity assumption are estimated at pixels with stereo depth. The smoothness and the
+planarity assumption are linear in the ratio of input to true depth, so completion is a sparse
+linear least-squares problem.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ def estimate_planarity(
 ) -> PlanarityPrior:
     """Estimate the weights of the planarity prior from the stereo depth of an image.
 
-    The prior std of second differences is estimated from the stereo depth. If the input depth has
-    an equally large second difference at a pixel, a depth edge is likely and the planarity weight
+    The prior std of second differences is estimated from the stereo depth. If the second difference
+    of input depth at a pixel equals the prior std, a depth edge is likely and the planarity weight
     is halved. Depth edges at the rim of a hole cannot be detected, so the planarity weight at the
     rim is 0. Without stereo depth all planarity weights are 0.
 

@@ -55,8 +55,8 @@ class GeometricConsistency:
     def std_px(self) -> Float32:
         """(h, w) std of the mean of consistent depths, as std of a stereo match in pixels.
 
-        Because the errors of depth maps are correlated, depth differences alone underestimate this
-        std.
+        Because the errors of depth maps are correlated, depth differences alone underestimate the
+        std of the mean.
         """
         views = self.views.astype(np.float32)
         correlation = _ERROR_CORRELATION
@@ -122,7 +122,7 @@ def evaluate_consistency(
 ) -> GeometricConsistency:
     """Merge the depth differences to several views and estimate the std of a match.
 
-    A depth difference contains the errors of two stereo matches.
+    The depth difference of two views contains the errors of two stereo matches.
 
     Args:
         parallax: (h, w) motion in pixels of a point's projection per unit of log depth.

@@ -23,8 +23,8 @@ from mpsfm_core.support.threads import count_cores
 T = TypeVar("T")
 
 _MAX_WORKERS = 4
-"""Default maximum of the option ``runtime.workers``. Each worker loads its own copy of a network,
-so further CPU cores become threads of the workers."""
+"""Maximum number of workers if the option ``runtime.workers`` is not set. Each worker loads its own
+copy of a network, so further CPU cores become threads of the workers."""
 _MAX_URI_LENGTH = 1000
 
 
@@ -68,7 +68,7 @@ class ActiveProvider:
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Names, code hashes, versions, options, seed and file hashes of provider and wrappers."""
+        """Names, code, versions, options, seed and files that identify provider and wrappers."""
         with self._lock:
             if self._identity is None:
                 self._identity = self._identify()
@@ -90,7 +90,7 @@ class ActiveProvider:
 
     @property
     def workers(self) -> int:
-        """Number of threads that run the provider, 1 on a GPU or for an object of the caller."""
+        """Number of threads that run the provider, 1 on a GPU or for a provider object."""
         if isinstance(self.spec.factory, ProviderInstance):
             return 1
         return 1 if _device(self._runtime, self.spec) == "cuda" else worker_count(self._runtime)

@@ -41,7 +41,7 @@ class Cache:
 
     Args:
         folder: Cache folder, default ``$MPSFM_CACHE`` or the platform's user cache. Cache entries
-            are stored in its subfolder ``extraction/``.
+            are stored in the subfolder ``extraction/`` of the cache folder.
     """
 
     def __init__(self, folder: Path | None = None) -> None:

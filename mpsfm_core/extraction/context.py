@@ -76,7 +76,7 @@ class ExtractionContext:
 
         Args:
             stage: Name of the stage, for progress messages.
-            items: Inputs of the calls of ``work``, one per call.
+            items: Items to process, each by one call of ``work``.
             work: Function that computes the result of one item.
             providers: Providers that the stage uses; each provider limits the number of threads.
             local: If true, the stage runs on this machine even if a remote executor is configured.
@@ -110,7 +110,7 @@ class ExtractionContext:
             cls: Data class of the provider result.
             inputs: Plain data that identifies the input of the provider in the cache.
             compute: Function that computes the result with a provider instance.
-            images: Indices of the images that the input shows.
+            images: Indices of the images of the provider input, for which a failure is recorded.
 
         Raises:
             ProviderRunError: the provider failed, or too many images failed.

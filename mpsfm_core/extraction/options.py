@@ -17,7 +17,8 @@ class PairOptions(Options):
     order of the images. The mode ``retrieval`` matches the most similar images by global
     descriptors [reference]. The mode ``auto`` matches the most similar images by a few local
     features (or by the retrieval provider, if configured), and neighbors by numbered file names.
-    The mode ``auto`` then also matches pairs between unconnected components of the match graph."""
+    After verification, the mode ``auto`` also matches pairs between unconnected components of the
+    match graph."""
     partners: int = Field(30, ge=1)
     """Minimum number of images that each image is matched with, in mode ``auto``. A larger value
     finds more pairs of small overlap and takes proportionally longer. [tuned: benchmarks.pairs]"""

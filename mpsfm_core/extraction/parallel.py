@@ -31,7 +31,7 @@ def run_stage(
     Args:
         events: Receiver of progress; called in the calling thread.
         stage: Name of the extraction stage, for progress messages.
-        items: Inputs of the calls of ``work``, one per call.
+        items: Items to process, each by one call of ``work``.
         work: Function that computes the result of one item.
         workers: Number of threads.
         remote: Generator that yields whenever a remote worker has written an item's result to the

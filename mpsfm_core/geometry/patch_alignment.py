@@ -176,7 +176,7 @@ def _bilinear(image: Float32, x: float, y: float) -> float:
 
 @helper()
 def _inside(image: Float32, x: float, y: float, reach_x: float, reach_y: float) -> bool:
-    """Return True if bilinear interpolation is possible in a box around (x, y); False for NaN."""
+    """Return whether bilinear interpolation is possible in a box around (x, y), False for NaN."""
     fits_x = x - reach_x >= 0.0 and x + reach_x < image.shape[1] - 1
     return fits_x and y - reach_y >= 0.0 and y + reach_y < image.shape[0] - 1
 

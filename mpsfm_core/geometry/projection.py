@@ -50,7 +50,7 @@ def scale_pixels(xy: Float64, from_size: tuple[int, int], to_size: tuple[int, in
 
 
 def inside(xy: Float64, size: tuple[int, int]) -> Bool:
-    """Return True for pixels (..., 2) inside a view of size (width, height); False for NaN."""
+    """Return whether pixels (..., 2) are inside a view of size (width, height), False for NaN."""
     x, y = xy[..., 0], xy[..., 1]
     with np.errstate(invalid="ignore"):
         result: Bool = (x >= 0) & (y >= 0) & (x <= size[0]) & (y <= size[1])

@@ -58,7 +58,7 @@ def avif_exif(data: bytes) -> bytes | None:
     try:
         with importlib.import_module("PIL.Image").open(BytesIO(data)) as image:
             block = image.info.get("exif")
-    except Exception:  # decoding the image reports the reason later
+    except Exception:  # the decoder reports the error later
         return None
     return bytes(block).removeprefix(b"Exif\x00\x00") if block else None
 
@@ -68,7 +68,7 @@ def heif_exif(data: bytes) -> bytes | None:
     try:
         opened = importlib.import_module("pillow_heif").open_heif(data)
         block = opened.info.get("exif")
-    except Exception:  # decoding the image reports the reason later
+    except Exception:  # the decoder reports the error later
         return None
     return None if block is None else bytes(block).removeprefix(b"Exif\x00\x00")
 
@@ -76,9 +76,9 @@ def heif_exif(data: bytes) -> bytes | None:
 def _decode_heif(data: bytes, path: Path) -> UInt8:
     library = _library("pillow_heif", "heic", path)
     try:
-        image = library.read_heif(data)  # pillow_heif applies the rotation
+        image = library.read_heif(data)  # pillow_heif applies the EXIF rotation
         pixels = np.asarray(image.to_pillow().convert("RGB"))
-    except Exception as error:  # the decoder documents no exception types
+    except Exception as error:  # pillow_heif documents no exception types
         raise InputError(f"image file {path} cannot be decoded: {error}") from error
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
@@ -93,7 +93,7 @@ def _decode_avif(data: bytes, path: Path) -> UInt8:
         raise InputError(
             f"image {path}: this Pillow does not read AVIF: pip install 'mpsfm-core[avif]'"
         ) from error
-    except Exception as error:  # the decoder documents no exception types
+    except Exception as error:  # Pillow's decoder documents no exception types
         raise InputError(f"image file {path} cannot be decoded: {error}") from error
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
@@ -103,7 +103,7 @@ def _decode_raw(data: bytes, path: Path) -> UInt8:
     try:
         with library.imread(BytesIO(data)) as raw:
             pixels = raw.postprocess(use_camera_wb=True, output_bps=8)
-    except Exception as error:  # the decoder documents no exception types
+    except Exception as error:  # rawpy documents no exception types
         raise InputError(f"image {path} cannot be decoded: {error!r}") from error
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 

@@ -23,8 +23,8 @@ _TENTHS_MM = 200
 def read_subtitles(path: Path) -> list[tuple[float, GpsPosition, float | None]]:
     """Read time in s, GPS position and 35 mm equivalent focal length in mm of each subtitle.
 
-    Subtitles without a GPS position are skipped, and subtitles with latitude and longitude 0, which
-    drones write before the first GPS fix.
+    Subtitles are skipped if they have no GPS position, or latitude and longitude 0, which drones
+    write before the first GPS fix.
 
     Raises:
         OSError: the subtitle file cannot be read.

@@ -56,7 +56,9 @@ class HlocFiles:
         where = f"{self.features.path}, descriptors of {name!r}"
         values = self.features.read(f"{name}/descriptors")[0]
         if values.ndim != 2 or not _finite(values):
-            raise InputError(f"{where}: must be finite and of shape (d, n), not {values.shape}")
+            raise InputError(
+                f"{where}: the array must be finite and of shape (d, n), not {values.shape}"
+            )
         if not self.features.has(f"{name}/scores"):
             return values.T.astype(np.float32), None
         scores = self.features.read(f"{name}/scores")[0].ravel()
@@ -76,7 +78,7 @@ class HlocFiles:
         return int(values[0]), int(values[1])
 
     def pairs(self, names: list[str]) -> Iterator[tuple[str, str, Int64, Float32]]:
-        """Yield both names, keypoint indices (m, 2) and scores (m,) in [0, 1] of each pair."""
+        """Yield image names, keypoint indices (m, 2) and scores (m,) in [0, 1] of each pair."""
         assert self.matches is not None
         written = {name.replace("/", "-"): name for name in names}
         suffix = "/matches0"

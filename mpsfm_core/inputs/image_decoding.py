@@ -48,8 +48,8 @@ def read_bytes(path: Path) -> bytes:
 def check_decodable(data: bytes, path: Path) -> None:
     """Decode an image at 1/8 size; raise :class:`InputError` if it is damaged or not an image."""
     if is_cut_jpeg(data):
-        raise InputError(f"image {path} is cut off: its end is missing. Copy it again")
-    if find_decoder(data, path) is None:  # upright_size decodes other formats in full
+        raise InputError(f"image {path} is cut off: its end is missing. Copy the image file again")
+    if find_decoder(data, path) is None:  # other formats are decoded in ``upright_size``
         decode_stored(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
 
@@ -165,6 +165,7 @@ def decode_stored(data: bytes, path: Path, flags: int = cv2.IMREAD_UNCHANGED) ->
         raise InputError(f"image {path} cannot be decoded: {error.err}") from error
     if pixels is None:
         raise InputError(
-            f"image {path} cannot be decoded: it is damaged or not an image. Replace or remove it"
+            f"image {path} cannot be decoded: it is damaged or not an image. "
+            f"Replace or remove the image file"
         )
     return np.asarray(pixels)

@@ -83,8 +83,8 @@ class SourceImage:
     path: Path
     """Path of the image file."""
     camera: pycolmap.Camera
-    """Camera of the upright original image. Its ``camera_id`` is the number in the intrinsics file,
-    if given, else a running number."""
+    """Camera of the upright original image. The ``camera_id`` of the camera is the number in the
+    intrinsics file, if given, else a running number."""
     pinhole: PinholeCamera
     """Pinhole camera of the undistorted and possibly downscaled image."""
     focal_source: FocalSource
@@ -318,8 +318,8 @@ def load_images(
             the order of the images.
         options: see :class:`InputOptions`.
         model: COLMAP model or ``transforms.json`` of some of the images. Without ``intrinsics`` the
-            images use the cameras of this model. Images that the model does not list use its camera
-            of their size, if there is exactly one.
+            images use the cameras of this model. Images that the model does not list use the camera
+            of the model with their image size, if exactly one camera has this size.
         without: subfolder to skip in the search, such as the output folder.
         names: names of the images to read, instead of ``image_list``; a single image is allowed.
 
@@ -420,7 +420,7 @@ def _given_camera(
         camera = colmap_from_pinhole(camera)
     if camera is not None and (camera.width, camera.height) != size:
         raise InputError(
-            f"image {name!r} has {size[0]}x{size[1]} pixels, its camera "
+            f"image {name!r} has {size[0]}x{size[1]} pixels, but its camera is for "
             f"{camera.width}x{camera.height}"
         )
     found: pycolmap.Camera | None = camera

@@ -35,7 +35,8 @@ _MIN_FOCAL_RATIO, _MAX_FOCAL_RATIO = 0.1, 10.0
 _CENTRAL = (0.8, 1.25)
 """Plausible ratios of principal point to image center, per axis."""
 _SAME_SCALE = 0.1
-"""Maximum relative difference of the x and y ratios of a camera for another image size."""
+"""Maximum relative difference between the x and y ratios of principal point to image center, if the
+camera is for an image of another size."""
 
 
 @dataclass(frozen=True)

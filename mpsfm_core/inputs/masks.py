@@ -125,10 +125,11 @@ def orient_masks(
 ) -> tuple[dict[str, MaskFile], dict[str, str]]:
     """Determine the orientation of masks, and find entirely black masks.
 
-    A mask fits its image before or after EXIF rotation. If the mask size fits only one of the two
-    orientations, the size decides. Masks that fit both orientations follow the majority of the
-    masks whose size decides, or count as not rotated if there is no majority [COLMAP mask_path]. An
-    EXIF orientation in the mask file has precedence over the mask size and the majority.
+    A mask fits its image before or after EXIF rotation. If the size of a mask fits only one of the
+    two orientations, the mask has this orientation. Masks that fit both orientations follow the
+    majority of the masks that fit only one orientation, or count as not rotated without a majority
+    [COLMAP mask_path]. An EXIF orientation in the mask file has precedence over the mask size and
+    the majority.
 
     Args:
         masks: paths of mask files by image name.

@@ -99,7 +99,8 @@ def features_from_hloc(
         descriptors, scores = files.descriptors(stored)
         if len(descriptors) != len(keypoints):
             raise InputError(
-                f"{path}, {stored!r}: {len(keypoints)} keypoints, {len(descriptors)} descriptors"
+                f"{path}: image {stored!r} has {len(keypoints)} keypoints, but "
+                f"{len(descriptors)} descriptors"
             )
         xy = image.view_pixels(_upright(str(path), image, keypoints, files.size(stored)))
         row = np.flatnonzero(np.isfinite(xy).all(axis=1) & inside(xy, image.pinhole.size))
@@ -188,5 +189,6 @@ def _upright(
     if size == (width, height):
         return keypoints
     raise InputError(
-        f"{source}: image {image.name!r} has {size[0]}x{size[1]} pixels, the photo {width}x{height}"
+        f"{source}: image {image.name!r} has {size[0]}x{size[1]} pixels, but the photo "
+        f"{width}x{height}"
     )

@@ -108,8 +108,9 @@ def orient_model(
     """Convert a COLMAP model from stored pixels to upright images if necessary.
 
     The pose of an image belongs to stored pixels if its camera has the size before EXIF rotation.
-    If the size fits both orientations, the colors of the 3D points decide, then the majority of the
-    other images. If nothing decides, the pose belongs to stored pixels [COLMAP].
+    If the camera size fits the image before and after EXIF rotation, the colors of the 3D points
+    decide, then the majority of the other images. If neither colors nor a majority decide, the pose
+    belongs to stored pixels [COLMAP].
 
     Args:
         model: COLMAP model of stored or upright images.

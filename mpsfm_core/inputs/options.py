@@ -15,8 +15,8 @@ class VideoOptions(Options):
     """Options of the selection of video frames as images."""
 
     motion: float = expert(0.08, gt=0, lt=1)
-    """Median motion of tracked points between selected frames over the image diagonal. Larger
-    motion selects fewer frames [3 to 5 degrees of rotation of a phone]."""
+    """Median motion of tracked points between selected frames, relative to the image diagonal.
+    Larger motion selects fewer frames [3 to 5 degrees of rotation of a phone]."""
     overlap: float = expert(0.7, gt=0, lt=1)
     """Share of still tracked points below which the next frame is selected. A larger share of
     tracked points selects more frames."""
@@ -48,7 +48,7 @@ class InputOptions(Options):
     majority of masks whose size fits only one orientation, or ``stored`` if there is no such mask
     [COLMAP, which ignores EXIF orientation]."""
     camera_per: Literal["auto", "image", "folder", "set"] = "auto"
-    """Which images without given intrinsics share a camera [COLMAP single_camera,
+    """Criterion by which images without given intrinsics share a camera [COLMAP single_camera,
     single_camera_per_folder, single_camera_per_image]. With ``image``, each image has its own
     camera. With ``folder`` or ``set``, all images of one size in a folder or in the whole set share
     a camera. With ``auto``, images of one size share a camera if EXIF names the same camera, lens

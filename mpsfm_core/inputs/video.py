@@ -164,13 +164,13 @@ class _Chooser:
             return
         way = self._track.follow(frame.gray, self.options)
         if way < _EARLY_RATIO:
-            self._candidates.clear()  # the camera is again at the selected frame
+            self._candidates.clear()  # the camera is back at the last selected frame
             if (
                 len(self.chosen) == 1
                 and frame.sharpness > self._track.sharpness
                 and way < _EARLY_RATIO / 2
             ):
-                self.chosen.clear()  # replace the first frame by a sharper one
+                self.chosen.clear()  # replace the first frame by a sharper frame
                 self._take(frame)
             return
         self._candidates.append((way, frame))
@@ -178,7 +178,7 @@ class _Chooser:
             self._take_sharpest()
 
     def finish(self) -> list[int]:
-        """Select from the remaining candidates; return the numbers of all selected frames."""
+        """Select from the remaining candidate frames; return the numbers of all selected frames."""
         while self._candidates:
             self._take_sharpest()
         return self.chosen
@@ -283,7 +283,7 @@ def _digest(video: Path) -> str:
 
 
 def _read_list(path: Path) -> object:
-    """Read from ``frames.json`` which video and options the frames have, None if unreadable."""
+    """Read the source video and options of the frames in ``frames.json``, None if unreadable."""
     try:
         origin = json.loads(path.read_text(encoding="utf-8"))
         check_version(origin, FORMAT, path)

@@ -102,9 +102,8 @@ def adjust_bundle(problem: BundleProblem, options: BundleOptions | None = None) 
 
     As in COLMAP, an observation whose point is behind the camera, or more than 89.9999 degrees off
     the optical axis, has residual 0. An observation where radial distortion folds the image over
-    also has residual 0. If a solver step makes the residual of an observation 0 in this way, the
-    observation keeps its previous cost. The adjusted parameters do not depend on the number of
-    threads, bit for bit.
+    also has residual 0. If a solver step makes an observation invisible, the observation keeps its
+    previous cost. The adjusted parameters do not depend on the number of threads, bit for bit.
 
     Args:
         problem: Initial parameters and observations of bundle adjustment, which stay unchanged.
@@ -217,7 +216,7 @@ class SchurComplementSolver:
 
     @staticmethod
     def _intrinsic_slots(layout: kernels.ParameterLayout) -> NDArray[np.int32]:
-        """Return the indices (2k,) of focal lengths and radial distortions in the camera system."""
+        """Return the indices (2k,) of the intrinsic parameters in the reduced camera system."""
         return np.concatenate([layout.focal_slot, layout.radial_slot])
 
     def _prior_cost(self, state: kernels.BundleParameters) -> float:
@@ -347,7 +346,8 @@ class SchurComplementSolver:
             return boost
         matrix = np.zeros((len(boost), len(boost)))
         kernels.assemble_reduced_matrix(self.total, boost, self.p.bundle.layout.pair, matrix)
-        # LAPACK does not copy the transposed matrix, because it has Fortran's memory order.
+        # LAPACK does not copy the transposed matrix, because the transpose has Fortran's memory
+        # order.
         _, solution, info = lapack.dposv(matrix.T, rhs, lower=0, overwrite_a=1)
         return solution if info == 0 else np.full_like(boost, np.nan)
 

@@ -32,8 +32,8 @@ Int32 = NDArray[np.int32]
 MIN_DEPTH = 1e-9
 """Minimum depth of a point that projects into an image. [COLMAP: machine epsilon]"""
 MAX_SLOPE = 1e6
-"""Maximum slope of a ray of a point that projects into an image, which keeps all derivatives
-finite. [ours]"""
+"""Maximum slope ``(|x| + |y|) / z`` of the ray of a point that projects into an image, which keeps
+all derivatives finite. [ours]"""
 MIN_DEPTH_RATIO = 0.1
 """Minimum ratio of a point's depths after and before a step. The linearized log depth would
 otherwise move distant points behind the camera. [ours]"""
@@ -51,8 +51,8 @@ MIN_RADIAL_SLOPE = 0.1
 """Smallest derivative ``1 + 3 k r^2`` of the distorted radius at a point that projects into an
 image. Radial distortion folds the image over where the derivative is 0. [ours]"""
 NUM_IMAGE_PARAMS, NUM_INTRINSIC_PARAMS = np.int64(7), np.int64(1)
-"""Number of parameters of an image (pose and log scale of its depth map), and of one intrinsic
-parameter."""
+"""Number of parameters per pose slot (pose and log scale of the depth map), and per intrinsic
+slot."""
 LOG_SCALE_IDX = 6
 """Index of the depth map's log scale among the 7 parameters of an image."""
 _ONLY = np.int64(0)
@@ -655,7 +655,7 @@ def _eliminate_from_intrinsics(
     system: ReducedCameraSystem,
     scratch: EliminationBuffers,
 ) -> None:
-    """Subtract a point's Schur complement from the blocks of the observing intrinsics."""
+    """Subtract a point's Schur complement from the blocks of its cameras' intrinsic parameters."""
     intrinsics, yf, slots, y = scratch.intrinsics, scratch.yf, scratch.slots, scratch.y
     for f in range(num_intrinsics):
         y0, y1, y2 = yf[f, 0, 0], yf[f, 1, 0], yf[f, 2, 0]

@@ -130,7 +130,7 @@ class FocalPrior(NamedTuple):
     """(s,) inverse variance of the prior on each log focal length."""
 
     def residuals(self, state: kernels.BundleParameters) -> Float64:
-        """Return the residuals (s,), log focal lengths minus their prior means."""
+        """Return the residuals (s,) of the prior: log focal lengths minus their prior means."""
         residuals: Float64 = np.log(state.intrinsics[self.camera, 0]) - self.log_focal
         return residuals
 
@@ -151,7 +151,7 @@ class RadialPrior(NamedTuple):
     """(s,) inverse variance of the prior on each radial distortion."""
 
     def residuals(self, state: kernels.BundleParameters) -> Float64:
-        """Return the residuals (s,), which equal the radial distortions."""
+        """Return the residuals (s,) of the zero-mean prior, which equal the radial distortions."""
         residuals: Float64 = state.radial[self.camera]
         return residuals
 

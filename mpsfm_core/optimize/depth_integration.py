@@ -53,7 +53,8 @@ POINT_MAX_RATIO = 1.5
 """Maximum ratio between the depth of a triangulated point and the scaled prior for which the point
 is used. [reference]"""
 _FIXED_WEIGHT = 1e15
-"""Weight of a known pixel depth in the linear system, far above other coefficients (1e12)."""
+"""Weight in the linear system that fixes pixels of known depth, far above other coefficients
+(1e12)."""
 
 
 class Anchors(NamedTuple):
@@ -87,7 +88,8 @@ class RefinedDepth:
     scale: float
     """Scale of the depth prior during the refinement."""
     initial_energy: float
-    """Energy of the initial depth map for the same anchors."""
+    """Energy of the depth map before refinement, with the anchors (sparse points) of the
+    refinement."""
     energy: float
     """Energy of the refined depth map, at most ``initial_energy``."""
     point_energy: float
@@ -129,7 +131,7 @@ class DepthIntegrator:
     """Depth integration of one image, for changing anchors and depth scales.
 
     Pixels with a normal but without depth are integrated from neighboring pixels. Several threads
-    may use one instance, because instances are immutable.
+    may use one integrator, because integrators are immutable.
 
     Args:
         depth: Depth prior with variance, at the resolution of ``camera``.
@@ -193,7 +195,7 @@ class DepthIntegrator:
         Args:
             anchors: Triangulated points.
             scale: Scale factor on the depth prior.
-            start: Earlier refined depth of this instance, which is rescaled and used as initial
+            start: Earlier refined depth of this integrator, which is rescaled and used as initial
                 depth map. The earlier depth map is returned unrefined if the anchors fit about as
                 well as before. With None, the refinement starts from the scaled prior.
         """

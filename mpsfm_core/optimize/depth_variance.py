@@ -4,9 +4,9 @@ The algorithm is selected inversion by nested dissection (George, 1973). The ope
 matrix with a five-point stencil on the pixel grid. Separator lines halve the grid until small
 blocks remain. Block elimination proceeds bottom-up, from the small blocks to the separators. Each
 elimination leaves a dense Schur complement on the boundary of the eliminated part. A top-down pass
-then computes the entries of the inverse on these boundaries. Grid parts of equal size are processed
-together as stacked dense matrices. Selected inversion for n pixels takes O(n^1.5) operations and
-O(n log n) memory.
+then computes the entries of the inverse matrix on the boundaries of grid parts. Grid parts of equal
+size are processed together as stacked dense matrices. Selected inversion for n pixels takes
+O(n^1.5) operations and O(n log n) memory.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class _Group(NamedTuple):
     outer: list[_Pixel]
     """Boundary pixels around the grid part, relative to the top left pixel of the part."""
     children: list[_Child]
-    """Two halves of each grid part, or no halves."""
+    """First and second halves of the grid parts, empty for parts that are not divided."""
 
 
 class _Elimination(NamedTuple):

@@ -38,7 +38,7 @@ _TINY = 1e-30
 _PLANES, _FIRST_WEIGHTS = 19, 11
 """Number of arrays per multigrid level, and index of the first array of interpolation weights."""
 _Squares = tuple[float, ...]
-"""Six couplings and four masses between the four corner pixels of a coarse grid cell."""
+"""Couplings (6) and masses (4) of the four corner pixels of a coarse grid cell."""
 _Corners = tuple[float, float, float, float]
 _NO_SQUARES: _Squares = (0.0,) * 10
 

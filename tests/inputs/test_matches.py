@@ -166,7 +166,7 @@ def test_matches_of_photos_of_another_size_are_refused(
     features, matches = write_hloc(tmp_path, seen)
     with h5py.File(features, "a") as file:
         file[NAMES[1]]["image_size"][...] = (320, 240)
-    with pytest.raises(InputError, match="320x240 pixels, the photo 160x120"):
+    with pytest.raises(InputError, match="320x240 pixels, but the photo 160x120"):
         matches_from_hloc(features, matches, images)
 
 

@@ -187,7 +187,7 @@ def test_damaged_photos_are_left_out(tmp_path: Path, caplog) -> None:
     (tmp_path / "test.JPG").write_bytes(b"no image")
     images = load(photos)
     assert images.names == ["b.jpg", "c.jpg", "d.jpg"]
-    assert set(images.left_out) == {"a.jpg", "test.JPG"} and "Copy it again" in caplog.text
+    assert set(images.left_out) == {"a.jpg", "test.JPG"} and "Copy the image" in caplog.text
 
 
 def test_bands_of_16_bits_next_to_photos_are_photos(tmp_path: Path) -> None:

@@ -257,7 +257,7 @@ def adjust_keypoints(
 ) -> list[AdjustedKeypoints]:
     """Move the keypoints of all images to fit the patch alignments of all pairs.
 
-    The detected keypoint position has a Gaussian prior.
+    A Gaussian prior keeps each keypoint near its detected position.
 
     Args:
         keypoints: (n, 2) keypoints of each image, pixels.

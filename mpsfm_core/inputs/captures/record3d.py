@@ -82,7 +82,7 @@ def _frames(path: Path, read: _Read) -> Iterator[CapturedFrame]:
     if not poses[:, 4:].any():
         raise InputError(
             f"{path}: the capture has no poses, because only videos of the LiDAR camera have "
-            f"poses; reconstruct the folder of its images without them"
+            f"poses; reconstruct the folder of its images without poses"
         )
     for number, (pose, frame_params) in enumerate(zip(poses, params, strict=True)):
         image = read(f"rgbd/{number}.jpg")
