@@ -41,7 +41,7 @@ def start_browser(width: int = 1280, height: int = 800) -> Iterator[Any]:
     options.binary_location = chromium
     for argument in _ARGUMENTS:
         options.add_argument(argument)
-    options.page_load_strategy = "none"  # the benchmarks wait until the page is drawn
+    options.page_load_strategy = "none"  # benchmarks wait for the page's content
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     browser = webdriver.Chrome(options=options, service=webdriver.ChromeService(driver))
     browser.command_executor.client_config.timeout = 600  # seconds

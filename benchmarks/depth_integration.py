@@ -251,7 +251,7 @@ def bench_scaling(repeats: int) -> dict[str, Any]:
 def bench_accuracy(
     problems: list[Problem], options: IntegrationOptions | None = None
 ) -> dict[str, float] | None:
-    """Compute mean depth errors before and after depth integration; None without problems."""
+    """Compute mean depth errors before and after depth integration, or None without problems."""
     if not problems:
         return None
     rows = []

@@ -6,7 +6,7 @@ The scenes are the synthetic halls of :mod:`benchmarks.everyday`, with calibrate
 prior maps as large as those of photos. The time of a step includes all called functions. The
 paper's times of global and local steps are summed. The paper's times are of ETH3D on the authors'
 machine, so compare the growth with the number of images. All scenes run in one process, from few to
-many images, so the peak memory listed for a scene is that scene's.
+many images, so the largest scene so far determines the peak memory.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mpsfm_core.pipeline.stages import peak_memory_mb
 from mpsfm_core.testing.synthetic.halls import CALIBRATED_PRIORS, make_hall_problem
 
 MAP_WIDTH = 387
-"""Width of the prior maps (``extraction.integration_size``)."""
+"""Width of the prior maps in pixels (``extraction.integration_size``)."""
 WHOLE = "mapping"
 
 

@@ -138,8 +138,8 @@ def measure(models: Sequence[pycolmap.Reconstruction], folder: Path) -> dict[str
     """Measure registered images, pose AUC, rotation, focal and distortion errors, GPS residual.
 
     Args:
-        models: Models of one photo set, largest first; only the largest model is evaluated. folder:
-            Folder of the photo set.
+        models: Models of one photo set, largest first; only the largest model is evaluated.
+        folder: Folder of the photo set.
     """
     names = sorted(path.name for path in (folder / "images").iterdir())
     row: dict[str, Any] = {

@@ -7,7 +7,7 @@ compares each view at its true pose with all other views. The depth check also c
 the corresponding wrong pose in the other room with the views of the other room and of the corridor.
 The second table (*mapped*) lists results of the whole mapper, with and without the depth check. A
 registered image counts as wrong if it is nearer to the corresponding position in the other room
-than to its true position. Positions are relative to the first pair.
+than to its true position. Positions are relative to an image of the initial pair.
 """
 
 from __future__ import annotations

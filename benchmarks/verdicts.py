@@ -135,7 +135,7 @@ def edit_photos(
         scene: Scene folder with the original photos.
         edit: Function that edits each photo.
         stems: Names of the edited photos without suffix, or None for all photos.
-        same_photo: Edit only the first photo, once for each photo.
+        same_photo: Replace each photo by the first photo of the scene before editing.
         with_copies: Add a brightened copy of each photo to the photo set.
     """
 
@@ -160,7 +160,7 @@ def edit_photos(
 
 
 def crop(image: UInt8, zoom: float, shift: float = 0.0) -> UInt8:
-    """Enlarge an image about a point at a distance from the image center, a share of the size."""
+    """Crop and enlarge an image about a point off its center by ``shift`` times half the size."""
     height, width = image.shape[:2]
     center = np.array([width / 2, height / 2]) * (1 + shift)
     matrix = np.column_stack([zoom * np.eye(2), np.array([width / 2, height / 2]) - zoom * center])

@@ -39,7 +39,7 @@ class TrajectoryErrors:
     rotations_deg: Float64
     """(n,) orientation errors after the best common rotation.
 
-    The orientations alone determine this rotation, so collinear camera centers cause no error."""
+    Only orientations determine the common rotation, so collinear camera centers cause no error."""
     steps: Float64
     """(n - 1,) translation errors of the relative poses of successive images."""
     step_turns_deg: Float64
@@ -88,8 +88,8 @@ def trajectory_errors(
     """Compute the trajectory errors of the images with estimated and true pose.
 
     Returns:
-        The trajectory errors, or None if fewer than three images are common or camera centers
-        coincide.
+        The trajectory errors, or None if fewer than three images have both poses, or if camera
+        centers coincide.
     """
     names = [name for name in truth if name in estimated]
     if len(names) < 3:

@@ -149,7 +149,7 @@ class PreparedSets(NamedTuple):
     """Registry of plugins."""
 
     def build_problem(self, image_set: EvaluationSet) -> MappingProblem:
-        """Build the mapping problem of a test set; only pairs within the set adjust keypoints."""
+        """Build the mapping problem of a test set, whose pairs determine keypoint adjustment."""
         names, images = set(image_set.images), self.problem.images
         inside = [
             pair
@@ -188,7 +188,8 @@ def prepare_sets(
     loaded = resolve_providers(loaded, registry, stages).config
     image_list = work / "images.txt"
     write_file(image_list, "\n".join(names) + "\n")
-    # The option makes an unreadable image an error, because no image may be skipped.
+    # The option ``inputs.strict`` makes an unreadable image an error, because no image may be
+    # skipped.
     inputs = loaded.inputs.model_copy(update={"strict": True})
     images = load_images(scene.images, scene.intrinsics, image_list, inputs)
     no_adjustment = loaded.adjustment.model_copy(update={"enabled": False})
@@ -273,7 +274,7 @@ class _SceneRuns:
         except InputError:
             return None
         if record is None or record.key != key or record.error:
-            return None  # Failed runs are repeated, because memory may have been short.
+            return None  # A failed run is repeated, because memory may have been short.
         return record
 
     def _build_record(

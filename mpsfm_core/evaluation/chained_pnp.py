@@ -36,7 +36,7 @@ def estimate_chained_poses(problem: MappingProblem, seed: int = 0) -> list[dict[
         Poses ``cam_from_world`` by image name of each component, the largest first.
     """
     options = RegistrationOptions()
-    # Without poses, the 3D points of each depth map are in the camera frame.
+    # The scene has no poses, so the 3D points of each depth map are in its camera frame.
     scene = Scene(problem)
     for depth_map in scene.maps:
         depth_map.set_scale(1.0)

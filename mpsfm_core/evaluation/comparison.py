@@ -66,7 +66,7 @@ def read_benchmark(place: str) -> dict[str, list[BenchmarkRecord]]:
 
     Args:
         place: ``DIR`` for all records of a benchmark, ``DIR:CONFIG`` for one configuration, or
-            ``DIR:METHOD`` for one method, with key ``*`` in the result.
+            ``DIR:METHOD`` for one method, whose key in the returned dictionary is ``*``.
 
     Raises:
         InputError: The folder has no benchmark records, or no such configuration or method.

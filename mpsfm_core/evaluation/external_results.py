@@ -24,7 +24,7 @@ def read_external_records(
     """Convert the models of another program to one benchmark record for each test set.
 
     Without a model, all images of a test set are unregistered. The recorded run times are 0,
-    because they are unknown.
+    because the run times of the other program are unknown.
 
     Args:
         label: Label of the other program in the records.

@@ -1,8 +1,8 @@
 """Two-view and three-view overlap from true depth or from a COLMAP model [paper, appendix].
 
-The two-view overlap is the ratio of a view's pixels that are visible in the second view, and the
-minimum of both directions. The three-view overlap is the ratio of a view's pixels that are visible
-in both remaining views, and the maximum over the three views.
+The two-view overlap is the share of a view's pixels that are visible in the other view; the smaller
+share of both views counts. The three-view overlap is the share of a view's pixels that are visible
+in both other views; the largest share of the three views counts.
 
 A pixel with true depth is visible in another view if the pixel projects into that view with
 consistent depth. With a COLMAP model, the observed points of a view replace the pixels.
@@ -28,8 +28,8 @@ from mpsfm_core.geometry import (
 )
 
 DEPTH_TOLERANCE = 0.05
-"""Maximum relative difference between the depth of a projected pixel and the depth map that sees
-it."""
+"""Maximum relative difference between the depth of a pixel projected into another view and the
+depth map of that view."""
 _GRID_COLUMNS = 96
 """Number of columns of the pixel grid on which depth maps are compared."""
 _ONES: UInt8 = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1).sum(

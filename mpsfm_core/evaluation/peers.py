@@ -23,7 +23,7 @@ from mpsfm_core.support.threads import thread_limit
 Models = Mapping[int, pycolmap.Reconstruction]
 
 _TUNED_ANGLE_DEG = 0.001
-"""Minimum triangulation angle of the tuned baselines, for low parallax [paper, baselines]."""
+"""Minimum triangulation angle of COLMAP tuned for low parallax, in degrees [paper, baselines]."""
 
 
 def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path], Models]:

@@ -34,7 +34,7 @@ _MILLIMETER = 0.001
 
 
 def parse_error_seed(quality: str) -> int | None:
-    """Parse the random seed N of a prior quality ``degraded-N``; None for other qualities."""
+    """Return the random seed N of a prior quality ``degraded-N``, or None for other qualities."""
     match = re.fullmatch(r"degraded(?:-(\d+))?", quality)
     return int(match[1] or 0) if match else None
 

@@ -35,8 +35,8 @@ def evaluate_depth(output: Path, truth: Path, photos: Path | None = None) -> dic
     Args:
         output: Result folder.
         truth: Folder of true depth maps as 16-bit PNG files in millimeters, named like the images.
-        photos: Folder of the photos. If given, true depth maps of EXIF-rotated photos are rotated
-            upright like the results.
+        photos: Folder of the photos. If the photo folder is given, true depth maps of EXIF-rotated
+            photos are rotated upright.
 
     Returns:
         Means over images: Depth accuracy without scaling (``raw``, only for results in meters) and

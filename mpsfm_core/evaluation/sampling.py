@@ -7,7 +7,7 @@ added. Test sets of a bucket differ by at least two images. The sampling is dete
 same image overlap and random seed.
 
 In contrast to the paper, all triplets of a set in the bucket ``minimal`` satisfy the overlap limit.
-The paper adds images of higher overlap to these sets, to span a whole scene.
+The paper adds images of higher overlap to the sets of ``minimal``, to span a whole scene.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ for index, (image, camera) in enumerate(photos(job)):
     rgb = (rgb - torch.tensor(_MEAN).view(3, 1, 1)) / torch.tensor(_STD).view(3, 1, 1)
     intrins = torch.eye(3)[None]
     intrins[:, 0, 0], intrins[:, 1, 1] = camera["fx"], camera["fy"]
-    intrins[:, 0, 2] = camera["cx"] - 0.5 + left  # DSINE's first pixel center is at 0
+    intrins[:, 0, 2] = camera["cx"] - 0.5 + left  # DSINE: center of the first pixel at 0
     intrins[:, 1, 2] = camera["cy"] - 0.5 + top
     with torch.inference_mode():
         found = model(rgb, intrins)[0, :, top : top + height, left : left + width]

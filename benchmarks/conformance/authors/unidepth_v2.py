@@ -18,8 +18,8 @@ model.resolution_level = 9
 model.shape_constraints |= {"pixels_min": 0, "pixels_max": SIZE[0] * SIZE[1]}
 mean, std = (torch.tensor(v)[:, None, None] for v in (IMAGENET_DATASET_MEAN, IMAGENET_DATASET_STD))
 for index, (image, camera) in enumerate(photos(job)):
-    # UniDepth's exported ONNX file has a fixed input size. UniDepth's infer() pads the photo to its
-    # own size, so the photo is placed in the center of an image of the size of the file.
+    # The exported ONNX file has a fixed input size, but UniDepth's function ``infer`` chooses a
+    # size for each photo. Therefore the photo is padded to the input size of the ONNX file first.
     height, width = image.shape[:2]
     scale = min(SIZE[0] / height, SIZE[1] / width)
     h, w = round(height * scale), round(width * scale)

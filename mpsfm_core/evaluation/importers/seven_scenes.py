@@ -3,7 +3,7 @@
 The source is a scene (``chess/`` with ``seq-01/``, ...) or one sequence. A frame has
 ``frame-000000.color.png``, ``.depth.png`` (millimeters, 65535 and 0 unknown) and ``.pose.txt`` (4 x
 4 ``world_from_cam``, meters). The authors of 7-Scenes treat depth and color as one camera with a
-focal length of 585 pixels; the actual offset is a few pixels.
+focal length of 585 pixels; the actual offset between depth and color images is a few pixels.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 The source is a folder with the images, or with the images in ``images/``. The ground truth is a
 COLMAP model in ``sparse/0``, whose points determine image overlap as in the paper, or the
-trajectory log ``NAME_COLMAP_SfM.log``. The log has a line of three numbers and the 4 x 4 matrix
-``world_from_cam`` for each image in the order of names. The log has no intrinsics, so the importer
-assumes a typical focal length; a COLMAP model is more accurate.
+trajectory log ``NAME_COLMAP_SfM.log``. The trajectory log has a line of three numbers and the 4 x 4
+matrix ``world_from_cam`` for each image in the order of names. The trajectory log has no
+intrinsics, so the importer assumes a typical focal length; a COLMAP model is more accurate.
 """
 
 from __future__ import annotations

@@ -12,6 +12,6 @@ from mpsfm_core.testing import ContractSetup
 
 
 def setup(folder: Path) -> ContractSetup:
-    """Write a network with the compact network's tensors that decodes depth from image colors."""
+    """Write a test network with the tensors of ``compact`` that decodes depth from image colors."""
     model = stand_in(describe(CompactOptions()), folder)
     return ContractSetup(options={"weights": str(model)}, truth_source="painted")

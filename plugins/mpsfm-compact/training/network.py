@@ -64,7 +64,7 @@ class CompactNetwork(nn.Module):
         for skip, out in zip(reversed(_SKIPS), _DECODER, strict=True):
             self.decoder.append(_Up(channels, _STAGES[skip][1], out))
             channels = out
-        self.decoder[-1].mix = nn.Identity()  # decoder stage at half the image size: no mixing
+        self.decoder[-1].mix = nn.Identity()  # no convolution at half the image size
         self.head = nn.Sequential(_ConvNorm(channels, channels, 3), nn.Conv2d(channels, 7, 1))
         self.register_buffer("start", torch.tensor([0.9, -1.5, 0.0, 0.0, -1.0, -1.2, 2.0]))
 

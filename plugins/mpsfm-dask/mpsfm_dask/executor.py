@@ -30,7 +30,7 @@ class DaskOptions(Options):
 
 
 class DaskExecutor:
-    """Executor that sends an extraction step to each Dask worker once, then its items as tasks."""
+    """Executor that sends an extraction step, then its images or pairs, to the Dask workers."""
 
     def __init__(self, options: Mapping[str, Any]) -> None:
         """Connect to the Dask scheduler, or start workers on this machine.

@@ -100,7 +100,7 @@ def network_of(name: str) -> Any:
 def as_published(network: Any) -> torch.nn.Module:
     """Return the Depth Anything 3 network with the tensor names of its published weights.
 
-    The weights files store a tensor that several network parts share only once.
+    If several parts of the network share a tensor, the weights file contains the tensor only once.
     """
     return torch.nn.ModuleDict({"model": network})
 

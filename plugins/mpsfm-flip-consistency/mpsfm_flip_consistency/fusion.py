@@ -4,7 +4,7 @@ The covariance of depth or normals is the unbiased sample covariance of the two 
 sample covariance of two predictions is the sum of the outer products of their deviations from the
 mean. If the network predicts a variance, the fused variance is the maximum of predicted and sample
 variance. The errors of the predictions for an image and its mirror are correlated, so the variance
-is not halved for the mean of both.
+of the mean prediction is not halved.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from mpsfm_kornia.lightglue import LIGHTGLUE_256
 
 
 def not_symmetric(folder: Path) -> ContractSetup:
-    """Test a published detector that finds few of its keypoints again in a rotated view."""
+    """Return a contract test setup for detectors that are not invariant to rotation."""
     reason = "the detector is not invariant to a rotation by 180 degrees"
     return ContractSetup(expected_failures={"features-pixel-convention": reason})
 

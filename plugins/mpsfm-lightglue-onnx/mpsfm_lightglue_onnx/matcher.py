@@ -21,7 +21,7 @@ class LightGlue:
     The inputs ``kpts0`` and ``kpts1`` (1, n, 2) are normalized keypoints, and ``desc0`` and
     ``desc1`` (1, n, d) are descriptors. The outputs ``matches0`` and ``mscores0`` are either
     matches (m, 2) and their scores (m,), or index and score (1, n) for every keypoint of the first
-    view. In the second form, ``matches0`` is -1 for keypoints without a match.
+    view. An index of -1 in ``matches0`` marks a keypoint without a match.
     """
 
     def __init__(self, options: LightGlueOptions, context: ProviderContext) -> None:

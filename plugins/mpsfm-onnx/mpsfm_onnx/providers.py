@@ -25,7 +25,8 @@ class DescribedDepth:
     """Provider of depth, with the variance that the network predicts, if any.
 
     Args:
-        weights: Path or URI of the ONNX file. None selects the file that the description names.
+        weights: Path or URI of the ONNX file. None selects the ONNX file that the network
+            description names.
         sha256: Expected SHA-256 hash of the file ``weights``.
     """
 
@@ -69,7 +70,8 @@ class DescribedNormals:
     """Provider of normals, with the variance that the network predicts, if any.
 
     Args:
-        weights: Path or URI of the ONNX file. None selects the file that the description names.
+        weights: Path or URI of the ONNX file. None selects the ONNX file that the network
+            description names.
         sha256: Expected SHA-256 hash of the file ``weights``.
     """
 
@@ -168,7 +170,7 @@ def _factor(rule: DepthOutput, answer: NetworkOutput, camera: PinholeCamera) -> 
         sides = zip(answer.canvas.image, camera.size, strict=True)
         scale = max(
             resized_side / side for resized_side, side in sides
-        )  # rounding changes the scale of the other side
+        )  # the shorter side is rounded to whole pixels
         factor *= (camera.fx + camera.fy) / 2 * scale / rule.canonical_focal
     if rule.assumed_focal is not None:
         factor *= resized.fx / answer.numbers[rule.assumed_focal]

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 
 
 def save_model(text: str, path: Path, **arrays: ArrayLike) -> Path:
-    """Write an ONNX model from ONNX's text syntax, with arrays for names that the text lacks.
+    """Write an ONNX model from ONNX's text syntax, with the constant tensors ``arrays``.
 
     For example, call ``save_model("tiny (float[1,3,h,w] image) => (float[1,1,h,w] depth) {...}",
-    path, weight=w)``. Arrays keep their dtype, except that float64 becomes float32.
+    path, weight=w)``. The constant tensors keep their dtype, except that float64 becomes float32.
     """
     model = onnx.parser.parse_model(f'<ir_version: 8, opset_import: ["" : 17]> {text}')
     for name, values in arrays.items():

@@ -28,7 +28,7 @@ class RayOptions(Options):
 
 
 class RayExecutor:
-    """Executor that stores an extraction step in Ray's object store, and runs items as tasks."""
+    """Executor that runs an extraction step on images or pairs as Ray tasks."""
 
     def __init__(self, options: Mapping[str, Any]) -> None:
         """Connect to the Ray cluster, or start workers on this machine.

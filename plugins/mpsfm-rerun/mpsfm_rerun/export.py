@@ -30,6 +30,6 @@ def write(source: ExportSource, folder: Path) -> None:
 
 
 def _with_depth(source: ExportSource, image: PosedImage) -> PosedImage:
-    """Add the refined depth map of an image, and the camera of the depth map."""
+    """Add the refined depth map of an image and the camera of the depth map to a recording."""
     maps = source.maps(image.name)
     return image if maps is None else replace(image, camera=maps.camera, depth=maps.depth)

@@ -56,9 +56,9 @@ class WarpNetwork(ABC):
 
         Returns:
             The warp (h, w, 4), its certainty (h, w), and True if the warp is symmetric. The warp
-            has positions ``x_a, y_a, x_b, y_b`` in [-1, 1], where the first two are on a regular
-            grid. A symmetric warp also has the warp of the second view in its right half, where the
-            last two are on a regular grid.
+            has positions ``x_a, y_a, x_b, y_b`` in [-1, 1], where ``x_a, y_a`` are on a regular
+            grid. A symmetric warp also has the warp of the second view in its right half, where
+            ``x_b, y_b`` are on a regular grid.
         """
 
     def warps(self, view_a: View, view_b: View) -> tuple[Warp, Warp | None]:

@@ -33,7 +33,7 @@ class SimpleSky:
         above = np.intersect1d(large[large > 0], labels[0])
         core = np.isin(labels, above).astype(np.uint8)
         inner = cv2.dilate(core, kernel, iterations=2) & likely
-        sky = cv2.dilate(inner, kernel)  # sky pixels at the skyline exceed ``roughness``
+        sky = cv2.dilate(inner, kernel)  # adds the skyline, where brightness changes
         keep: Bool = resize_map(sky, *view.camera.size) <= 0.5
         return keep
 

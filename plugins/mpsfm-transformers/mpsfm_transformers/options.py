@@ -23,8 +23,8 @@ METRIC = DepthCalibration(std_scale=1.0, relative_std=0.079)
 DEPTH_PRO = DepthCalibration(std_scale=1.0, relative_std=0.0875)
 """Variance calibration of Depth Pro. [reference]"""
 RELATIVE = DepthCalibration(std_scale=1.0, relative_std=0.16, shift_space="disparity")
-"""Variance calibration of models that predict depth of unknown scale and shift. The depth std is
-twice that of metric models because of the unknown shift.
+"""Variance calibration of models that predict depth of unknown scale and shift. The depth std of
+models with unknown shift is assumed to be twice that of metric models.
 """
 
 
@@ -191,7 +191,8 @@ class DinoOptions(HubOptions):
 
     model: str = "facebook/dinov2-small"
     resize: int = Field(336, ge=32)
-    """Longer side of the network input in pixels. The whole image is used, not only its center."""
+    """Longer side of the network input in pixels. The network input shows the whole image, not only
+    its center."""
 
 
 def hub_files(options: HubOptions) -> tuple[WeightsFile, ...]:

@@ -44,7 +44,7 @@ def provide_imports(matcher: Any) -> AbstractContextManager[Any]:
 
 
 def get_inner_network(matcher: Any, name: str, *attributes: str) -> Any:
-    """Return the network inside a vismatch matcher, the first of ``attributes`` that exists."""
+    """Return the network inside a vismatch matcher: its first attribute in ``attributes``."""
     for attribute in attributes:
         if hasattr(matcher, attribute):
             return getattr(matcher, attribute)

@@ -41,7 +41,7 @@ def vismatch_roma(folder: Path) -> ContractSetup:
 
 
 def vismatch_roma_sparse(folder: Path) -> ContractSetup:
-    """Return a patch matcher with RoMa's warp that accepts keypoints within 3 pixels of it."""
+    """Return a patch matcher with RoMa's warp for keypoints within 3 pixels of the warp."""
     return ContractSetup(
         options={"network": f"{_STAND_IN}:Warping", "snap_px": 3.0, "min_certainty": 0.5},
         truth_source="image",

@@ -21,8 +21,8 @@ from mpsfm_vismatch.options import RomaNetwork
 class TorchWarpNetwork(WarpNetwork):
     """RoMa network in torch, called by the authors' function ``match``.
 
-    The function ``match`` resizes the images and runs both passes. The images are written to files,
-    because RoMa opens them again for the second pass.
+    RoMa's function ``match`` resizes the images and runs both passes of the network. The images are
+    written to files, because RoMa opens them again for the second pass.
     """
 
     def __init__(self, options: RomaNetwork, context: ProviderContext) -> None:
