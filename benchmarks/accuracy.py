@@ -75,11 +75,11 @@ COMPARISONS: Mapping[str, Comparison] = {
     "rendered_kitchen": Comparison(
         "rendered_kitchen",
         priors=(*PRIORS, *DEGRADED[1:]),
-        note=f"Degraded depth: errors of {SEEDS} seeds, each counted as a set.",
+        note=f"Degraded depth has errors of {SEEDS} seeds, and each seed counts as a test set.",
     ),
     "hololens_room": Comparison(
         "hololens_room",
-        note="`minimal` depends on the device pose of one pair (device_poses.md).",
+        note="The bucket `minimal` depends on the device pose of one pair (device_poses.md).",
     ),
     "hololens_room-low_parallax": Comparison("hololens_room", low_parallax=True),
     "hololens_room-aliked": Comparison(
@@ -90,7 +90,7 @@ COMPARISONS: Mapping[str, Comparison] = {
         ("minimal", "leq5", "leq10", "all"),
         ("sensor", "config"),
         UNCONFIRMED,
-        note="With `mapping.register_tentatively`: images that cannot be verified are registered "
+        note="With `mapping.register_tentatively`, images that cannot be verified are registered "
         "with the pose that explains most of their matches.",
         ours_only=True,
     ),
@@ -100,8 +100,8 @@ COMPARISONS: Mapping[str, Comparison] = {
             buckets,
             ("config",),
             depth=COMPACT,
-            note="Depth and normals of `compact`. FastDepth on the same matches: rows "
-            f"`ours-config` of accuracy-{scene}.md.",
+            note="The mapper uses depth and normals of the network `compact`. FastDepth on the "
+            f"same matches is in the rows `ours-config` of accuracy-{scene}.md.",
             ours_only=True,
         )
         for scene, buckets in NETWORK_BUCKETS.items()

@@ -73,8 +73,8 @@ def main() -> None:
         lines.append(f"| {bucket} | {len(each)} | {start} | {percent(area)} | {share:.0%} |")
     parts = [
         f"# Bounds set by matches and depth on {SCENE}",
-        f"Degraded depth, {len(DEGRADED)} seeds: our mapper, and our mapper initialized with the "
-        "true poses. "
+        "The table compares our mapper with our mapper initialized with the true poses, on "
+        f"degraded depth of {len(DEGRADED)} random seeds. "
         f"Pose AUC in percent, convention `{CONVENTION.name}`: {CONVENTION.description}.",
         "\n".join(lines),
     ]

@@ -234,9 +234,9 @@ def _tables(
     yield "# Accuracy of depth and normal priors"
     yield ""
     yield (
-        "`python -m benchmarks.priors`. AbsRel and delta < 1.25 are after scaling each image by "
-        "the ratio of the medians (truth / prediction). AUSE is the area between the "
-        "sparsification curve and the ideal curve, lower is better."
+        "`python -m benchmarks.priors`. AbsRel and delta < 1.25 are computed after scaling each "
+        "depth map by the ratio of the medians (truth / prediction). AUSE is the area between the "
+        "sparsification curve and the ideal curve; a lower AUSE is better."
     )
     yield ""
     columns = (

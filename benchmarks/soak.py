@@ -173,9 +173,9 @@ def report(folder: Path, alone: Life, lives: list[Life], arguments: argparse.Nam
         f"--workers {arguments.workers}`: {arguments.photos} photos, killed "
         f"{len(lives) - 1} times. CPU seconds include child processes.",
         "",
-        f"* Without kills: {alone.seconds:.0f} s. Killed and resumed: {total:.0f} s, "
-        f"**{total / alone.seconds:.2f} times** as much.",
-        f"* Result: {len(expected)} files, {verdict}. Leftover files: "
+        f"* The undisturbed reconstruction takes {alone.seconds:.0f} s, and the killed and resumed "
+        f"one {total:.0f} s, **{total / alone.seconds:.2f} times** as much.",
+        f"* The result has {len(expected)} files, {verdict}. Leftover files: "
         f"{', '.join(leftovers) or 'none'}.",
         "",
         "| process | CPU s | killed | mapping resumed from |",

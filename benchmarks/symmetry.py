@@ -137,7 +137,7 @@ def main() -> None:
     parser.add_argument("--placed-only", action="store_true")
     parser.add_argument("--output", type=Path)
     arguments = parser.parse_args()
-    lines = ["Placed:", "", HEADER]
+    lines = ["Depth check at given poses:", "", HEADER]
     for name, errors in PRIORS.items():
         cases = [make_twin_room_problem(seed, errors=errors) for seed in range(arguments.seeds)]
         rows = [row for case in cases for row in placed(case)]
@@ -145,7 +145,7 @@ def main() -> None:
         lines.append(f"| {name} | {shares([row[:2] for row in rows])} | {milliseconds:.1f} |")
     if not arguments.placed_only:
         convention = CONVENTIONS["paper"]
-        lines += ["", f"Mapped; pose AUC in percent, convention `{convention.name}`:"]
+        lines += ["", f"Results of the whole mapper; pose AUC in percent, convention `{convention.name}`:"]
         lines += [f"{convention.description}.", "", HEADER_MAPPED]
         for name, errors in PRIORS.items():
             cases = [make_twin_room_problem(seed, errors=errors) for seed in range(arguments.seeds)]

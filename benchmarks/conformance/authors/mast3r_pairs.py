@@ -34,7 +34,8 @@ _SIZE = 256  # MASt3R's descriptor matching takes minutes for larger images on a
 def answers(model: Any, first: Any, second: Any) -> dict[str, Any]:
     """Compute the depth of two views, each in its camera frame, and the matches of both passes."""
     with torch.inference_mode():
-        # MASt3R predicts view 1 in frame 1, view 2 in frame 1, view 2 in frame 2, view 1 in frame 2.
+        # The predictions of MASt3R are view 1 in frame 1, view 2 in frame 1, view 2 in frame 2,
+        # and view 1 in frame 2.
         predictions = symmetric_inference(model, first, second, "cpu")
     features, certainties = (
         [view[key][0] for view in predictions] for key in ("desc", "desc_conf")
