@@ -34,7 +34,7 @@ def main() -> None:
     arguments = parser.parse_args()
     parts = [
         "# Mapping time",
-        "The tables list wall time and CPU time of mapping in seconds (number of registered images).",
+        "Tables list wall time and CPU time of mapping in seconds (number of registered images).",
     ]
     for name in arguments.scenes:
         scene, output = shared_folder() / "data" / name, arguments.output / "mapping_time" / name

@@ -145,7 +145,7 @@ def main() -> None:
         lines.append(f"| {name} | {shares([row[:2] for row in rows])} | {milliseconds:.1f} |")
     if not arguments.placed_only:
         convention = CONVENTIONS["paper"]
-        lines += ["", f"Results of the whole mapper; pose AUC in percent, convention `{convention.name}`:"]
+        lines += ["", f"Whole mapper; pose AUC in percent, convention `{convention.name}`:"]
         lines += [f"{convention.description}.", "", HEADER_MAPPED]
         for name, errors in PRIORS.items():
             cases = [make_twin_room_problem(seed, errors=errors) for seed in range(arguments.seeds)]
