@@ -22,6 +22,7 @@ from mpsfm_core.data.decisions import ImageReason, Value
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.extraction.report import ExtractionReport
 from mpsfm_core.inputs.images import ImageSet, SourceImage
+from mpsfm_core.mapping.scene.estimated_intrinsics import IntrinsicParameter
 from mpsfm_core.mapping.scene.reconstruction import (
     MappingResult,
     Reconstruction,
@@ -237,15 +238,15 @@ def _describe_camera(
     focal_px = photos.original_camera(registered).mean_focal_length()
     if focal_px != described["focal_length_px"]:
         described["refined_focal_length_px"] = focal_px
-    if registered.focal_log_std is not None:
-        described["focal_length_std_px"] = focal_px * registered.focal_log_std
-    if registered.focal_reason is not None:
-        described["focal_length_reason"] = registered.focal_reason.to_json()
-    if registered.radial_std is not None:
-        described["radial_distortion"] = registered.radial
-        described["radial_distortion_std"] = registered.radial_std
-    if registered.radial_reason is not None:
-        described["radial_distortion_reason"] = registered.radial_reason.to_json()
+    for parameter, calibrated in registered.calibration.items():
+        name = parameter.name.lower()
+        if calibrated.std is not None and parameter == IntrinsicParameter.FOCAL_LENGTH:
+            described["focal_length_std_px"] = focal_px * calibrated.std
+        elif calibrated.std is not None:
+            described[name] = registered.radial
+            described[f"{name}_std"] = calibrated.std
+        if calibrated.reason is not None:
+            described[f"{name}_reason"] = calibrated.reason.to_json()
     return described
 
 

@@ -15,7 +15,12 @@ from mpsfm_core.geometry import pixel_centers, project, sample_nearest, scale_pi
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.undistortion import undistort_camera
-from mpsfm_core.mapping.scene.reconstruction import MappingResult
+from mpsfm_core.mapping.scene.estimated_intrinsics import (
+    CalibrationOutcome,
+    IntrinsicEstimate,
+    IntrinsicParameter,
+)
+from mpsfm_core.mapping.scene.reconstruction import CalibratedParameter, MappingResult
 from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.refined_views import (
     undistort_cameras,
@@ -52,13 +57,15 @@ def mapped(solved, images: ImageSet) -> tuple[MappingProblem, MappingResult]:
     pinhole = replace(images[0].pinhole, fx=FOCAL_PX, fy=FOCAL_PX)
     views = [replace(i, camera=images[0].pinhole, focal_known=False) for i in solved.problem.images]
     registered = []
+    estimate = IntrinsicEstimate(CalibrationOutcome.REFINED, RADIAL, 0.01)
+    calibration = {IntrinsicParameter.RADIAL_DISTORTION: CalibratedParameter(estimate)}
     for image in solved.best.images:
         seen = image.point_ids >= 0
         local = transform(image.rotation, image.translation, solved.best.points)
         keypoints = solved.problem.images[image.index].keypoints.copy()
         keypoints[seen] = TRUE.img_from_cam(local[image.point_ids[seen]])
         views[image.index] = replace(views[image.index], keypoints=keypoints)
-        registered.append(replace(image, camera=pinhole, radial=RADIAL, radial_std=0.01))
+        registered.append(replace(image, camera=pinhole, radial=RADIAL, calibration=calibration))
     model = replace(solved.best, images=tuple(registered))
     return replace(solved.problem, images=tuple(views)), MappingResult(
         (model,), solved.result.report

@@ -14,6 +14,7 @@ from mpsfm_core.mapping.initialization.camera_splitting import (
     split_cameras,
 )
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.scene.estimated_intrinsics import IntrinsicParameter
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 
 MIN_FOCAL_CHANGE = 1.1
@@ -64,8 +65,7 @@ def _apply_shared_focals(
     cameras = {
         problem.images[image.index].shared_camera: image.camera
         for image in model.images
-        if image.focal_log_std is not None
-        and image.focal_reason is None
+        if image.calibration[IntrinsicParameter.FOCAL_LENGTH].is_refined
         and abs(np.log(image.camera.fx / problem.images[image.index].camera.fx))
         >= np.log(MIN_FOCAL_CHANGE)
     }

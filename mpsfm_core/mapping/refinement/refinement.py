@@ -18,7 +18,7 @@ from mpsfm_core.mapping.refinement.depth_noise import DepthNoise, measure_depth_
 from mpsfm_core.mapping.refinement.filtering import filter_points
 from mpsfm_core.mapping.refinement.keypoint_noise import measure_loss_scale
 from mpsfm_core.mapping.refinement.self_calibration import calibrate_cameras, has_guessed_camera
-from mpsfm_core.mapping.scene.calibration_outcome import MIN_FOCAL_IMAGES
+from mpsfm_core.mapping.scene.estimated_intrinsics import MIN_FOCAL_IMAGES
 from mpsfm_core.mapping.scene.local_bundle import find_local_bundle
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import StateDict

@@ -16,7 +16,12 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Int64, MappingImage
 from mpsfm_core.geometry.focal_length import compute_equivalent_mm, is_plausible_equivalent
-from mpsfm_core.mapping.scene.calibration_outcome import MIN_FOCAL_IMAGES, CalibrationOutcome
+from mpsfm_core.mapping.scene.estimated_intrinsics import (
+    MIN_FOCAL_IMAGES,
+    CalibrationOutcome,
+    IntrinsicEstimate,
+    IntrinsicParameter,
+)
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.optimize.bundle_adjustment import (
     BundleProblem,
@@ -72,7 +77,8 @@ def calibrate_cameras(
     focal = has_guessed_camera(scene, representatives)
     num_images = np.bincount(problem.camera_of_image, minlength=len(images))
     may_distort = focal & refine_distortion & (num_images >= MIN_FOCAL_IMAGES)
-    radial = may_distort & (scene.focal_outcome[representatives] == CalibrationOutcome.REFINED)
+    is_refined = scene.estimated_intrinsics.is_refined(IntrinsicParameter.FOCAL_LENGTH)
+    radial = may_distort & is_refined[representatives]
     problem = replace(
         problem,
         prior_log_focals=np.log([image.focal_prior_px for image in images]),
@@ -95,8 +101,7 @@ def calibrate_cameras(
             break
     for row, image in enumerate(map(int, representatives)):
         if focal[row]:
-            scene.set_shared_focal(image, *map(float, result.intrinsics[row, :2]))
-            scene.set_shared_radial(image, float(result.radial[row]))
+            scene.set_shared_intrinsics(image, result.intrinsics[row, :2], result.radial[row])
     return result
 
 
@@ -119,52 +124,44 @@ def _decide(
     refuses_focal, refuses_radial = np.zeros((2, len(images)), dtype=np.bool_)
     for row in map(int, np.flatnonzero(problem.variable_focal)):
         image, focal_px = images[row], float(result.intrinsics[row, 0])
-        # the posterior variance is at most the prior variance, also if the reduced camera system is
-        # singular
-        std = min(float(result.std_log_focals[row]), image.focal_log_std)
-        equivalent_mm = compute_equivalent_mm(focal_px, *image.camera.size)
-        outcome = decide_focal_outcome(equivalent_mm, std, image.focal_log_std)
-        scene.set_focal_outcome(int(representatives[row]), outcome, std, focal_px)
-        refuses_focal[row] = outcome != CalibrationOutcome.REFINED
+        sharing = scene.shares_camera(int(representatives[row]))
+        focal = judge_estimate(
+            focal_px,
+            float(result.std_log_focals[row]),
+            image.focal_log_std,
+            is_plausible_equivalent(compute_equivalent_mm(focal_px, *image.camera.size)),
+        )
+        scene.estimated_intrinsics.set(sharing, IntrinsicParameter.FOCAL_LENGTH, focal)
+        refuses_focal[row] = focal.outcome != CalibrationOutcome.REFINED
         if problem.variable_radial[row]:
-            radial = float(result.radial[row])
-            radial_std = min(float(result.std_radial[row]), RADIAL_PRIOR_STD)
-            outcome = decide_radial_outcome(radial, radial_std)
+            value = float(result.radial[row])
+            std = float(result.std_radial[row])
+            radial = judge_estimate(value, std, RADIAL_PRIOR_STD, abs(value) <= MAX_RADIAL)
             if refuses_focal[row]:
-                outcome = CalibrationOutcome.NOT_OBSERVABLE
-            scene.set_radial_outcome(int(representatives[row]), outcome, radial_std, radial)
-            refuses_radial[row] = outcome != CalibrationOutcome.REFINED
+                radial = radial._replace(outcome=CalibrationOutcome.NOT_OBSERVABLE)
+            scene.estimated_intrinsics.set(sharing, IntrinsicParameter.RADIAL_DISTORTION, radial)
+            refuses_radial[row] = radial.outcome != CalibrationOutcome.REFINED
             refuses_focal[row] = False
     return refuses_focal, refuses_radial
 
 
-def decide_focal_outcome(
-    equivalent_mm: float, posterior_std: float, prior_std: float
-) -> CalibrationOutcome:
-    """Decide whether a camera takes its estimated focal length.
+def judge_estimate(
+    value: float, posterior_std: float, prior_std: float, is_plausible: bool
+) -> IntrinsicEstimate:
+    """Decide whether a camera takes the estimate of an intrinsic parameter.
 
     Args:
-        equivalent_mm: Estimated focal length as 35 mm equivalent.
-        posterior_std: Posterior standard deviation of the log focal length, given observations and
-            prior.
-        prior_std: Prior standard deviation of the log focal length.
+        value: Estimated value.
+        posterior_std: Posterior standard deviation, given observations and prior. A singular
+            reduced camera system may give more than ``prior_std``, which is an upper bound.
+        prior_std: Prior standard deviation.
+        is_plausible: True if a lens with the estimated value exists.
     """
-    if not is_plausible_equivalent(equivalent_mm):
-        return CalibrationOutcome.OUT_OF_RANGE
-    if not posterior_std <= MAX_STD_RATIO * prior_std:
-        return CalibrationOutcome.NOT_OBSERVABLE
-    return CalibrationOutcome.REFINED
-
-
-def decide_radial_outcome(radial: float, posterior_std: float) -> CalibrationOutcome:
-    """Decide whether a camera takes its estimated radial distortion.
-
-    Args:
-        radial: The estimated coefficient.
-        posterior_std: Posterior standard deviation of the radial distortion coefficient.
-    """
-    if abs(radial) > MAX_RADIAL:
-        return CalibrationOutcome.OUT_OF_RANGE
-    if not posterior_std <= MAX_STD_RATIO * RADIAL_PRIOR_STD:
-        return CalibrationOutcome.NOT_OBSERVABLE
-    return CalibrationOutcome.REFINED
+    std = min(posterior_std, prior_std)
+    if not is_plausible:
+        outcome = CalibrationOutcome.OUT_OF_RANGE
+    elif not std <= MAX_STD_RATIO * prior_std:
+        outcome = CalibrationOutcome.NOT_OBSERVABLE
+    else:
+        outcome = CalibrationOutcome.REFINED
+    return IntrinsicEstimate(outcome, value, std)

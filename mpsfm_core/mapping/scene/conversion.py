@@ -8,8 +8,17 @@ from mpsfm_core.data import DepthPrior, PosedImage, SceneState
 from mpsfm_core.data.decisions import CameraReason, Reason
 from mpsfm_core.geometry.focal_length import compute_equivalent_mm
 from mpsfm_core.geometry.statistics import MAD_TO_STD
-from mpsfm_core.mapping.scene.calibration_outcome import MIN_FOCAL_IMAGES, CalibrationOutcome
-from mpsfm_core.mapping.scene.reconstruction import MetricScale, Reconstruction, RegisteredImage
+from mpsfm_core.mapping.scene.estimated_intrinsics import (
+    MIN_FOCAL_IMAGES,
+    CalibrationOutcome,
+    IntrinsicParameter,
+)
+from mpsfm_core.mapping.scene.reconstruction import (
+    CalibratedParameter,
+    MetricScale,
+    Reconstruction,
+    RegisteredImage,
+)
 from mpsfm_core.mapping.scene.scene import Scene
 
 MAX_METRIC_SPREAD = 0.15
@@ -90,7 +99,6 @@ def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> R
     """
     image, depth_map = scene.problem.images[index], scene.maps[index]
     depth = depth_map.depth * np.float32(factor)
-    log_std, radial_std = float(scene.focal_log_std[index]), float(scene.radial_std[index])
     variance = (depth_map.log_std * depth) ** 2
     return RegisteredImage(
         index=index,
@@ -101,27 +109,34 @@ def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> R
         point_ids=scene.tracks.point_of[scene.graph.keypoints_of(index)].copy(),
         depth=DepthPrior.from_arrays(depth, variance, depth_map.valid, metric=in_metres),
         scale=depth_map.scale * factor,
-        focal_log_std=log_std if np.isfinite(log_std) else None,
-        focal_reason=_get_focal_reason(scene, index),
         radial=float(scene.radial[index]),
-        radial_std=radial_std if np.isfinite(radial_std) else None,
-        radial_reason=_get_radial_reason(scene, index),
+        calibration={p: _describe_calibration(scene, index, p) for p in IntrinsicParameter},
     )
+
+
+def _describe_calibration(
+    scene: Scene, index: int, parameter: IntrinsicParameter
+) -> CalibratedParameter:
+    """Return estimate and std of a parameter, and the reason why the parameter is not refined."""
+    get_reason = {
+        IntrinsicParameter.FOCAL_LENGTH: _get_focal_reason,
+        IntrinsicParameter.RADIAL_DISTORTION: _get_radial_reason,
+    }[parameter]
+    estimate = scene.estimated_intrinsics.get(index, parameter)
+    return CalibratedParameter(estimate, get_reason(scene, index))
 
 
 def _get_focal_reason(scene: Scene, index: int) -> Reason | None:
     """Return the reason why a camera's focal length is not refined, or None if it is refined."""
     if scene.problem.images[index].focal_known:
         return CameraReason.KNOWN.because()
-    outcome = CalibrationOutcome(int(scene.focal_outcome[index]))
+    outcome, focal_px, std = scene.estimated_intrinsics.get(index, IntrinsicParameter.FOCAL_LENGTH)
     if outcome == CalibrationOutcome.REFINED:
         return None
     if outcome == CalibrationOutcome.NOT_OBSERVABLE:
-        std_ratio = round(float(scene.focal_log_std[index]), 4)
-        return CameraReason.NOT_OBSERVABLE.because(focal_length_std_ratio=std_ratio)
+        return CameraReason.NOT_OBSERVABLE.because(focal_length_std_ratio=round(std, 4))
     if outcome == CalibrationOutcome.OUT_OF_RANGE:
-        width, height = scene.problem.images[index].camera.size
-        equivalent_mm = compute_equivalent_mm(float(scene.focal_estimate_px[index]), width, height)
+        equivalent_mm = compute_equivalent_mm(focal_px, *scene.problem.images[index].camera.size)
         return CameraReason.OUT_OF_RANGE.because(equivalent_mm=round(equivalent_mm, 2))
     num_images = int(scene.registered.sum())
     if num_images < MIN_FOCAL_IMAGES:
@@ -133,13 +148,13 @@ def _get_focal_reason(scene: Scene, index: int) -> Reason | None:
 
 def _get_radial_reason(scene: Scene, index: int) -> Reason | None:
     """Return why a camera's radial distortion is not refined, or None if refined or known."""
-    outcome = CalibrationOutcome(int(scene.radial_outcome[index]))
+    outcome, radial, std = scene.estimated_intrinsics.get(
+        index, IntrinsicParameter.RADIAL_DISTORTION
+    )
     if scene.problem.images[index].focal_known or outcome == CalibrationOutcome.REFINED:
         return None
     if outcome == CalibrationOutcome.NOT_OBSERVABLE:
-        std = round(float(scene.radial_std[index]), 4)
-        return CameraReason.DISTORTION_NOT_OBSERVABLE.because(radial_std=std)
+        return CameraReason.DISTORTION_NOT_OBSERVABLE.because(radial_std=round(std, 4))
     if outcome == CalibrationOutcome.OUT_OF_RANGE:
-        radial = round(float(scene.radial_estimate[index]), 4)
-        return CameraReason.DISTORTION_OUT_OF_RANGE.because(radial=radial)
+        return CameraReason.DISTORTION_OUT_OF_RANGE.because(radial=round(radial, 4))
     return CameraReason.DISTORTION_NOT_ESTIMATED.because()

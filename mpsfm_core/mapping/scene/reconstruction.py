@@ -18,10 +18,49 @@ from mpsfm_core.data import (
     VerifiedPair,
 )
 from mpsfm_core.data.decisions import CameraReason, Reason, reason_from_json
+from mpsfm_core.mapping.scene.estimated_intrinsics import (
+    CalibrationOutcome,
+    IntrinsicEstimate,
+    IntrinsicParameter,
+)
 from mpsfm_core.mapping.state import StateDict, reasons_from_json, reasons_to_json
 
 _NO_ROWS = np.zeros(0, np.int64)
 _REASON_FIELDS = ("image_reasons", "pair_reasons")
+
+
+@dataclass(frozen=True)
+class CalibratedParameter:
+    """Result of self-calibration for one intrinsic parameter of a registered image."""
+
+    estimate: IntrinsicEstimate
+    """Outcome, estimated value and its standard deviation."""
+    reason: Reason | None = None
+    """Reason (``CameraReason``) why the parameter is not refined, or None if it is refined or
+    known."""
+
+    @property
+    def is_refined(self) -> bool:
+        """True if the camera takes the estimated value."""
+        return self.estimate.outcome == CalibrationOutcome.REFINED
+
+    @property
+    def std(self) -> float | None:
+        """Standard deviation of the estimate, or None if the parameter was not estimated."""
+        return self.estimate.std if np.isfinite(self.estimate.std) else None
+
+    def state_dict(self) -> StateDict:
+        """Return the state of the parameter for a checkpoint."""
+        outcome, value, std = self.estimate
+        reason = self.reason and self.reason.to_json()
+        return {"outcome": int(outcome), "value": value, "std": std, "reason": reason}
+
+    @classmethod
+    def from_state_dict(cls, state: StateDict) -> CalibratedParameter:
+        """Restore a parameter from a checkpoint."""
+        outcome = CalibrationOutcome(state["outcome"])
+        reason = state["reason"] and reason_from_json(CameraReason, state["reason"])
+        return cls(IntrinsicEstimate(outcome, state["value"], state["std"]), reason)
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,39 +86,31 @@ class RegisteredImage:
     """Scale of the depth prior, in world units per unit of the prior."""
     confirmed: bool = True
     """False if the image was registered tentatively, without verification."""
-    focal_log_std: float | None = None
-    """Posterior standard deviation of the log focal length, or None if the focal length was not
-    estimated."""
-    focal_reason: Reason | None = None
-    """Reason (``CameraReason``) why the focal length is not refined, or None if it is refined."""
     radial: float = 0.0
     """Radial distortion coefficient (SIMPLE_RADIAL) of the original image. The keypoints were
     undistorted with an initial coefficient, which the mapper refines."""
-    radial_std: float | None = None
-    """Posterior standard deviation of the radial distortion, or None if the mapper did not estimate
-    the distortion."""
-    radial_reason: Reason | None = None
-    """Reason (``CameraReason``) why the radial distortion is not refined, or None if it is
-    refined or known."""
+    calibration: Mapping[IntrinsicParameter, CalibratedParameter] = field(
+        default_factory=lambda: dict.fromkeys(
+            IntrinsicParameter, CalibratedParameter(IntrinsicEstimate())
+        )
+    )
+    """Result of self-calibration for each intrinsic parameter."""
 
     def state_dict(self) -> StateDict:
         """Return the state of the registered image for a checkpoint."""
         parts = {"camera": {**vars(self.camera)}, "depth": {**vars(self.depth)}}
-        reasons = {
-            "focal_reason": self.focal_reason and self.focal_reason.to_json(),
-            "radial_reason": self.radial_reason and self.radial_reason.to_json(),
-        }
-        return {**vars(self), **parts, **reasons}
+        calibration = {p.name: result.state_dict() for p, result in self.calibration.items()}
+        return {**vars(self), **parts, "calibration": calibration}
 
     @classmethod
     def from_state_dict(cls, state: StateDict) -> RegisteredImage:
         """Restore a registered image from a checkpoint."""
         parts = {"camera": PinholeCamera(**state["camera"]), "depth": DepthPrior(**state["depth"])}
-        reasons = {
-            name: state[name] and reason_from_json(CameraReason, state[name])
-            for name in ("focal_reason", "radial_reason")
+        calibration = {
+            IntrinsicParameter[name]: CalibratedParameter.from_state_dict(result)
+            for name, result in state["calibration"].items()
         }
-        return cls(**{**state, **parts, **reasons})
+        return cls(**{**state, **parts, "calibration": calibration})
 
 
 @dataclass(frozen=True)

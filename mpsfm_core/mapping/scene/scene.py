@@ -10,8 +10,8 @@ import numpy as np
 from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, PinholeCamera
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.geometry.distortion import distort_rays, undistort_rays
-from mpsfm_core.mapping.scene.calibration_outcome import CalibrationOutcome
 from mpsfm_core.mapping.scene.depth_map import DepthMap
+from mpsfm_core.mapping.scene.estimated_intrinsics import EstimatedIntrinsics, IntrinsicParameter
 from mpsfm_core.mapping.scene.graph import CorrespondenceGraph
 from mpsfm_core.mapping.scene.kernels import compute_max_triangulation_angles
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
@@ -30,13 +30,8 @@ class Snapshot(NamedTuple):
     xyz: Float64
     point_of: Int64
     maps: Sequence[tuple[float, bool, RefinedDepth | None]]
-    focal_outcome: Int64
-    focal_log_std: Float64
-    focal_estimate_px: Float64
     radial: Float64
-    radial_outcome: Int64
-    radial_std: Float64
-    radial_estimate: Float64
+    estimated_intrinsics: StateDict
 
 
 class Scene:
@@ -53,20 +48,10 @@ class Scene:
         translations: (n, 3) float64 translation of ``cam_from_world`` of each image.
         registered: (n,) bool mask of the registered images.
         intrinsics: (n, 4) float64 intrinsics fx, fy, cx, cy of each image in pixels.
+        radial: (n,) float64 coefficient of the radial distortion (SIMPLE_RADIAL) of each image.
         camera_of: (n,) int64 camera index of each image. Images with the same camera index share
             estimated intrinsics.
-        focal_outcome: (n,) int64 :class:`CalibrationOutcome` of the camera of each image.
-        focal_log_std: (n,) float64 posterior standard deviation of the log focal length of each
-            image, NaN without an estimate.
-        focal_estimate_px: (n,) float64 estimated ``fx`` of each image, also an implausible one, NaN
-            without an estimate.
-        radial: (n,) float64 coefficient of the radial distortion (SIMPLE_RADIAL) of each image.
-        radial_outcome: (n,) int64 :class:`CalibrationOutcome` of the radial distortion of each
-            image.
-        radial_std: (n,) float64 posterior standard deviation of the radial distortion of each
-            image, NaN without an estimate.
-        radial_estimate: (n,) float64 estimated radial distortion of each image, also an implausible
-            one, NaN without an estimate.
+        estimated_intrinsics: Estimates of self-calibration for the camera of each image.
         depth_group_of: (n,) int64 depth group of each image. The depth priors of a group have the
             same unit and share their scale.
         distorted_keypoints: (k, 2) float64 keypoints of all images in pixels, with the radial
@@ -90,6 +75,7 @@ class Scene:
         self.distorted_keypoints: Float64 = self.keypoints.copy()
         self.keypoint_std_px: Float64 = np.array([i.keypoint_std_px for i in problem.images])
         self.intrinsics: Float64 = np.array([image.camera.params for image in problem.images])
+        self.radial: Float64 = np.array([image.radial for image in problem.images])
         self.camera_of: Int64 = _shared_cameras(problem)
         self.depth_group_of: Int64 = _depth_groups(problem)
         self.maps = [DepthMap(image) for image in problem.images]
@@ -105,13 +91,7 @@ class Scene:
         self.rotations: Float64 = np.tile(np.eye(3), (count, 1, 1))
         self.translations: Float64 = np.zeros((count, 3))
         self.registered: Bool = np.zeros(count, dtype=np.bool_)
-        self.focal_outcome: Int64 = np.zeros(count, dtype=np.int64)
-        self.focal_log_std: Float64 = np.full(count, np.nan)
-        self.focal_estimate_px: Float64 = np.full(count, np.nan)
-        self.radial: Float64 = np.array([image.radial for image in problem.images])
-        self.radial_outcome: Int64 = np.zeros(count, dtype=np.int64)
-        self.radial_std: Float64 = np.full(count, np.nan)
-        self.radial_estimate: Float64 = np.full(count, np.nan)
+        self.estimated_intrinsics = EstimatedIntrinsics(count)
         self._distort_keypoints()
         self.tracks = Tracks(len(self.keypoints))
 
@@ -147,8 +127,8 @@ class Scene:
                 present focal length.
         """
         if focal_px is not None:
-            fx, fy, _, _ = self.intrinsics_with_focal(image, focal_px)
-            self.set_shared_focal(image, float(fx), float(fy))
+            focal = self.intrinsics_with_focal(image, focal_px)[:2]
+            self.set_shared_intrinsics(image, focal, self.radial[image])
         self.rotations[image], self.translations[image] = rotation, translation
         self.registered[image] = True
 
@@ -178,50 +158,27 @@ class Scene:
 
     def has_free_focal(self, image: int) -> bool:
         """Return whether the focal length is a guess and no registered image shares the camera."""
-        shares_camera = self.camera_of == self.camera_of[image]
         is_guess = not self.problem.images[image].focal_known
-        return is_guess and not bool((shares_camera & self.registered).any())
+        return is_guess and not bool((self.shares_camera(image) & self.registered).any())
 
     def has_determined_focal(self, images: Int64) -> Bool:
         """Return a bool mask (m,) of the images whose focal length is known or refined."""
         known = np.array([image.focal_known for image in self.problem.images], dtype=np.bool_)
-        determined: Bool = (known | (self.focal_outcome == CalibrationOutcome.REFINED))[images]
+        refined = self.estimated_intrinsics.is_refined(IntrinsicParameter.FOCAL_LENGTH)
+        determined: Bool = (known | refined)[images]
         return determined
 
-    def set_focal(self, image: int, fx: float, fy: float) -> None:
-        """Set the focal length of one image, in pixels."""
-        self.intrinsics[image, :2] = fx, fy
-        self.maps[image].set_camera(self.camera(image))
-        if self.radial[image]:
-            self.set_radial(image, float(self.radial[image]))
-
-    def set_shared_focal(self, image: int, fx: float, fy: float) -> None:
-        """Set the focal length in pixels of all images that share the camera of an image."""
-        shares_camera = self.camera_of == self.camera_of[image]
-        for other in np.flatnonzero(
-            shares_camera & (self.intrinsics[:, :2] != (fx, fy)).any(axis=1)
-        ):
-            self.set_focal(int(other), fx, fy)
-
-    def set_focal_outcome(
-        self, image: int, outcome: CalibrationOutcome, log_std: float, estimate_px: float
-    ) -> None:
-        """Record the outcome of self-calibration for all images that share a camera.
+    def set_intrinsics(self, image: int, focal: Float64, radial: float) -> None:
+        """Set focal length and radial distortion of one image, and undistort its keypoints.
 
         Args:
-            image: Index of an image that was taken by the camera.
-            outcome: The decision.
-            log_std: Posterior standard deviation of the log focal length.
-            estimate_px: Estimated focal length ``fx`` in pixels, also an implausible one.
+            image: The image.
+            focal: (2,) focal lengths fx, fy in pixels.
+            radial: Coefficient of the radial distortion (SIMPLE_RADIAL).
         """
-        shares_camera = self.camera_of == self.camera_of[image]
-        self.focal_outcome[shares_camera] = outcome
-        self.focal_log_std[shares_camera] = log_std
-        self.focal_estimate_px[shares_camera] = estimate_px
-
-    def set_radial(self, image: int, radial: float) -> None:
-        """Set the radial distortion of one image, and undistort its keypoints."""
+        self.intrinsics[image, :2] = focal
         self.radial[image] = radial
+        self.maps[image].set_camera(self.camera(image))
         rows = self.graph.keypoints_of(image)
         given = self.problem.images[image]
         focal_px, center = self.intrinsics[image, :2], self.intrinsics[image, 2:]
@@ -234,27 +191,22 @@ class Scene:
             distorted = (self.distorted_keypoints[rows] - center) / focal_px
             self.keypoints[rows] = center + focal_px * undistort_rays(distorted, radial)
 
-    def set_shared_radial(self, image: int, radial: float) -> None:
-        """Set the radial distortion of all images that share the camera of an image."""
-        shares_camera = self.camera_of == self.camera_of[image]
-        for other in np.flatnonzero(shares_camera & (self.radial != radial)):
-            self.set_radial(int(other), radial)
-
-    def set_radial_outcome(
-        self, image: int, outcome: CalibrationOutcome, std: float, estimate: float
-    ) -> None:
-        """Record the outcome of self-calibration of the radial distortion of a camera.
+    def set_shared_intrinsics(self, image: int, focal: Float64, radial: float) -> None:
+        """Set focal length and radial distortion of all images that share the camera of an image.
 
         Args:
             image: Index of an image that was taken by the camera.
-            outcome: The decision.
-            std: Posterior standard deviation of the radial distortion.
-            estimate: Estimated radial distortion, also an implausible one.
+            focal: (2,) focal lengths fx, fy in pixels.
+            radial: Coefficient of the radial distortion (SIMPLE_RADIAL).
         """
-        shares_camera = self.camera_of == self.camera_of[image]
-        self.radial_outcome[shares_camera] = outcome
-        self.radial_std[shares_camera] = std
-        self.radial_estimate[shares_camera] = estimate
+        changed = (self.intrinsics[:, :2] != focal).any(axis=1) | (self.radial != radial)
+        for other in np.flatnonzero(self.shares_camera(image) & changed):
+            self.set_intrinsics(int(other), focal, radial)
+
+    def shares_camera(self, image: int) -> Bool:
+        """Return a bool mask (n,) of the images that share the camera of an image."""
+        shared: Bool = self.camera_of == self.camera_of[image]
+        return shared
 
     def centers(self) -> Float64:
         """Return the camera centers (n, 3) in world coordinates."""
@@ -351,14 +303,12 @@ class Scene:
             self.register(image.index, image.rotation, image.translation)
             self.maps[image.index].set_scale(image.scale)
             self.tracks.point_of[self.graph.keypoints_of(image.index)] = image.point_ids
-            self.set_shared_focal(image.index, image.camera.fx, image.camera.fy)
-            if image.focal_log_std is not None and image.focal_reason is None:
-                outcome = CalibrationOutcome.REFINED
-                self.set_focal_outcome(image.index, outcome, image.focal_log_std, image.camera.fx)
-            self.set_shared_radial(image.index, image.radial)
-            if image.radial_std is not None and image.radial_reason is None:
-                outcome = CalibrationOutcome.REFINED
-                self.set_radial_outcome(image.index, outcome, image.radial_std, image.radial)
+            self.set_shared_intrinsics(image.index, image.camera.params[:2], image.radial)
+            for parameter, calibrated in image.calibration.items():
+                if calibrated.is_refined:
+                    self.estimated_intrinsics.set(
+                        self.shares_camera(image.index), parameter, calibrated.estimate
+                    )
 
     def _distort_keypoints(self) -> None:
         """Distort the keypoints by the radial distortion that was removed from them."""
@@ -380,13 +330,8 @@ class Scene:
             self.tracks.xyz.copy(),
             self.tracks.point_of.copy(),
             maps,
-            self.focal_outcome.copy(),
-            self.focal_log_std.copy(),
-            self.focal_estimate_px.copy(),
             self.radial.copy(),
-            self.radial_outcome.copy(),
-            self.radial_std.copy(),
-            self.radial_estimate.copy(),
+            self.estimated_intrinsics.state_dict(),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -394,16 +339,10 @@ class Scene:
         self.rotations = snapshot.rotations.copy()
         self.translations = snapshot.translations.copy()
         self.registered = snapshot.registered.copy()
-        for image in np.flatnonzero((self.intrinsics != snapshot.intrinsics).any(axis=1)):
-            self.set_focal(int(image), *map(float, snapshot.intrinsics[image, :2]))
-        self.focal_outcome = snapshot.focal_outcome.copy()
-        self.focal_log_std = snapshot.focal_log_std.copy()
-        self.focal_estimate_px = snapshot.focal_estimate_px.copy()
-        for image in np.flatnonzero(self.radial != snapshot.radial):
-            self.set_radial(int(image), float(snapshot.radial[image]))
-        self.radial_outcome = snapshot.radial_outcome.copy()
-        self.radial_std = snapshot.radial_std.copy()
-        self.radial_estimate = snapshot.radial_estimate.copy()
+        changed = (self.intrinsics != snapshot.intrinsics).any(axis=1)
+        for image in np.flatnonzero(changed | (self.radial != snapshot.radial)):
+            self.set_intrinsics(int(image), snapshot.intrinsics[image, :2], snapshot.radial[image])
+        self.estimated_intrinsics.load_state_dict(snapshot.estimated_intrinsics)
         self.tracks.xyz = snapshot.xyz.copy()
         self.tracks.point_of = snapshot.point_of.copy()
         for depth_map, (scale, active, refined) in zip(self.maps, snapshot.maps, strict=True):

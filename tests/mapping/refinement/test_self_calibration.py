@@ -14,9 +14,9 @@ from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.geometry.distortion import undistort_rays
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement.self_calibration import decide_focal_outcome
-from mpsfm_core.mapping.scene.calibration_outcome import CalibrationOutcome
+from mpsfm_core.mapping.refinement.self_calibration import judge_estimate
 from mpsfm_core.mapping.scene.conversion import convert_scene
+from mpsfm_core.mapping.scene.estimated_intrinsics import CalibrationOutcome, IntrinsicParameter
 from tests.mapping.focal_scenes import (
     CAMERA,
     POSES,
@@ -26,6 +26,9 @@ from tests.mapping.focal_scenes import (
     register_true_poses,
     scale_focal,
 )
+
+FOCAL = IntrinsicParameter.FOCAL_LENGTH
+RADIAL = IntrinsicParameter.RADIAL_DISTORTION
 
 
 @pytest.fixture(scope="module")
@@ -45,8 +48,9 @@ def test_reconstruct_with_wrong_focal_lengths_refines_all(
     assert len(model.images) == 5
     for image in model.images:
         assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
-        assert image.focal_reason is None
-        assert image.focal_log_std is not None and 0 < image.focal_log_std < 0.01
+        focal_std = image.calibration[FOCAL].std
+        assert focal_std is not None and 0 < focal_std < 0.01
+        assert image.calibration[FOCAL].is_refined
         for other in model.images:
             relative = image.rotation @ other.rotation.T
             true_relative = POSES[image.index][:, :3] @ POSES[other.index][:, :3].T
@@ -63,8 +67,9 @@ def test_reconstruct_with_radial_distortion_refines_shared_camera(
     for image in model.images:
         assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
         assert image.radial == pytest.approx(radial, abs=0.01)
-        assert image.radial_reason is None
-        assert image.radial_std is not None and 0 < image.radial_std < 0.01
+        radial_std = image.calibration[RADIAL].std
+        assert radial_std is not None and 0 < radial_std < 0.01
+        assert image.calibration[RADIAL].is_refined
         relative = image.rotation @ model.images[0].rotation.T
         true_relative = POSES[image.index][:, :3] @ POSES[0][:, :3].T
         assert rotation_angle_deg(relative @ true_relative.T) < 0.3
@@ -73,8 +78,8 @@ def test_reconstruct_with_radial_distortion_refines_shared_camera(
 def test_reconstruct_with_one_image_per_camera_keeps_pinhole_cameras(room: MappingProblem) -> None:
     problem = guess_focals(distort(room, -0.05), [0.9, 0.95, 1.0, 1.05, 1.1])
     for image in reconstruct(problem).reconstructions[0].images:
-        assert image.radial == 0 and image.focal_reason is None
-        assert image.radial_reason == CameraReason.DISTORTION_NOT_ESTIMATED.because()
+        assert image.radial == 0 and image.calibration[FOCAL].reason is None
+        assert image.calibration[RADIAL].reason == CameraReason.DISTORTION_NOT_ESTIMATED.because()
 
 
 def test_reconstruct_of_partly_undistorted_views_refines_the_original_distortion(
@@ -100,16 +105,17 @@ def test_reconstruct_without_refinement_of_distortion_keeps_pinhole_cameras(
     )
     problem = guess_focals(distort(room, -0.05), [1.0] * 5)
     for image in reconstruct(problem, options).reconstructions[0].images:
-        assert image.radial == 0 and image.radial_std is None
-        assert image.radial_reason == CameraReason.DISTORTION_NOT_ESTIMATED.because()
+        assert image.radial == 0 and image.calibration[RADIAL].std is None
+        assert image.calibration[RADIAL].reason == CameraReason.DISTORTION_NOT_ESTIMATED.because()
 
 
 def test_reconstruct_with_known_focal_lengths_keeps_them(room: MappingProblem) -> None:
     for image in reconstruct(room).reconstructions[0].images:
         assert image.camera == CAMERA
-        assert image.focal_reason == CameraReason.KNOWN.because()
-        assert image.focal_log_std is None
-        assert image.radial == 0 and image.radial_std is image.radial_reason is None
+        assert image.calibration[FOCAL].reason == CameraReason.KNOWN.because()
+        assert image.calibration[FOCAL].std is None
+        assert image.radial == 0
+        assert image.calibration[RADIAL].std is image.calibration[RADIAL].reason is None
 
 
 def test_reconstruct_without_refinement_keeps_guesses(room: MappingProblem) -> None:
@@ -117,12 +123,12 @@ def test_reconstruct_without_refinement_keeps_guesses(room: MappingProblem) -> N
     problem = guess_focals(room, [1.02] * 5)
     for image in reconstruct(problem, options).reconstructions[0].images:
         assert image.camera == problem.images[0].camera
-        assert image.focal_reason == CameraReason.NOT_ESTIMATED.because()
+        assert image.calibration[FOCAL].reason == CameraReason.NOT_ESTIMATED.because()
 
 
 def test_convert_scene_of_two_images_gives_too_few_images(room: MappingProblem) -> None:
     scene = register_true_poses(guess_focals(room, [1.02] * 5), range(2)).scene
-    reason = convert_scene(scene).images[0].focal_reason
+    reason = convert_scene(scene).images[0].calibration[FOCAL].reason
     assert reason == CameraReason.TOO_FEW_IMAGES.because(num_images=2, min_images=3)
 
 
@@ -143,11 +149,10 @@ def test_adjust_with_implausible_camera_refines_the_others(room: MappingProblem)
     component.refiner.adjust(list(range(5)), focal=True)
     scene = component.scene
     assert scene.intrinsics[4, 0] == enlarged.camera.fx
-    assert scene.focal_outcome.tolist() == [CalibrationOutcome.REFINED] * 4 + [
-        CalibrationOutcome.OUT_OF_RANGE
-    ]
+    outcomes = [scene.estimated_intrinsics.get(image, FOCAL).outcome for image in range(5)]
+    assert outcomes == [CalibrationOutcome.REFINED] * 4 + [CalibrationOutcome.OUT_OF_RANGE]
     assert scene.intrinsics[:4, 0] == pytest.approx(CAMERA.fx, rel=0.005)
-    reason = convert_scene(scene).images[4].focal_reason
+    reason = convert_scene(scene).images[4].calibration[FOCAL].reason
     assert reason is not None and reason.code == CameraReason.OUT_OF_RANGE
     assert reason.values["equivalent_mm"] == pytest.approx(40 * 520 / 800 * 43.27, rel=0.1)
 
@@ -157,21 +162,21 @@ def test_adjust_with_narrow_prior_keeps_the_guess(room: MappingProblem) -> None:
     component.refiner.adjust(list(range(5)), focal=True)
     assert (component.scene.intrinsics[:, 0] == 1.02 * CAMERA.fx).all()
     for image in convert_scene(component.scene).images:
-        assert image.focal_reason is not None
-        assert image.focal_reason.code == CameraReason.NOT_OBSERVABLE
+        assert image.calibration[FOCAL].reason is not None
+        assert image.calibration[FOCAL].reason.code == CameraReason.NOT_OBSERVABLE
 
 
 @pytest.mark.parametrize(
-    ("equivalent_mm", "posterior_std", "prior_std", "expected"),
+    ("is_plausible", "posterior_std", "prior_std", "expected"),
     [
-        (7.9, 0.01, 0.7, CalibrationOutcome.OUT_OF_RANGE),
-        (801.0, 0.01, 0.7, CalibrationOutcome.OUT_OF_RANGE),
-        (28.0, 0.4, 0.7, CalibrationOutcome.NOT_OBSERVABLE),
-        (28.0, np.inf, 0.7, CalibrationOutcome.NOT_OBSERVABLE),
-        (28.0, 0.04, 0.1, CalibrationOutcome.REFINED),
+        (False, 0.01, 0.7, CalibrationOutcome.OUT_OF_RANGE),
+        (True, 0.4, 0.7, CalibrationOutcome.NOT_OBSERVABLE),
+        (True, np.inf, 0.7, CalibrationOutcome.NOT_OBSERVABLE),
+        (True, 0.04, 0.1, CalibrationOutcome.REFINED),
     ],
 )
-def test_decide_focal_outcome_by_range_and_information(
-    equivalent_mm: float, posterior_std: float, prior_std: float, expected: CalibrationOutcome
+def test_judge_estimate_by_range_and_information(
+    is_plausible: bool, posterior_std: float, prior_std: float, expected: CalibrationOutcome
 ) -> None:
-    assert decide_focal_outcome(equivalent_mm, posterior_std, prior_std) == expected
+    estimate = judge_estimate(28.0, posterior_std, prior_std, is_plausible)
+    assert estimate == (expected, 28.0, min(posterior_std, prior_std))
