@@ -1,92 +1,51 @@
-"""Estimation of memory and disk space before a run, and measurement at its end.
+"""Coarse estimate of memory and disk space before a run, which limits the number of workers.
 
-The memory estimate is the sum of a fixed part, the caches, and the largest of three stages:
-extraction, dense depth and results. Constants are bytes per pixel of arrays in memory, or derived
-from the peak resident memory of a stage (CPython 3.11 on Linux, [tuned: benchmarks.resources]). The
-estimate assumes a single connected component of images, which needs most memory.
+The estimate is the sum of the program, the cached images, and the larger of two stages. In
+extraction, each worker decodes an image, or runs a detector or network. In the dense stage, each
+worker has a cost volume. For three photos of 3 to 48 megapixels, SIFT, and 1 to 4 workers, the
+estimate was within 6 % of the measured peak (Linux). The estimate excludes GPU memory, and networks
+whose library downloads the weights.
 """
 
 from __future__ import annotations
 
-import math
 import shutil
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from glob import escape
 from pathlib import Path
-
-import psutil
 
 from mpsfm_core.config import Config
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.dense_view import dense_grid_size
 from mpsfm_core.extraction.active_provider import worker_count
-from mpsfm_core.extraction.features import CACHED_BYTES as CACHED_FEATURE_BYTES
-from mpsfm_core.extraction.matching.keypoint_adjustment import CACHED_BYTES as CACHED_GRAY_BYTES
 from mpsfm_core.extraction.priors.prior_maps import integration_grid
-from mpsfm_core.inputs.images import CACHED_BYTES as CACHED_VIEW_BYTES
-from mpsfm_core.providers import ProviderSpec, WeightsFile
-from mpsfm_core.providers.provider_config import ProviderConfig
+from mpsfm_core.inputs.images import CACHED_BYTES
+from mpsfm_core.providers import WeightsFile
 from mpsfm_core.providers.weights import WeightStore
-from mpsfm_core.support.control_groups import ControlGroups
 from mpsfm_core.support.disk_arrays import MEMORY_LIMIT
+from mpsfm_core.support.memory import MB, measure_memory
 from mpsfm_core.support.threads import count_cores
 
-TOLERANCE = 1.3
-"""Maximum factor between estimated and measured memory or disk space."""
+MAX_RATIO = 2.0
+"""Ratio of estimate and available memory or disk space from which a run is refused. [ours]"""
 
-_MB = float(1 << 20)
-_PROGRAM_MB = 320.0
-"""Memory of interpreter, libraries and compiled kernels, MB."""
-_TORCH_MB = 250.0
-"""Additional memory if a provider needs torch, MB."""
-_VIEW_BYTES = 3.0
-"""Bytes per pixel of a cached RGB view."""
-_GRAY_BYTES = 4.0
-"""Bytes per pixel of a cached float32 gray image of keypoint adjustment."""
-_DECODE_BYTES = 9.0
-"""Bytes per pixel of an image during decoding, for the file, RGB and undistorted copies."""
+_PROGRAM_MB = 400.0
+"""Memory of interpreter, libraries and compiled kernels, MB. [tuned: benchmarks.resources]"""
+_RGB_BYTES = 3.0
+"""Bytes per pixel of a decoded image; a worker has three copies: file, decoded and undistorted."""
 _DETECTOR_BYTES = 280.0
-"""Bytes of detector memory per input pixel, for the scale-space pyramids of SIFT."""
-_NETWORK_RATIO = 2.0
-"""Ratio of a loaded network's memory to the size of its weights file."""
-_ACTIVATION_RATIO, _MAX_ACTIVATION_MB = 3.0, 320.0
-"""Ratio of a network's activations to its weights file, and the maximum activations in MB."""
+"""Bytes per pixel of the scale space of SIFT, for each worker. [tuned: benchmarks.resources]"""
+_NETWORK_RATIO = 4.0
+"""Ratio of a network's memory, with activations, to its weights. [tuned: benchmarks.resources]"""
 _PRIOR_BYTES = 106.0
-"""Bytes per pixel of depth, normals and variances in the mapper, with derived maps."""
-_DENSE_WORKER_BYTES = 320.0
-"""Bytes per pixel of stereo matching, for a cost volume of 11 labels and its aggregation."""
-_DENSE_MAP_BYTES = 20.0
-"""Bytes per pixel of a dense depth map with variance and support."""
-_FUSION_BYTES = 4.6
-"""Bytes per pixel of a depth map during fusion into a point cloud."""
-_POINT_BYTES = 120.0
-"""Bytes per point of the dense cloud, including two temporary copies."""
-_POINT_RATIO = 0.4
-"""Ratio of points of the dense cloud to pixels of the depth maps."""
-
-_KEYPOINT_BYTES = 544.0
-"""Bytes per cached keypoint with position, scale and 128 float32 descriptor values."""
-_PIXELS_PER_KEYPOINT = 60.0
-"""Minimum number of image pixels per SIFT keypoint."""
-_DEFAULT_MAX_KEYPOINTS = 4096
-"""Assumed keypoints per image if the feature options set no limit."""
-_CACHED_PRIOR_MB = 0.27
-"""Disk space of the cached depth and normals of an image, MB."""
-_CACHED_PAIR_BYTES = 6_000.0
-"""Disk space of the cached matches and two-view geometry of a pair, bytes."""
-_CACHED_DENSE_BYTES = 12.0
-"""Disk space per pixel of a checkpoint of the dense stage, bytes."""
-_WRITTEN_POINT_BYTES = 32.0
-_WRITTEN_MAP_BYTES = 7.3
-"""Disk space per pixel of a compressed depth map, bytes."""
-_REPORT_MAP_BYTES = 8.0
-"""Disk space per pixel of a prior map in the report page, compressed, bytes."""
-_REPORT_MB, _REPORT_IMAGE_MB = 2.0, 0.22
-"""Disk space of the report page without images, and per image, MB."""
-_SAMPLING_PERIOD_S = 1.0
+"""Bytes per pixel of depth, normals, variances and derived maps in the mapper."""
+_COST_VOLUME_BYTES = 320.0
+"""Bytes per pixel of a cost volume of 11 depth labels and its aggregation, for each worker."""
+_DENSE_BYTES = 40.0
+"""Bytes per pixel of dense depth maps and of the points fused from them, up to ``MEMORY_LIMIT``."""
+_DISK_BYTES = 40.0
+"""Bytes per pixel of depth maps and prior maps, in the results and in the cache."""
 
 
 @dataclass(frozen=True)
@@ -100,14 +59,13 @@ class ResourceEstimate:
     def __str__(self) -> str:
         return (
             f"{self.memory_mb:.0f} MB of memory, {self.cache_mb:.0f} MB of cache and "
-            f"{self.output_mb:.0f} MB of results, if all photos end in one model"
+            f"{self.output_mb:.0f} MB of results"
         )
 
 
 def estimate_resources(
     sizes: Sequence[tuple[int, int]],
     config: Config,
-    providers: Sequence[ProviderSpec],
     networks: Sequence[int],
     workers: int | None = None,
 ) -> ResourceEstimate:
@@ -116,20 +74,28 @@ def estimate_resources(
     Args:
         sizes: (width, height) of the undistorted images in pixels.
         config: Configuration in which each block has one available provider.
-        providers: Specifications (requirements and weights) of the chosen providers.
         networks: Size in bytes of the weights of each network, see :func:`measure_weights`.
         workers: Number of worker threads; default: the number in ``config.runtime``.
     """
-    memory = _PROGRAM_MB * _MB + _TORCH_MB * _MB * any("torch" in p.requires for p in providers)
-    memory += _cached_bytes(sizes, config)
-    stages = (
-        _extraction_bytes(sizes, config, networks, workers or worker_count(config.runtime)),
-        _dense_bytes(sizes, config, workers or config.runtime.workers or count_cores()),
-        _result_bytes(sizes, config),
+    largest = max(sizes, key=_count_pixels)
+    in_extraction = min(len(sizes), workers or worker_count(config.runtime)) * max(
+        3 * _RGB_BYTES * _count_pixels(largest),
+        _DETECTOR_BYTES * _count_detected_pixels(largest, config),
+        _NETWORK_RATIO * sum(networks),
     )
-    memory += max(stages)
-    cache, output = _cache_folder_bytes(sizes, config), _output_bytes(sizes, config)
-    return ResourceEstimate(round(memory / _MB), round(cache / _MB), round(output / _MB))
+    grids = [integration_grid(size, config.extraction.integration_size) for size in sizes]
+    num_pixels = sum(map(_count_pixels, grids))
+    in_mapping = _PRIOR_BYTES * num_pixels
+    if config.dense.enabled:
+        grids = [dense_grid_size(size, config.dense.max_size) for size in sizes]
+        num_pixels = sum(map(_count_pixels, grids))
+        in_mapping += min(MEMORY_LIMIT, _DENSE_BYTES * num_pixels)
+        busy = min(len(sizes), workers or config.runtime.workers or count_cores())
+        in_mapping += busy * _COST_VOLUME_BYTES * max(map(_count_pixels, grids))
+    cached = min(CACHED_BYTES, _RGB_BYTES * sum(map(_count_pixels, sizes)))
+    disk_mb = round(_DISK_BYTES * num_pixels / MB)
+    memory_mb = _PROGRAM_MB + (cached + max(in_extraction, in_mapping)) / MB
+    return ResourceEstimate(round(memory_mb), disk_mb, disk_mb)
 
 
 def reduce_workers(
@@ -157,18 +123,23 @@ def measure_weights(file: WeightsFile, store: WeightStore) -> int:
     return sum(part.stat().st_size for part in path.parent.glob(f"{escape(path.name)}*"))
 
 
+def measure_folder_mb(folder: Path) -> float:
+    """Return the size of all files below a folder in MB."""
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / MB
+
+
 def find_shortages(estimate: ResourceEstimate, cache: Path, output: Path | None) -> list[str]:
-    """Compare an estimate with free memory and disk; return a warning per shortage.
+    """Compare an estimate with free memory and disk space; return a warning per shortage.
 
     Raises:
         InputError: the estimate exceeds the total memory of the machine or container, or the free
-            disk space, by more than the factor :data:`TOLERANCE`.
+            disk space for the results, by more than the factor :data:`MAX_RATIO`.
     """
     total_mb, free_mb = measure_memory()
     warnings = []
     need = f"this run takes about {estimate.memory_mb:.0f} MB of memory"
     remedy = "reduce inputs.max_image_size or dense.max_size, use fewer photos"
-    if estimate.memory_mb > TOLERANCE * total_mb:
+    if estimate.memory_mb > MAX_RATIO * total_mb:
         raise InputError(
             f"{need}, but the machine or container has {total_mb:.0f} MB: {remedy}, "
             f"or set runtime.check_resources=false"
@@ -179,197 +150,22 @@ def find_shortages(estimate: ResourceEstimate, cache: Path, output: Path | None)
     if output is not None:
         folders["the results"] = (output, estimate.output_mb)
     for name, (folder, size_mb) in folders.items():
-        free_mb = _free_disk_mb(folder)
+        existing = next(path for path in (folder, *folder.resolve().parents) if path.exists())
+        free_mb = shutil.disk_usage(existing).free / MB
         text = f"{name} in {folder} take about {size_mb:.0f} MB and {free_mb:.0f} MB are free"
-        if name == "the results" and size_mb > TOLERANCE * free_mb:
+        if name == "the results" and size_mb > MAX_RATIO * free_mb:
             raise InputError(f"{text}: free disk space, or set runtime.check_resources=false")
-        on_same_disk = (mb for path, mb in folders.values() if _same_disk(path, folder))
-        if sum(on_same_disk) > free_mb:
+        if size_mb > free_mb:
             warnings.append(f"{text}: the run may fail")
     return warnings
 
 
-def measure_memory(groups: ControlGroups | None = None) -> tuple[float, float]:
-    """Return total and free memory in MB that this process may use.
-
-    Args:
-        groups: Control groups with memory limits; default: the control groups of this process.
-    """
-    machine = psutil.virtual_memory()
-    limits = (groups or ControlGroups()).memory_limits()
-    total = min([machine.total, *(limit.total for limit in limits)])
-    free = min([machine.available, *(limit.free for limit in limits)])
-    return total / _MB, free / _MB
+def _count_pixels(size: tuple[int, int]) -> int:
+    return size[0] * size[1]
 
 
-class ChildMemoryMonitor:
-    """Measures the peak resident memory of all child processes together."""
-
-    def __init__(self) -> None:
-        self.peak_mb = 0.0
-
-    @contextmanager
-    def watching(self) -> Iterator[None]:
-        """Sample the memory of child processes once per second inside a ``with`` block."""
-        ended = threading.Event()
-        thread = threading.Thread(target=self._sample_until, args=(ended,), name="mpsfm memory")
-        thread.start()
-        try:
-            yield
-        finally:
-            ended.set()
-            thread.join()
-
-    def _sample_until(self, ended: threading.Event) -> None:
-        process = psutil.Process()
-        while not ended.wait(_SAMPLING_PERIOD_S):
-            resident = 0
-            with suppress(psutil.Error):
-                for child in process.children(recursive=True):
-                    with suppress(psutil.Error):
-                        resident += child.memory_info().rss
-            self.peak_mb = max(self.peak_mb, resident / _MB)
-
-
-def measure_folder_mb(folder: Path) -> float:
-    """Return the size of all files below a folder in MB."""
-    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / _MB
-
-
-def _cached_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    """Estimate the bytes of the in-memory caches of views, features and gray images."""
-    views = min(CACHED_VIEW_BYTES, _VIEW_BYTES * _num_pixels(sizes))
-    features = min(CACHED_FEATURE_BYTES, _feature_bytes(sizes, config))
-    gray = 0.0
-    if config.adjustment.enabled:
-        detected = sum(_detection_pixels(size, config) for size in sizes)
-        gray = min(CACHED_GRAY_BYTES, _GRAY_BYTES * detected)
-    return views + features + gray
-
-
-def _extraction_bytes(
-    sizes: Sequence[tuple[int, int]], config: Config, networks: Sequence[int], workers: int
-) -> float:
-    """Estimate the bytes of extraction workers for image decoding and a detector or networks."""
-    decoding = _DECODE_BYTES * max(width * height for width, height in sizes)
-    detector = _DETECTOR_BYTES * max(_detection_pixels(size, config) for size in sizes)
-    limit = _MAX_ACTIVATION_MB * _MB
-    network = sum(_NETWORK_RATIO * size + min(_ACTIVATION_RATIO * size, limit) for size in networks)
-    return min(workers, len(sizes)) * max(decoding, detector, network)
-
-
-def _dense_bytes(sizes: Sequence[tuple[int, int]], config: Config, workers: int) -> float:
-    """Estimate the bytes of the dense stage, for all maps and a cost volume per worker."""
-    if not config.dense.enabled:
-        return _PRIOR_BYTES * _num_pixels(_prior_grids(sizes, config))
-    grids = _final_grids(sizes, config)
-    cost_volume = _DENSE_WORKER_BYTES * max(width * height for width, height in grids)
-    return _map_bytes(sizes, config) + min(workers, len(sizes)) * cost_volume
-
-
-def _result_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    """Estimate the bytes of the results stage, for all maps and the points of the cloud."""
-    fusion = _FUSION_BYTES * _num_pixels(_final_grids(sizes, config))
-    return _map_bytes(sizes, config) + fusion + _POINT_BYTES * _num_points(sizes, config)
-
-
-def _map_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    """Estimate the bytes of the maps in memory from mapping to the results."""
-    priors = _PRIOR_BYTES * _num_pixels(_prior_grids(sizes, config))
-    if not config.dense.enabled:
-        return priors
-    return priors + min(MEMORY_LIMIT, _DENSE_MAP_BYTES * _num_pixels(_final_grids(sizes, config)))
-
-
-def _cache_folder_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    size = _feature_bytes(sizes, config) + _CACHED_PRIOR_MB * _MB * len(sizes)
-    size += _CACHED_PAIR_BYTES * _max_pairs(len(sizes), config)
-    if config.dense.enabled:
-        dense = _num_pixels(_final_grids(sizes, config))
-        size += _CACHED_DENSE_BYTES * dense + max(0.0, _DENSE_MAP_BYTES * dense - MEMORY_LIMIT)
-    return size
-
-
-def _output_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    results = config.results
-    size = _WRITTEN_POINT_BYTES * _num_points(sizes, config)
-    if results.depth_maps:
-        size += _WRITTEN_MAP_BYTES * _num_pixels(_final_grids(sizes, config))
-    if results.report:
-        size += (_REPORT_MB + _REPORT_IMAGE_MB * len(sizes)) * _MB
-        size += _REPORT_MAP_BYTES * _num_pixels(_prior_grids(sizes, config))
-    return size
-
-
-def _num_pixels(sizes: Sequence[tuple[int, int]]) -> int:
-    return sum(width * height for width, height in sizes)
-
-
-def _prior_grids(sizes: Sequence[tuple[int, int]], config: Config) -> list[tuple[int, int]]:
-    return [integration_grid(size, config.extraction.integration_size) for size in sizes]
-
-
-def _final_grids(sizes: Sequence[tuple[int, int]], config: Config) -> list[tuple[int, int]]:
-    if not config.dense.enabled:
-        return _prior_grids(sizes, config)
-    return [dense_grid_size(size, config.dense.max_size) for size in sizes]
-
-
-def _num_points(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    if not config.results.dense_cloud:
-        return 0.0
-    points = _POINT_RATIO * _num_pixels(_final_grids(sizes, config))
-    return min(config.results.dense_max_points, points)
-
-
-def _feature_configs(config: Config) -> list[ProviderConfig]:
+def _count_detected_pixels(size: tuple[int, int], config: Config) -> float:
+    """Return the number of pixels of an image that the feature detectors process."""
     blocks = [config.features, None if config.fast_pass is None else config.fast_pass.features]
-    return [block for block in blocks if block is not None]
-
-
-def _detection_pixels(size: tuple[int, int], config: Config) -> float:
-    """Return the number of pixels of the largest image that a detector processes."""
-    pixels = 0.0
-    for block in _feature_configs(config):
-        side = block.options.get("resize") or max(size)
-        ratio = min(1.0, side / max(size))
-        pixels = max(pixels, math.prod(size) * ratio**2)
-    return pixels
-
-
-def _feature_bytes(sizes: Sequence[tuple[int, int]], config: Config) -> float:
-    """Estimate the bytes of the features of all images, without a cache limit."""
-    limits = [
-        int(block.options.get("max_keypoints") or _DEFAULT_MAX_KEYPOINTS)
-        for block in _feature_configs(config)
-    ]
-    limit = max(limits, default=0)
-    return _KEYPOINT_BYTES * sum(
-        min(limit, _detection_pixels(size, config) / _PIXELS_PER_KEYPOINT) for size in sizes
-    )
-
-
-def _max_pairs(num_images: int, config: Config) -> int:
-    """Return the maximum number of pairs that pair selection can give."""
-    pairs = config.pairs
-    partners = {
-        "exhaustive": num_images,
-        "sequential": pairs.overlap,
-        "retrieval": pairs.top_k,
-        "auto": pairs.partners + pairs.overlap,
-    }
-    return min(num_images * (num_images - 1) // 2, num_images * partners[pairs.mode])
-
-
-def _free_disk_mb(folder: Path) -> float:
-    return shutil.disk_usage(_nearest_existing(folder)).free / _MB
-
-
-def _same_disk(a: Path, b: Path) -> bool:
-    return _nearest_existing(a).stat().st_dev == _nearest_existing(b).stat().st_dev
-
-
-def _nearest_existing(folder: Path) -> Path:
-    """Return a folder if it exists, else its nearest existing ancestor."""
-    folder = folder.resolve()
-    return next(path for path in (folder, *folder.parents) if path.exists())
+    sides = [block.options.get("resize") or max(size) for block in blocks if block is not None]
+    return _count_pixels(size) * min(1.0, max(sides, default=0) / max(size)) ** 2

@@ -68,6 +68,7 @@ from mpsfm_core.results.summary import (
 from mpsfm_core.results.writer import ComponentResult, update_summary, write_failure, write_results
 from mpsfm_core.support.disk_arrays import DiskArrays
 from mpsfm_core.support.files import lock_output_folder
+from mpsfm_core.support.memory import ChildMemoryMonitor, measure_memory
 from mpsfm_core.support.threads import limit_threads, thread_limit
 
 PathLike = str | Path
@@ -248,7 +249,7 @@ class _Run:
         self._georeference_report: dict[str, object] | None = None
         self._dense_reports: list[dict[str, Any]] | None = None
         self._estimate = resources.ResourceEstimate(0, 0, 0)
-        self._children = resources.ChildMemoryMonitor()
+        self._children = ChildMemoryMonitor()
         self._checkpoints: list[MappingCheckpoints | DenseCheckpoints] = []
         self._compilation: precompile.Compilation | None = None
 
@@ -618,12 +619,11 @@ class _Run:
             resources.estimate_resources,
             [image.pinhole.size for image in images],
             config,
-            [choice.provider for choice in self._resolution.choices],
             list(networks.values()),
         )
         self._estimate = estimate()
         if config.runtime.check_resources:
-            free_mb = resources.measure_memory()[1]
+            free_mb = measure_memory()[1]
             if self._estimate.memory_mb > free_mb:
                 workers = resources.reduce_workers(estimate, thread_limit(), free_mb)
                 self._limit_workers(workers)

@@ -11,7 +11,6 @@ import cv2
 import numpy as np
 import pytest
 
-from mpsfm_core.pipeline.resources import TOLERANCE
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 from .conftest import CAMERA
@@ -48,7 +47,7 @@ def test_measured_resources_agree_with_estimate(
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert [part["images"] for part in summary["reconstructions"]] == [5] * groups
     said, took = (summary["resources"][key] for key in ("predicted", "measured"))
-    assert took["memory_mb"] < TOLERANCE * said["memory_mb"]
+    assert took["memory_mb"] < 1.3 * said["memory_mb"]
     if groups == 1:
-        assert took["memory_mb"] > said["memory_mb"] / TOLERANCE
-        assert 1 / TOLERANCE < took["output_mb"] / said["output_mb"] < TOLERANCE
+        assert took["memory_mb"] > said["memory_mb"] / 1.3
+        assert 1 / 3 < took["output_mb"] / said["output_mb"] < 3
