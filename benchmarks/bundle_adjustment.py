@@ -64,7 +64,7 @@ def bench_speed(size: tuple[int, int, float], repeats: int) -> dict[str, float]:
     problem = perturb(make_problem(*size), seed=1)
     plain = without_depth(problem)
     reconstructions = [to_pycolmap(problem) for _ in range(repeats)]
-    fresh = iter(reconstructions)  # pycolmap's adjuster does not keep its model alive
+    fresh = iter(reconstructions)  # keeps the models alive, unlike the adjuster
     threads = SOFT_L1_OPTIONS.model_copy(update={"threads": 1})
     median, results = side_by_side(
         {

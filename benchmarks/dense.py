@@ -243,7 +243,7 @@ def set_errors(
     map_metrics = [map_errors(each, scale, own_scale_factor) for each in common_pixels]
     cameras = {photo.name: photo.pinhole for photo in photos}
     accuracy = evaluate_dense_geometry(reconstruction, cloud, scene, cameras, TOLERANCES)
-    assert accuracy is not None  # because the scene has true depth
+    assert accuracy is not None  # not None, because the scene has true depth
     result = {"abs_rel": accuracy["depth"]["abs_rel"], **_means(map_metrics)}
     for tolerance in map(str, TOLERANCES):
         centimetres = round(100 * float(tolerance))

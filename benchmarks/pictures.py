@@ -51,7 +51,7 @@ def on_terminal(*arguments: str, code: int = 0) -> str:
     while True:
         try:
             part = os.read(ours, 65536)
-        except OSError:  # Linux: the command has closed the terminal
+        except OSError:  # on Linux, after the command closed the terminal
             break
         if not part:
             break

@@ -43,7 +43,7 @@ MAX_ERRORS_DEG = (2.0, 5.0)
 LONGER_SIDE = 640
 """Longer side in pixels of the photos of generated photo sets."""
 NUM_LOW_OVERLAP_SETS = 2
-"""Number of test sets of each bucket (test sets of similar overlap) with low overlap."""
+"""Number of low-overlap test sets per bucket (group of test sets of similar overlap)."""
 
 Photo = tuple[UInt8, dict[int, float]]
 """Photo as BGR pixels, with numeric tags of its EXIF directory."""

@@ -37,8 +37,8 @@ def compare(environment: Environment, checkout: Path) -> dict[str, float]:
             with np.load(output) as theirs:
                 certainty = theirs["certainty"]
                 half = certainty.shape[1] // 2
-                # our provider returns the matches of the first view, then of the second, in row
-                # order
+                # Our provider returns the matches from the warp of the first view, then from the
+                # warp of the second view, each in row order.
                 rows = np.arange(certainty.size).reshape(certainty.shape)
                 order = np.concatenate([rows[:, :half].ravel(), rows[:, half:].ravel()])
                 order = order[certainty.ravel()[order] > options["min_certainty"]]

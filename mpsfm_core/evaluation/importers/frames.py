@@ -164,5 +164,5 @@ def _link(source: Path, target: Path) -> None:
     """Hard-link a file, or copy it if links are impossible."""
     try:
         os.link(source.resolve(), target)
-    except OSError:  # The target is on another disk, or the file system has no hard links.
+    except OSError:  # A hard link fails on another disk, or if the file system has no hard links.
         shutil.copyfile(source, target)

@@ -69,7 +69,7 @@ class CompactNetwork(nn.Module):
         self.register_buffer("start", torch.tensor([0.9, -1.5, 0.0, 0.0, -1.0, -1.2, 2.0]))
 
     def forward(self, image: Tensor, rays: Tensor) -> dict[str, Tensor]:
-        """Predict a dictionary of output maps and focal length, as in the class docstring."""
+        """Predict output maps and the focal length from images and ray slopes."""
         x = self.stem((image - 127.0) / 128.0)  # normalization of EfficientNet-lite
         skips = []
         for number, stage in enumerate(self.stages):

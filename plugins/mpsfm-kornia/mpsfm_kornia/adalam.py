@@ -22,9 +22,9 @@ neighbor."""
 class AdalamMatcher:
     """AdaLAM matcher for features with any descriptors, without learned weights.
 
-    AdaLAM accepts the matches of an image neighborhood if one affine map explains enough of them.
-    Keypoint orientations are not compared, because ``Features`` have none. Keypoint scales are
-    compared if the features of both images have scales. The score of a match is ``c / (c +
+    AdaLAM accepts the matches of an image neighborhood if one affine map explains enough of these
+    matches. Keypoint orientations are not compared, because ``Features`` have none. Keypoint scales
+    are compared if the features of both images have scales. The score of a match is ``c / (c +
     min_confidence)``, where c is AdaLAM's confidence in the neighborhood.
     """
 

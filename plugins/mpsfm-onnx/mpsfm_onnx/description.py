@@ -94,7 +94,7 @@ class ImageInput(Options):
 
 
 class DepthOutput(Options):
-    """Output tensor of depth, with the quantity ``v = value * scale + shift``."""
+    """Output tensor of depth, whose values are converted to ``v = value * scale + shift``."""
 
     name: str
     output: Literal["depth", "disparity", "log-depth", "ray-length", "points"] = "depth"

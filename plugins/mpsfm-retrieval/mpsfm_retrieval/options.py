@@ -40,5 +40,5 @@ class AppearanceOptions(Options):
     sharpness: float = Field(15.0, gt=0)
     """Parameter of the kernel ``exp(-sharpness |x - y|^2)`` of two unit SIFT descriptors x, y."""
     color_share: float = Field(0.3, ge=0, lt=1)
-    """Weight of the color histogram in the similarity of two images. The SIFT features have the
-    remaining weight in the similarity."""
+    """Weight of the color histogram in the similarity of two images. The weight of the SIFT
+    features is one minus the weight of the color histogram."""

@@ -88,7 +88,7 @@ class PromptDepth:
             directory=options.directory,
             suffix=options.suffix,
             scale=options.scale,
-            relative_std=1.0,  # avoids transformers' warnings about unused depth maps
+            relative_std=1.0,  # provider ``files`` requires a std, not used here
         )
         self._sensor = DepthFiles(files, context)
         self._preparation: Preparation = preparation_for(self._model)

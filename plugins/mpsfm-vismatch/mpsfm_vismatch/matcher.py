@@ -55,7 +55,7 @@ class DenseMatcher:
 
     def __init__(self, options: CollectionOptions, context: ProviderContext) -> None:
         self._matcher = load(options.network, context, options.max_keypoints)
-        self._matcher.skip_ransac = True  # RANSAC in vismatch fits a homography
+        self._matcher.skip_ransac = True  # vismatch's RANSAC would fit a homography
         self._resize, self._seed = options.resize, context.seed
         self._first = _first_pixel(options.network)
 
