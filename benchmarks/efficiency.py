@@ -3,10 +3,10 @@
     python -m benchmarks.efficiency [--views 25 49 100 250 505]
 
 The scenes are the synthetic halls of :mod:`benchmarks.everyday`, with calibrated depth priors and
-prior maps as large as those of photos. The time of a step includes all called functions. The
-paper's times of global and local steps are summed. The paper's times are of ETH3D on the authors'
-machine, so compare the growth with the number of images. All scenes run in one process, from few to
-many images, so the largest scene so far determines the peak memory.
+prior maps as large as those of photos. The time of a mapping step includes all functions that the
+step calls. The paper's times of global and local steps are summed. The paper's times are of ETH3D
+on the authors' machine, so compare the growth with the number of images. All scenes run in one
+process, from few to many images, so the largest scene so far determines the peak memory.
 """
 
 from __future__ import annotations

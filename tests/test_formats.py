@@ -1,4 +1,4 @@
-"""Files that an earlier version wrote are read; those of a later one are refused, or made anew.
+"""Tests that files of earlier versions are read, and files of later versions refused or replaced.
 
 ``tests/golden/VERSION`` has a file of each format as that version wrote it
 (``python -m tests.golden.make``).
@@ -48,7 +48,7 @@ KEY = "0" * 64
 
 
 def results(folder: Path) -> Any:
-    """All that is read of a result folder."""
+    """Return all data that MP-SfM reads from a result folder."""
     found = ResultFolder.open(folder / "out")
     assert found.names == ["0.png", "1.png", "2.png"] == ExportSource.read(folder / "out").names
     assert found.model.num_reg_images() == 3 and len(found.dense_cloud()[0]) > 100
@@ -65,7 +65,8 @@ def depth(folder: Path) -> Any:
 
 
 def configuration(folder: Path) -> Any:
-    """The settings that the file has; later versions may have more."""
+    """Return the settings that the configuration file contains; later versions may have more
+    settings."""
     (folder / "set.yaml").write_text("extends: config.yaml\n")
     config = load_config(folder / "set.yaml").model_dump(mode="json")
     said = yaml.safe_load((folder / "config.yaml").read_text())
@@ -81,7 +82,7 @@ def contained(said: Any, found: Any) -> Any:
 
 
 def calibrated(path: Path) -> Any:
-    """The values that the maker set."""
+    """Return the calibration values that ``tests.golden.make`` sets."""
     values = load_calibration(path).model_dump()
     return {name: values[name] for name in ("std_scale", "relative_std")}
 
@@ -93,7 +94,8 @@ def speeds(folder: Path) -> Any:
 
 
 def frames(folder: Path) -> Any:
-    """Whether the frames would be taken as they are."""
+    """Return the folder of the reused frames, or "looked into" if the video would be decoded
+    again."""
     options = video.VideoOptions.model_validate(
         json.loads((folder / "frames" / "frames.json").read_text())["options"]
     )
@@ -109,8 +111,9 @@ def exchange(folder: Path) -> Any:
 
 
 class File(NamedTuple):
-    """``path``: that says its version. ``read``: gives what is in it. ``anew``: what it gives for a
-    file that may be newer, because it can be had again; such a file is refused where it is None.
+    """File of a format. ``path`` is relative to the golden folder, and ``read`` returns the
+    content. ``anew`` is the content that is read if a file of a later version is replaced, or None
+    if such a file is refused.
     """
 
     path: str
@@ -160,12 +163,12 @@ EXPECTED = {
 
 @pytest.fixture(params=VERSIONS)
 def golden(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A copy of the files of a version."""
+    """Return a copy of the golden files of one version."""
     return Path(shutil.copytree(GOLDEN / request.param, tmp_path / "golden"))
 
 
 def change_version(path: Path, version: int | None) -> None:
-    """Let a file say another version, or none."""
+    """Change the format version in a file, or remove the version."""
     if path.suffix == ".npz":
         with np.load(path) as archive:
             arrays = {name: archive[name] for name in archive.files if name != VERSION}
@@ -221,7 +224,7 @@ CLASSES = {
 
 
 def test_entries_of_the_cache_are_read_as_they_were_written(golden: Path) -> None:
-    """Else :data:`mpsfm_core.extraction.cache.FORMAT` has to be raised."""
+    """If this test fails, increase :data:`mpsfm_core.extraction.cache.FORMAT`."""
     written = json.loads((golden / "digests.json").read_text())
     cache = Cache(golden / "cache")
     assert {kind: digest(cache.load(kind, KEY, cls)) for kind, cls in CLASSES.items()} == written
@@ -240,7 +243,7 @@ def test_files_of_this_version_are_kept() -> None:
 
 
 def declared() -> dict[str, int]:
-    """Module -> the number that it gives its format."""
+    """Return the format version that each module declares, by module path."""
     found = {}
     for path in sorted((ROOT / "mpsfm_core").rglob("*.py")):
         if "templates" in path.parts:
@@ -269,7 +272,7 @@ def test_what_is_no_version_is_refused(version: object) -> None:
 @pytest.mark.parametrize("name", ["../old.txt", "/etc/passwd", "..", "", "a/b", 1])
 @pytest.mark.parametrize("key", ["entries", "new"])
 def test_an_exchange_touches_nothing_outside(key: str, name: object, tmp_path: Path) -> None:
-    """A folder of results that came from somebody else."""
+    """Test a manipulated result folder that refers to files outside the folder."""
     output = tmp_path / "out"
     scratch = output / ".mpsfm-x"
     (scratch / "new").mkdir(parents=True)

@@ -239,7 +239,7 @@ def _swap_sides(units: Sequence[_SetErrors], rng: np.random.Generator) -> list[_
 def _auc_differences(
     samples: Iterable[Sequence[_SetErrors]], convention: PoseConvention
 ) -> Float64:
-    """Compute pose AUC differences (samples, thresholds) in percent, second minus first."""
+    """Compute AUC differences (samples, thresholds) in percent, second minus first benchmark."""
     both = [
         [_compute_aucs([unit[k] for unit in sample], convention) for k in (0, 1)]
         for sample in samples

@@ -58,9 +58,10 @@ class Truth:
 
 @dataclass
 class World:
-    """Images and providers. ``calls``: ``(kind, image or pair)`` -> how often it was asked.
+    """Images and providers. ``calls`` counts provider calls by ``(kind, image or pair)``.
 
-    ``break_on``: what to return (or raise) instead. ``made``: providers that were constructed.
+    ``break_on`` has functions that return (or raise) a replacement of an output. ``made`` counts
+    the constructed providers by kind.
     """
 
     truth: Truth

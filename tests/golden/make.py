@@ -1,8 +1,8 @@
-"""Writes a file of each of our formats, as this version writes it: ``python -m tests.golden.make``.
+"""Write one file of each format of this version by ``python -m tests.golden.make``.
 
-They go into a folder named after the version, where the tests find them from then on: what was
-written once is read for ever, or refused in words. What is there is not touched; a new folder is
-made when a format has changed or a version is released.
+The files are written to a folder named after the version of MP-SfM. The tests check that later
+versions read these files, or refuse them with a clear message. Existing folders are not changed;
+create a new folder if a format has changed or a version is released.
 """
 
 from __future__ import annotations
@@ -71,11 +71,11 @@ STATE = {
     "poses": [{"rotation": np.eye(3), "support": 0.5}],
     "seen": {"a": [1, 2], "b": None},
 }
-"""State like that of a mapper, whose fields change with every version."""
+"""State with the data types of a mapper's state, whose own fields change with every version."""
 
 
 def entries() -> dict[str, Any]:
-    """An object of each class that the cache keeps, by kind."""
+    """Return one object of each class that the cache stores, by kind."""
     rng = np.random.default_rng(0)
     maps = rng.uniform(1, 2, (3, 4)).astype(np.float32)
     depth = DepthPrior(maps, maps**2, maps > 1.2, metric=False)
@@ -99,7 +99,7 @@ def entries() -> dict[str, Any]:
 
 
 def write_run(folder: Path, output: Path) -> None:
-    """A result folder, and the configuration of its run."""
+    """Write a result folder, and the configuration of its run."""
     for name in ("photos", "depth"):
         (folder / name).mkdir()
     for number, pose in enumerate(arc_poses(3, 12.0)):
@@ -112,11 +112,11 @@ def write_run(folder: Path, output: Path) -> None:
     reconstruct(folder / "photos", output / "out", folder / "run.yaml", intrinsics=intrinsics)
     config = load_config(folder / "run.yaml")
     (output / "config.yaml").write_text(config.to_yaml())
-    (output / "out" / "report.html").unlink()  # is made of the rest
+    (output / "out" / "report.html").unlink()  # written again from the other files
 
 
 def write_cache(output: Path) -> None:
-    """Entries of each kind, a checkpoint, hashes of weights, speeds."""
+    """Write cache entries of each kind, a checkpoint, hashes of weights, and stage speeds."""
     cache, found = Cache(output / "cache"), {}
     for kind, value in entries().items():
         cache.store(kind, KEY, value)
@@ -144,7 +144,7 @@ def write_cache(output: Path) -> None:
 
 
 def write_calibrations(output: Path) -> None:
-    """As YAML and JSON."""
+    """Write a calibration file as YAML and as JSON."""
     provenance = Provenance(
         provider="a", distribution="mpsfm-a 1.0", truth="maps", data="b", date="2026-01-01",
         core=core_version(), images=3, pixels=1000, weights={"a.onnx": "00"},
@@ -157,7 +157,7 @@ def write_calibrations(output: Path) -> None:
 
 
 def write_evaluation(output: Path) -> None:
-    """Sets of images and a record."""
+    """Write test sets and a benchmark record."""
     sets = {"minimal": [{"images": ["0.png", "1.png"]}], "triplets": {"0-5": [["0", "1", "2"]]}}
     write_sets(output, sets, "overlap from depth")  # type: ignore[arg-type]
     poses = {f"{k}.png": (np.eye(3), np.array([k, 0.0, 0.5])) for k in range(3)}
@@ -169,7 +169,7 @@ def write_evaluation(output: Path) -> None:
 
 
 def write_others(output: Path) -> None:
-    """Frames of a video, an environment, and what a run that was killed left of an exchange."""
+    """Write video frames, an environment, and the unfinished replacement of a killed run."""
     clip = output / "clip.avi"
     clip.write_bytes(b"not looked into")
     options = VideoOptions()
@@ -190,12 +190,12 @@ def write_others(output: Path) -> None:
             (fresh / "new.txt").write_text("new")
     os.waitpid(child, 0)
     (scratch,) = exchange.glob(".mpsfm-*")
-    (scratch / "old" / "nothing").touch()  # git keeps no empty folder
+    (scratch / "old" / "nothing").touch()  # git does not store empty folders
     scratch.rename(exchange / ".mpsfm-killed")
 
 
 def main() -> None:
-    """Write them all, with nothing of this machine in them."""
+    """Write all files, without paths of this machine."""
     output = HERE / core_version()
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary)

@@ -1,4 +1,4 @@
-"""What the views of a scene say of its depth priors."""
+"""Tests of depth noise, measured from the disagreement of the views of a scene."""
 
 from __future__ import annotations
 
@@ -29,12 +29,13 @@ Errors = Callable[[np.random.Generator, tuple[int, int]], Float64]
 
 
 def measured(errors: Errors, scales: tuple[float, ...] = (1.0, 1.0, 1.0)) -> DepthNoise:
-    """Of true poses, beside priors with relative errors and images with scales that are off."""
+    """Measure depth noise with true poses, priors with relative errors, and images with wrong
+    scales."""
     return measure_depth_noise(scene_with(errors, scales))
 
 
 def scene_with(errors: Errors, scales: tuple[float, ...] = (1.0, 1.0, 1.0)) -> Scene:
-    """True poses and their tracks beside such priors."""
+    """Create a scene with true poses and tracks, priors with relative errors, and wrong scales."""
     problem = make_mapping_problem(
         room_scene(), CAMERA, POSES, points_per_view=400, declared_depth_std=DECLARED
     )
@@ -55,12 +56,12 @@ def scene_with(errors: Errors, scales: tuple[float, ...] = (1.0, 1.0, 1.0)) -> S
 
 
 def independent(rng: np.random.Generator, shape: tuple[int, int]) -> Float64:
-    """Twice what is declared, in each pixel anew."""
+    """Return independent errors of each pixel with twice the declared std."""
     return 2 * DECLARED * rng.normal(size=shape)
 
 
 def smooth(rng: np.random.Generator, shape: tuple[int, int]) -> Float64:
-    """As large, the same over an eighth of the map's width."""
+    """Return errors with twice the declared std, correlated over an eighth of the map's width."""
     noise = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), shape[1] / 8)
     return np.asarray(2 * DECLARED * noise / noise.std())
 
@@ -81,7 +82,8 @@ def test_smooth_errors_are_measured_as_large_as_they_are_and_correlated() -> Non
 
 
 def test_fewer_independent_errors_than_unknowns_are_fitted_to_say_less() -> None:
-    """Two views have one pair for the unknowns of one pose, three have three for two."""
+    """Two views have one pair to estimate one pose, but three views have three pairs for two
+    poses."""
 
     def ratio(errors: Errors) -> float:
         scene = scene_with(errors)
@@ -119,7 +121,7 @@ def test_noise_is_measured_where_a_prior_is_off(views: int) -> None:
     assert noise.shape == scene.maps[1].valid.shape
     columns = noise.shape[1]
     middle = noise[round(0.4 * columns), round(0.45 * columns)]
-    declared = DECLARED / np.exp(0.2)  # of the depth that is too far
+    declared = DECLARED / np.exp(0.2)  # keypoints at the depth that is too far
     assert middle == pytest.approx(0.2 / declared / np.sqrt(2), rel=0.1)
     assert np.median(noise) == 1.0
     no_points = np.zeros(len(scene.maps[1].keypoints), np.bool_)

@@ -1,4 +1,4 @@
-"""What matches say of how keypoints err."""
+"""Tests of keypoint noise, measured from the epipolar errors of matches."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ SCALE = 0.65
 
 
 def scene_of(noise_px: float, *, tails: bool = False, wrong: float = 0.0) -> Scene:
-    """Nine views of a hall at their true poses; with tails, every fourth keypoint errs 8 times as
-    much."""
+    """Return nine views of a hall at true poses; ``tails`` increases the noise of every fourth
+    keypoint."""
     hall = make_hall_problem(9, keypoint_noise_px=noise_px, wrong_matches=wrong, seed=1)
     scene = Scene(hall.problem)
     for number, image in enumerate(hall.problem.images):
@@ -45,7 +45,7 @@ def test_clean_keypoints_get_a_loss_near_least_squares(wrong: float) -> None:
 
 def test_keypoints_with_tails_keep_their_loss() -> None:
     scene = scene_of(0.7, tails=True)
-    # most keypoints are better than they declare, as learned ones are
+    # most keypoints are more accurate than declared, as learned keypoints are
     scene.keypoint_std_px *= 2
     assert measure_loss_scale(scene, SCALE) == SCALE
 

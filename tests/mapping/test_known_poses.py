@@ -1,4 +1,4 @@
-"""Images that come with poses: kept, continued, and what when they share no points."""
+"""Tests of images with known poses: fixed, refined, or without common points."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RING = [(0, 1), (1, 2), (2, 3), (3, 4)]
 
 
 def with_poses(problem: MappingProblem, poses: dict[int, Float64]) -> MappingProblem:
-    """The problem whose images bring some poses along."""
+    """Return the mapping problem with known poses of some images."""
     images = tuple(
         replace(image, known_pose=(poses[i][:, :3].copy(), poses[i][:, 3].copy()))
         if i in poses
@@ -34,7 +34,7 @@ def with_poses(problem: MappingProblem, poses: dict[int, Float64]) -> MappingPro
 
 
 def depth_ratio(image: RegisteredImage, poses: list[Float64]) -> float:
-    """Median of refined over true depth."""
+    """Return the median ratio of refined to true depth of an image."""
     rows, columns = image.depth.shape
     truth = room_scene().render(CAMERA.resized(columns, rows), poses[image.index]).depth
     return float(np.median(image.depth.depth[image.depth.valid] / truth[image.depth.valid]))
@@ -90,7 +90,8 @@ def test_images_without_a_pose_are_left_out_beside_fixed_ones() -> None:
 
 @pytest.fixture
 def apart() -> tuple[MappingProblem, list[Float64]]:
-    """A chain of five images; every other one has a pose, and none of these match."""
+    """Return a chain of five images, of which images 0, 2 and 4 have known poses but no common
+    matches."""
     poses = arc_poses(5, 14.0)
     problem = make_mapping_problem(room_scene(), CAMERA, poses, links=RING)
     return with_poses(problem, {i: poses[i] for i in (0, 2, 4)}), poses

@@ -1,4 +1,4 @@
-"""The whole mapper on analytic scenes with a known solution."""
+"""Tests of the whole mapper on analytic scenes with a known solution."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
 
 
 def relative_errors_deg(reconstruction: Reconstruction, poses: list[Float64]) -> Float64:
-    """Largest of rotation and translation-direction error of each pair of registered views."""
+    """Return the larger of rotation and translation direction error of each pair of registered
+    views."""
     errors = []
     for a in reconstruction.images:
         for b in reconstruction.images:
@@ -38,7 +39,7 @@ def relative_errors_deg(reconstruction: Reconstruction, poses: list[Float64]) ->
 
 
 def depth_errors(result: Reconstruction, problem: MappingProblem, poses: list[Float64]) -> Float64:
-    """Median relative depth error of each refined map."""
+    """Return the median relative error of each refined depth map."""
     scene = room_scene()
     errors = []
     for image in result.images:
@@ -83,7 +84,7 @@ def test_the_scale_is_metric(
 
 
 def test_the_result_is_the_same_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Run by run, and with one thread or two."""
+    """Results of repeated runs are identical, with one thread and with two."""
     monkeypatch.setattr(bundle_problem, "RANGE_SIZE", 300)  # several ranges, so several threads
     poses = arc_poses(4, 12.0)
     noise = SyntheticNoise(keypoints_px=0.7, scale=0.05, depth=0.02)
@@ -105,7 +106,7 @@ def test_the_result_is_the_same_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_chain_of_two_view_links_is_registered_by_lifting() -> None:
-    """No point is seen by three views through matches: COLMAP could not pass the scale on."""
+    """No three views observe a common point, so COLMAP could not propagate the scale."""
     poses = arc_poses(4, 20.0)
     noise = SyntheticNoise(keypoints_px=0.5, scale=0.03, depth=0.01)
     problem = make_mapping_problem(

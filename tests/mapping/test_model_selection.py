@@ -1,4 +1,4 @@
-"""Several runs with other random choices, of which the one that explains most counts."""
+"""Tests of model selection among runs with different seeds, by the share of explained matches."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 @pytest.fixture(scope="module")
 def problem() -> MappingProblem:
-    """Four views on an arc."""
+    """Return the mapping problem of four views on an arc."""
     return make_mapping_problem(
         room_scene(), CAMERA, arc_poses(4, 21.0), noise=SyntheticNoise(keypoints_px=0.3, depth=0.01)
     )
 
 
 def with_false_matches(problem: MappingProblem, share: float) -> MappingProblem:
-    """Of each pair so many matches, as a share, lead to wrong keypoints."""
+    """Return the problem with a share of wrong matches in each pair."""
     pairs = []
     for pair in problem.pairs:
         matches = pair.matches.copy()
@@ -77,7 +77,7 @@ def test_runs_that_come_to_the_same_are_the_last(problem: MappingProblem) -> Non
 
 
 class Scripted:
-    """A mapper whose runs are given: of each, what its groups explain."""
+    """Mapper whose runs are given by the share of matches that each component explains."""
 
     script: Sequence[Sequence[float]] = ()
     is_deterministic = False
@@ -89,7 +89,7 @@ class Scripted:
         self.explained = self.script[options.seed]
 
     def run(self, paused: object = None) -> MapperRun:
-        # a group's only mark is here how much it explains
+        # the points of a model identify the component by its explained share
         models = [Reconstruction((), np.full((1, 3), e), np.zeros(1)) for e in self.explained]
         report = MappingReport(seconds={"all": 2.0}, counts={"all": 1})
         return MapperRun(models, self.explained, report)
@@ -134,7 +134,8 @@ def test_poses_that_stay_leave_nothing_to_chance(
 
 
 def test_a_tie_goes_to_what_came_out_twice(problem: MappingProblem) -> None:
-    """A run that stands alone has to explain clearly more than two that came to the same."""
+    """A single run is selected only if it explains clearly more than two runs with the same
+    result."""
     (model,) = reconstruct(problem).reconstructions
 
     def run(size: int, explained: float) -> MapperRun:
@@ -148,7 +149,7 @@ def test_a_tie_goes_to_what_came_out_twice(problem: MappingProblem) -> None:
 
 
 def test_of_runs_that_are_alike_that_counts_in_which_depth_agrees(problem: MappingProblem) -> None:
-    """Of two that explain as much, though one image of one sees past all others."""
+    """If two runs explain equally many matches, the depth maps must agree in the selected run."""
     (model,) = reconstruct(problem).reconstructions
     *rest, last = model.images
     turned = np.diag([-1.0, 1.0, -1.0])

@@ -1,4 +1,4 @@
-"""Bundle adjustment of depth scales: priors on scales, the unit of the world, refined depth."""
+"""Tests of depth scales in bundle adjustment: priors on scales, world unit, refined depth."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def mapped(declared_depth_std: float, *, nearer: float = 1.0) -> Component:
 
 
 def push(group: Component, image: int, factor: float) -> None:
-    """Move the points an image sees along its rays."""
+    """Scale the distances of an image's observed points from the camera center."""
     scene = group.scene
     seen = np.unique(scene.tracks.point_of[scene.graph.keypoints_of(image)])
     seen = seen[seen >= 0]
@@ -46,11 +46,11 @@ def push(group: Component, image: int, factor: float) -> None:
 
 @pytest.mark.parametrize("metric", [True, False])
 def test_a_metric_prior_has_the_scale_of_the_others_where_nothing_else_tells(metric: bool) -> None:
-    """A view and its points, 20 % larger together, look as right as before to that view alone."""
+    """If a view and its points are enlarged by 20 %, the observations of this view still fit."""
     group = mapped(0.01)
     scene = group.scene
     seen = scene.tracks.point_of[scene.graph.keypoints_of(2)]
-    for image in (0, 1):  # leave the view alone with its points
+    for image in (0, 1):  # remove the other views' observations of these points
         shared = np.arange(*scene.graph.offsets[image : image + 2])
         shared = shared[np.isin(scene.tracks.point_of[shared], seen[seen >= 0])]
         scene.tracks.remove_observations(shared, min_length=1)

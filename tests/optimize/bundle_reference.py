@@ -1,4 +1,4 @@
-"""Scenes for bundle adjustment, and Ceres as its oracle (through pycolmap and pyceres)."""
+"""Bundle adjustment problems, and their reference solution by Ceres (pycolmap and pyceres)."""
 
 from __future__ import annotations
 
@@ -23,16 +23,17 @@ def soft_l1(**changes: Any) -> BundleOptions:
 
 
 def rotation(vector: Float64) -> Float64:
-    """Rotation matrix of a rotation vector."""
+    """Return the rotation matrix of a rotation vector."""
     matrix: Float64 = pycolmap.Rotation3d(np.asarray(vector, dtype=np.float64)).matrix()
     return matrix
 
 
 def make_problem(images: int, points: int, track: float, seed: int = 0) -> BundleProblem:
-    """Cameras that walk past a slab of points, each seen by neighbouring images.
+    """Create cameras that move past a slab of points, each observed by neighboring images.
 
-    Cameras and points are the true ones, the measurements noisy: 1 px with 3 % outliers, 5 % in
-    depth with heavy tails. One camera, the first pose constant. ``track``: mean track length.
+    Cameras and points are true; measurements have noise of 1 px with 3 % outliers, and of 5 % in
+    depth with heavy tails. All images share a camera, and the first pose is constant. ``track`` is
+    the mean track length.
     """
     rng = np.random.default_rng(seed)
     length = np.clip(rng.poisson(track - 2, points) + 2, 2, images)
@@ -67,7 +68,7 @@ def make_problem(images: int, points: int, track: float, seed: int = 0) -> Bundl
 
 
 def perturb(problem: BundleProblem, seed: int, amount: float = 1.0) -> BundleProblem:
-    """A start: poses (but the first two) and points moved, 2 % of the points grossly."""
+    """Perturb all poses except the first two, and all points, of which 2 % have gross errors."""
     rng = np.random.default_rng(seed)
     rotations, translations = problem.rotations.copy(), problem.translations.copy()
     for i in range(2, len(rotations)):
@@ -79,12 +80,12 @@ def perturb(problem: BundleProblem, seed: int, amount: float = 1.0) -> BundlePro
 
 
 def without_depth(problem: BundleProblem) -> BundleProblem:
-    """The plain problem, in which the second image fixes the scale."""
+    """Return the problem without depth, in which the pose of the second image fixes the scale."""
     return replace(problem, obs_log_depth=None, scale_anchor=1)
 
 
 def to_pycolmap(problem: BundleProblem) -> pycolmap.Reconstruction:
-    """The same scene as a reconstruction (ids are indices plus 1).
+    """Convert a bundle problem to a COLMAP reconstruction, whose ids are the indices plus 1.
 
     Cameras are SIMPLE_RADIAL if the problem has radial distortions, else PINHOLE if their focal
     lengths differ, else SIMPLE_PINHOLE.
@@ -131,7 +132,7 @@ def ceres_adjuster(
     refine_radial: bool = False,
     fix_scale: bool = True,
 ) -> Any:
-    """Pycolmap's adjuster with our defaults: soft-L1 loss, first pose (and scale) constant."""
+    """Create pycolmap's bundle adjuster with soft-L1 loss and constant first pose (and scale)."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = refine_focal
     options.refine_extra_params = refine_radial
@@ -153,7 +154,8 @@ def ceres_adjuster(
 
 
 class LogDepthCost(pyceres.CostFunction):  # type: ignore[misc]
-    """(log z - log d - s) / std on a pose (quaternion xyzw, translation), a point and the scale."""
+    """Ceres cost (log z - log d - s) / std of a pose (quaternion xyzw, translation), point and
+    scale."""
 
     def __init__(self, log_depth: float, std: float) -> None:
         super().__init__()
@@ -188,7 +190,7 @@ class LogDepthCost(pyceres.CostFunction):  # type: ignore[misc]
 
 
 class ScaleCost(pyceres.CostFunction):  # type: ignore[misc]
-    """(s - expected) / std of the logarithm of a scale."""
+    """Ceres cost (s - expected) / std of a log scale s."""
 
     def __init__(self, expected: float, std: float) -> None:
         super().__init__()
@@ -206,7 +208,7 @@ class ScaleCost(pyceres.CostFunction):  # type: ignore[misc]
 
 
 class RadialCost(pyceres.CostFunction):  # type: ignore[misc]
-    """k / std of the parameters of a SIMPLE_RADIAL camera."""
+    """Ceres cost k / std of the radial distortion k of a SIMPLE_RADIAL camera."""
 
     def __init__(self, std: float) -> None:
         super().__init__()
@@ -223,7 +225,8 @@ class RadialCost(pyceres.CostFunction):  # type: ignore[misc]
 
 
 class LogFocalCost(pyceres.CostFunction):  # type: ignore[misc]
-    """(log f - mean) / std of the ``size`` parameters of a camera, the first of which is f."""
+    """Ceres cost (log f - mean) / std of a camera with ``size`` parameters, where f is the
+    first."""
 
     def __init__(self, mean: float, std: float, size: int) -> None:
         super().__init__()
@@ -246,10 +249,10 @@ class LogFocalCost(pyceres.CostFunction):  # type: ignore[misc]
 def solve_with_ceres(
     problem: BundleProblem, *, refine_focal: bool = False
 ) -> tuple[float, float, pycolmap.Reconstruction, Float64]:
-    """Initial and final cost of the problem in Ceres, the reconstruction it leaves, and the
-    logarithms of the scales (n,).
+    """Solve a problem with Ceres; return initial and final cost, reconstruction and log scales
+    (n,).
 
-    All poses but the first and all points are variable, as :func:`make_problem` has it.
+    All poses except the first and all points are variable, as in :func:`make_problem`.
     """
     rec = to_pycolmap(problem)
     plain = problem.obs_log_depth is None
@@ -281,7 +284,7 @@ def solve_with_ceres(
             keep.append(LogDepthCost(problem.obs_log_depth[k], std[k]))
             scale = log_scales[int(problem.obs_image[k])]
             ceres.add_residual_block(keep[-1], loss, [pose, point, scale])
-        # a constant pose becomes variable with the first residual that is added on it
+        # adding a residual makes a constant pose variable
         ceres.set_parameter_block_constant(rec.images[1].frame.rig_from_world.params)
         free = np.zeros(count, bool) if problem.variable_scale is None else problem.variable_scale
         expected = np.zeros(count)
@@ -300,10 +303,10 @@ def solve_with_ceres(
 def whitened_residuals(
     problem: BundleProblem, points: Float64 | None = None, *, robust: bool = True
 ) -> Float64:
-    """(m, 3): reprojection and log-depth residuals in plain numpy, 0 where there is no depth.
+    """Compute reprojection and log-depth residuals (m, 3) with numpy, 0 without depth.
 
-    ``robust``: multiplied by the square roots of the default losses' weights at the problem's
-    own points, so that their Jacobian is that of the normal equations.
+    If ``robust`` is set, residuals are multiplied by the square roots of the loss weights at the
+    points of ``problem``, so that their Jacobian yields the normal equations.
     """
     if robust:
         fixed = whitened_residuals(problem, robust=False)
@@ -330,10 +333,10 @@ def whitened_residuals(
 
 
 def dense_information(problem: BundleProblem) -> Float64:
-    """J^T J by central differences over free poses (6 each), points, log focal lengths and, if the
-    problem has them, radial distortions.
+    """Compute J^T J by central differences over poses, points, log focal lengths and distortions.
 
-    The weights of the robust losses are those at the problem's own state.
+    The weights of the robust losses are those at the state of ``problem``. Each variable pose has 6
+    parameters, and radial distortions are optional.
     """
     poses, cameras = np.flatnonzero(problem.variable_pose), len(problem.intrinsics)
     sizes = 6 * len(poses), problem.points.size, cameras, 0 if problem.radial is None else cameras
@@ -368,7 +371,7 @@ def dense_information(problem: BundleProblem) -> Float64:
 
 
 def dense_point_information(problem: BundleProblem) -> Float64:
-    """J^T J (3p, 3p) of all points by central differences, robust weights included."""
+    """Compute J^T J (3p, 3p) of all points by central differences, with robust weights."""
     count = problem.points.size
     jacobian = np.empty((3 * len(problem.obs_image), count))
     for n in range(count):

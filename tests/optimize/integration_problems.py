@@ -1,4 +1,4 @@
-"""Small problems for the tests of depth integration."""
+"""Small problems for tests of depth integration."""
 
 import numpy as np
 
@@ -22,7 +22,7 @@ def normal_prior(normals, std=0.05, valid=None) -> NormalPrior:
 
 
 def random_problem(shape, seed, *, masked=0.0):
-    """Rough depth and unrelated normals, with anchors everywhere."""
+    """Create a problem of rough depth and unrelated normals, with anchor points everywhere."""
     rng = np.random.default_rng(seed)
     depth = np.exp(rng.normal(1.0, 0.1, shape))
     normals = rng.normal(0, 0.5, (*shape, 3)) - (0, 0, 1)

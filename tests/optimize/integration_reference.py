@@ -1,7 +1,7 @@
-"""Depth integration written out with sparse matrices: slow, plain, and independent of the kernels.
+"""Reference implementation of depth integration with sparse matrices, independent of the kernels.
 
-The tests compare the kernels with it, the benchmark races against it. Every pixel must have a depth
-or no data at all.
+Tests compare the kernels with this reference, and benchmarks compare the run times. Every pixel
+must have either depth or no data at all.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 def grid_operator(east: NDArray[Any], south: NDArray[Any], mass: NDArray[Any]) -> sp.csr_array:
-    """The five-point operator of `mpsfm_core.optimize.multigrid` as a sparse matrix."""
+    """Return the five-point operator of `mpsfm_core.optimize.multigrid` as a sparse matrix."""
     index = np.arange(mass.size).reshape(mass.shape)
     matrix = sp.diags_array(mass.ravel().astype(np.float64))
     for coupling, step in ((east[:, :-1], (0, 1)), (south[:-1], (1, 0))):
@@ -40,7 +40,7 @@ def grid_operator(east: NDArray[Any], south: NDArray[Any], mass: NDArray[Any]) -
 
 
 class Axis(NamedTuple):
-    """One-sided residuals along an axis: slope * difference @ z + normal, ahead and behind."""
+    """One-sided residuals ``slope * difference @ z + normal`` along an axis in both directions."""
 
     slope: Array
     normal: Array
@@ -52,7 +52,7 @@ class Axis(NamedTuple):
 
 
 class System(NamedTuple):
-    """Energy, half its gradient (n,), and the matrix of the majorizer (n, n)."""
+    """Energy, half of the energy's gradient (n,), and the matrix (n, n) of the majorizer."""
 
     energy: float
     gradient: Array
@@ -60,7 +60,7 @@ class System(NamedTuple):
 
 
 class ReferenceIntegration:
-    """The energy of one image over z (n,), row by row."""
+    """Energy of depth integration of one image as a function of log depth z (n,), row-major."""
 
     def __init__(
         self,
@@ -129,7 +129,8 @@ class ReferenceIntegration:
     def _differences(
         self, has_next: NDArray[np.bool_], step: int
     ) -> tuple[sp.csr_array, NDArray[np.bool_]]:
-        """Rows z[p + step] - z[p], and where they exist."""
+        """Return the matrix of differences z[p + step] - z[p], and the mask of pixels that have
+        one."""
         count = len(has_next)
         linked = np.zeros(count, bool)
         linked[: count - step] = (has_next & self.active)[: count - step] & self.active[step:]
@@ -139,7 +140,7 @@ class ReferenceIntegration:
         return sp.csr_array(sp.coo_array(entries, shape=(count, count))), linked
 
     def linearise(self, z: Array) -> System:
-        """Energy and majorizer at z."""
+        """Compute energy and majorizer at the log depth z."""
         matrix, gradient, energy = self._prior(z)
         for axis in self.axes:
             ahead = axis.slope * (axis.ahead @ z) + axis.normal
@@ -171,7 +172,7 @@ class ReferenceIntegration:
         return (full - total) / k, shares[0], shares[1]
 
     def _prior(self, z: Array) -> tuple[Any, Array, float]:
-        """Depth prior and sparse points."""
+        """Add the terms of the depth prior and of sparse points."""
         offset = z - self.prior
         square = self.prior_precision * offset**2
         scale = self.options.prior_scale**2
@@ -196,7 +197,7 @@ class ReferenceIntegration:
         max_iterations: int = 10,
         target: float = 0.0,
     ) -> tuple[Array, list[float]]:
-        """The published schedule: a full Jacobi-CG solve before each re-weighting.
+        """Minimize by the published schedule, with a full Jacobi-CG solve before each re-weighting.
 
         Returns the map and the energies before each re-weighting and at the end; stops early when
         the energy reaches `target`.

@@ -1,4 +1,5 @@
-"""Bundle adjustment: Ceres' optimum, all modes, single views, gross errors, degenerate input."""
+"""Bundle adjustment: Tests of bundle adjustment against Ceres, with single views, gross errors,
+degenerate input."""
 
 from dataclasses import fields, replace
 
@@ -67,7 +68,7 @@ def test_same_optimum_as_ceres_with_depth(seed: int) -> None:
 @pytest.mark.parametrize("std", [0.02, np.inf])
 @pytest.mark.parametrize("expected", [None, 0.05])
 def test_same_optimum_as_ceres_with_scales_of_depth(std: float, expected: float | None) -> None:
-    """Depth maps that are off by 10 % each; beside what is expected of that, and without."""
+    """Depth maps have scale errors of 10 %, with and without a prior on the scales."""
     assert_same_optimum(with_scales(perturb(make_problem(6, 60, 3.5), 0), std, expected))
 
 
@@ -87,7 +88,7 @@ def with_scales(problem: BundleProblem, std: float, expected: float | None) -> B
 
 
 def test_scales_of_exact_depth_are_found() -> None:
-    """All scales except that of the first image are variable."""
+    """All depth scales except that of the first image are variable."""
     truth = exact(make_problem(6, 200, 4))
     off = np.array([0.0, 0.1, -0.2, 0.3, 0.0, -0.1])
     wrong = replace(truth, obs_log_depth=truth.obs_log_depth + off[truth.obs_image])
@@ -136,7 +137,7 @@ def test_same_optimum_as_ceres_with_focal_length(depth: bool) -> None:
 @pytest.mark.parametrize("depth", [True, False])
 @pytest.mark.parametrize("aspect", [1.0, 1.25])
 def test_same_optimum_as_ceres_with_two_cameras(depth: bool, aspect: float) -> None:
-    """SIMPLE_PINHOLE beside SIMPLE_PINHOLE, both focal lengths refined, or beside PINHOLE."""
+    """The second camera is another SIMPLE_PINHOLE whose focal length is refined, or a PINHOLE."""
     one = perturb(make_problem(8, 120, 5), 0)
     fx, fy, cx, cy = one.intrinsics[0]
     other = np.array([0.8 * fx, 0.8 * fy * aspect, cx + 30, cy - 20])
@@ -154,7 +155,7 @@ def test_same_optimum_as_ceres_with_two_cameras(depth: bool, aspect: float) -> N
 
 
 def test_focal_length_per_camera() -> None:
-    """Each image with its own wrong focal length; exact measurements give all of them back."""
+    """Each image has another wrong focal length; exact measurements recover all focal lengths."""
     truth = exact(make_problem(6, 200, 5))
     truth = replace(
         truth,
@@ -186,7 +187,7 @@ def test_adjust_bundle_with_focal_prior_reaches_ceres_optimum(depth: bool) -> No
 def test_adjust_bundle_with_radial_distortion_reaches_ceres_optimum(
     depth: bool, prior_std: float, radial: float
 ) -> None:
-    """Observations of a SIMPLE_RADIAL camera, from no distortion and a wrong focal length."""
+    """A SIMPLE_RADIAL camera is refined from zero distortion and a wrong focal length."""
     start = perturb(distorted(make_problem(8, 120, 5), radial), 0)
     start = replace(
         start,
@@ -232,7 +233,7 @@ def with_two_cameras(problem: BundleProblem) -> BundleProblem:
 
 
 def distorted(problem: BundleProblem, radial: float) -> BundleProblem:
-    """The problem with observations of a camera with radial distortion, and the same noise."""
+    """Return the problem with radially distorted observations and unchanged noise."""
     noise = whitened_residuals(problem, robust=False)[:, :2]
     bent = replace(problem, radial=np.full(len(problem.intrinsics), radial))
     return replace(bent, obs_xy=exact(bent).obs_xy - noise)
@@ -243,7 +244,7 @@ def distorted(problem: BundleProblem, radial: float) -> BundleProblem:
 def test_adjust_bundle_intrinsic_stds_match_the_dense_hessian(
     dense_poses: int, prior_std: float
 ) -> None:
-    """The inverse of J^T J by finite differences over poses, points and two cameras."""
+    """The stds equal those of the inverse of J^T J by finite differences over all parameters."""
     problem = replace(
         with_two_cameras(make_problem(4, 40, 4)),
         prior_std_log_focals=prior_std,
@@ -271,7 +272,7 @@ def test_adjust_bundle_focal_std_is_nan_if_constant_and_infinite_if_unobserved()
 
 
 def exact(problem: BundleProblem) -> BundleProblem:
-    """The problem with noise-free measurements."""
+    """Return the problem with noise-free measurements."""
     residual = whitened_residuals(problem, robust=False)
     return replace(
         problem,
@@ -308,7 +309,7 @@ def test_poses_only() -> None:
 
 
 def test_local() -> None:
-    """Two variable poses among constant ones; some points constant."""
+    """Two poses and most points are variable; all other poses and points are constant."""
     truth = exact(make_problem(6, 300, 4))
     variable_pose = np.isin(np.arange(6), [2, 3])
     variable_point = np.random.default_rng(0).random(300) < 0.7
@@ -363,7 +364,7 @@ def test_conjugate_gradients_reach_the_dense_optimum(plain: bool) -> None:
 
 
 def test_result_does_not_depend_on_threads() -> None:
-    """Bit for bit, and from run to run; the problem is large enough for several ranges."""
+    """Results are bitwise identical; the problem is large enough for several observation ranges."""
     start = perturb(make_problem(12, 6000, 4.5), 0)
     assert len(start.obs_image) > 24_000
     results = [adjust_bundle(start, soft_l1(threads=n)) for n in (1, 2, 3, 2)]
@@ -416,7 +417,7 @@ def test_integer_types_and_strides_of_the_input_do_not_matter() -> None:
 
 
 def one_camera(points: Float64, **changes: object) -> BundleProblem:
-    """A constant camera at the origin that sees each point once, at the image centre."""
+    """Return a constant camera at the origin that observes each point at the image center."""
     count = len(points)
     problem = BundleProblem(
         rotations=np.eye(3)[None],
@@ -474,7 +475,8 @@ def test_points_behind_the_camera_count_nothing_and_stay() -> None:
 
 
 def test_nothing_is_gained_by_leaving_the_view() -> None:
-    """Measurements that no point in front of both cameras fits; the best point is behind one."""
+    """No point in front of both cameras fits the measurements; the best point is behind a
+    camera."""
     start = BundleProblem(
         rotations=np.stack([np.eye(3), np.eye(3)]),
         translations=np.array([[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]),
@@ -572,7 +574,7 @@ def test_indices_out_of_range_are_named(field: str, value: int) -> None:
 
 @st.composite
 def degenerate_problems(draw: st.DrawFn) -> BundleProblem:
-    """Few images and points at random, many of them coinciding, collinear, behind or far away."""
+    """Draw few random images and points, many coinciding, collinear, behind cameras or far away."""
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     images, points = draw(st.integers(1, 5)), draw(st.integers(1, 12))
     count = draw(st.integers(0, 40))
@@ -619,7 +621,7 @@ def degenerate_problems(draw: st.DrawFn) -> BundleProblem:
 def test_degenerate_geometry(
     problem: BundleProblem, reprojection_loss: Loss, depth_loss: Loss, dense: bool
 ) -> None:
-    """No exception, no warning (they are errors), nothing but finite numbers, no cost increase."""
+    """Degenerate problems cause no exception, warning, infinite value or cost increase."""
     options = soft_l1(
         reprojection_loss=reprojection_loss,
         depth_loss=depth_loss,

@@ -1,4 +1,4 @@
-"""Derivatives and elimination against finite differences and dense linear algebra."""
+"""Tests of derivatives and Schur elimination against finite differences and dense algebra."""
 
 from dataclasses import replace
 
@@ -20,7 +20,7 @@ def small_problem() -> BundleProblem:
     poses, scales of depth and points, a track that sees an image twice, missing depth, a single
     view."""
     problem = perturb(make_problem(5, 12, 3), seed=3)
-    # the longest track sees its last image twice
+    # the longest track has two observations in its last image
     point = np.bincount(problem.obs_point).argmax()
     twice = np.flatnonzero(problem.obs_point == point)[-1]
     single = np.flatnonzero(problem.obs_point == 0)[1:]
@@ -62,7 +62,7 @@ def moved(p: PreparedBundle, delta: Float64, points: Float64) -> kernels.BundleP
 def sights(
     p: PreparedBundle, state: kernels.BundleParameters
 ) -> list[kernels.LinearizedObservation]:
-    """All observations, in the kernels' order."""
+    """Return all observations in the order of the kernels."""
     points = np.repeat(np.arange(len(state.points)), np.diff(p.bundle.obs.start))
     return [
         kernels.linearize_observation(k, point, p.bundle, state) for k, point in enumerate(points)
@@ -70,7 +70,7 @@ def sights(
 
 
 def residuals(p: PreparedBundle, state: kernels.BundleParameters) -> Float64:
-    """(3 m + s,) whitened residuals, those of scales last, computed in plain numpy."""
+    """Compute whitened residuals (3 m + s,) with numpy, those of scales last."""
     obs, layout = p.bundle.obs, p.bundle.layout
     points = np.repeat(np.arange(len(state.points)), np.diff(obs.start))
     camera = np.einsum("mij,mj->mi", state.rotations[obs.image], state.points[points])
@@ -86,7 +86,7 @@ def residuals(p: PreparedBundle, state: kernels.BundleParameters) -> Float64:
 
 
 def numeric_jacobian(p: PreparedBundle) -> Float64:
-    """Jacobian (3 m + s, d + 3 v) of the residuals: camera side, then variable points."""
+    """Compute the Jacobian (3 m + s, d + 3 v) of camera parameters, then of variable points."""
     poses, focals = len(p.bundle.layout.pair), int(p.bundle.layout.focal_slot.max()) + 1
     size = kernels.NUM_IMAGE_PARAMS * poses + focals
     variable = np.flatnonzero(p.bundle.layout.variable_point)
@@ -175,7 +175,7 @@ def test_one_residual_at_random_poses(kind: str) -> None:
 
 @pytest.mark.parametrize("sparse", [False, True])
 def test_step_solves_the_damped_normal_equations(sparse: bool, monkeypatch) -> None:
-    """Elimination, borders, back-substitution and the promised decrease, against dense algebra."""
+    """The Schur complement step and its predicted cost decrease equal dense linear algebra."""
     options = soft_l1(
         reprojection_loss=Loss.TRIVIAL,
         depth_loss=Loss.TRIVIAL,
@@ -187,7 +187,7 @@ def test_step_solves_the_damped_normal_equations(sparse: bool, monkeypatch) -> N
     jacobian = numeric_jacobian(p)
     gradient = jacobian.T @ residuals(p, p.state)
     matrix = jacobian.T @ jacobian
-    # poses and focal lengths are damped each by its own diagonal, points by their mean one
+    # a point is damped by the mean of its three diagonal entries, other parameters by their own
     size = len(gradient) - 3 * p.bundle.layout.variable_point.sum()
     diagonal = np.diagonal(matrix).copy()
     diagonal[size:] = np.repeat(diagonal[size:].reshape(-1, 3).mean(axis=1), 3)
@@ -197,7 +197,7 @@ def test_step_solves_the_damped_normal_equations(sparse: bool, monkeypatch) -> N
         normal = SchurComplementSolver(p, options, run)
         cost = normal.linearize(p.state, damping)
         trial = kernels.BundleParameters(*(np.empty_like(array) for array in p.state))
-        # a huge tolerance: no point moves by itself after the joint step
+        # an infinite tolerance disables the separate refinement of points after the joint step
         normal.tolerance = np.inf
         _, _, promised = normal.step(p.state, trial, damping, cost)
     assert cost == pytest.approx(0.5 * np.sum(residuals(p, p.state) ** 2), rel=1e-12)

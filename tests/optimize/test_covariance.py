@@ -1,4 +1,4 @@
-"""Point covariances against a dense inverse, COLMAP and sampling."""
+"""Tests of point covariances against a dense inverse, COLMAP and sampling."""
 
 from dataclasses import replace
 
@@ -58,7 +58,7 @@ def test_depth_lowers_the_variance() -> None:
 
 
 def test_predicts_the_scatter_of_triangulated_depth() -> None:
-    """Two exact cameras, 1 px noise: linearised triangulation scatters as the covariance says."""
+    """With 1 px noise in two exact cameras, triangulated points have the predicted covariance."""
     rng = np.random.default_rng(0)
     turns = np.stack([rotation(np.array([0, 0.1, 0])), rotation(np.array([0.1, -0.2, 0.3]))])
     point = np.array([0.2, -0.1, 4.0])
@@ -101,7 +101,7 @@ def test_depth_variance_is_the_rotated_last_entry() -> None:
 
 
 def test_unobserved_directions_have_huge_but_finite_variance() -> None:
-    """A single view at any distance, a point behind the camera, and one that nothing sees."""
+    """Test points of a single view, a point behind the camera, and a point without observation."""
     problem = BundleProblem(
         rotations=rotation(np.array([0.3, -0.2, 0.1]))[None],
         translations=np.zeros((1, 3)),

@@ -1,4 +1,5 @@
-"""Depth integration: the kernels equal the written-out energy, descend it, and repair depth."""
+"""Tests that kernels of depth integration equal the reference energy, reduce it and repair
+depth."""
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -54,7 +55,7 @@ def test_energy_gradient_and_matrix_equal_the_reference(shape, masked):
 
 
 def only(part: str, terms):
-    """The energy with one kind of residual left."""
+    """Return the energy terms with only one kind of residual."""
     empty = replace_points(terms, 0)
     silent = terms.prior._replace(weight=0.0)
     weight = terms.normals.weight.copy()
@@ -86,7 +87,7 @@ def test_gradient_of_every_residual_by_finite_differences(part, seed):
     for i, j in np.ndindex(shape):
         unit = np.zeros(shape)
         unit[i, j] = h
-        # Fourth order: the soft minimum is strongly curved.
+        # Fourth-order differences, because the soft minimum is strongly curved.
         near = majorize(z + unit, terms).energy - majorize(z - unit, terms).energy
         far = majorize(z + 2 * unit, terms).energy - majorize(z - 2 * unit, terms).energy
         numeric[i, j] = (8 * near - far) / (12 * h)
@@ -252,7 +253,7 @@ def test_work_that_would_change_little_is_skipped():
     third = integrator.refine(moved, start=again)
     assert not third.skipped
     assert third.energy < third.initial_energy
-    # Small changes are compared with the last solve, so that they cannot pile up unseen.
+    # Changes are relative to the last solve, so that small changes accumulate.
     drifting = first
     for step in range(1, 40):
         drifting = integrator.refine(
@@ -328,7 +329,7 @@ def test_grids_and_variances_are_checked():
 
 @pytest.mark.parametrize("seed", range(40))
 def test_wild_normals_continue_depth_to_nowhere_far(seed):
-    """Those that turn away or graze the line of sight change it by any factor at each pixel."""
+    """Normals that face away or are perpendicular to the ray could change depth by any factor."""
     shape = (1, 6)
     known = np.arange(6).reshape(shape) == 0
     wild = np.random.default_rng(seed).normal(size=(*shape, 3))
@@ -342,7 +343,7 @@ def test_wild_normals_continue_depth_to_nowhere_far(seed):
 
 @st.composite
 def degenerate_problems(draw):
-    """Any grid, masks, extreme values and confidences, constant regions, hostile anchors."""
+    """Draw problems of any size with masks, extreme values, constant regions and wrong anchors."""
     shape = draw(st.tuples(st.integers(1, 9), st.integers(1, 9)))
     rng = np.random.default_rng(draw(st.integers(0, 10**6)))
     spread = draw(st.sampled_from([0.0, 0.01, 1.0, 5.0]))

@@ -1,4 +1,4 @@
-"""Selected inversion against the dense inverse."""
+"""Tests of selected inversion against the dense inverse."""
 
 import numpy as np
 import pytest

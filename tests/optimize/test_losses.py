@@ -1,4 +1,4 @@
-"""The robust losses: values, weights, and one definition for arrays and kernels."""
+"""Tests of robust losses: values, weights, and equality of arrays and kernels."""
 
 import numpy as np
 import pyceres
@@ -37,7 +37,7 @@ def test_starts_as_least_squares_and_never_exceeds_it(loss: Loss) -> None:
     ("loss", "name"), [(Loss.SOFT_L1, "soft_l1"), (Loss.CAUCHY, "cauchy"), (Loss.TRIVIAL, None)]
 )
 def test_agrees_with_ceres(loss: Loss, name: str | None) -> None:
-    """Through the cost of a one-residual problem, as Ceres exposes no loss values."""
+    """The loss is the cost of a problem with one residual, because Ceres exposes no loss values."""
 
     class Constant(pyceres.CostFunction):  # type: ignore[misc]
         def __init__(self) -> None:

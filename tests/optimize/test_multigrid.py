@@ -1,4 +1,4 @@
-"""The multigrid solver: solutions, symmetric positive preconditioner, and convergence."""
+"""Tests of the multigrid solver: solutions, symmetric positive preconditioner, convergence."""
 
 from concurrent.futures import ThreadPoolExecutor
 
@@ -21,7 +21,7 @@ Planes = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def random_planes(shape: tuple[int, int], seed: int, decades: float, cut: float = 0.2) -> Planes:
-    """Couplings spread over decades, a share of them cut, and masses."""
+    """Return couplings over several orders of magnitude, a share of them zero, and masses."""
     rng = np.random.default_rng(seed)
     east, south = 10 ** rng.uniform(0, decades, (2, *shape))
     east[rng.random(shape) < cut] = 0
@@ -31,7 +31,7 @@ def random_planes(shape: tuple[int, int], seed: int, decades: float, cut: float 
 
 
 def depth_like_planes(size: int) -> Planes:
-    """Strong couplings, weak prior, regions cut apart, and strips one and two pixels wide."""
+    """Return strong couplings, weak masses, separate regions, and strips of one or two pixels."""
     rng = np.random.default_rng(size)
     rows, columns = np.mgrid[:size, :size]
     region = (np.hypot(rows - size / 2, columns - size / 3) < size / 4) + 2 * (rows > 0.6 * size)
@@ -56,7 +56,7 @@ def heavy_planes(shape: tuple[int, int], seed: int) -> Planes:
 
 
 def energy_error(planes: Planes, x: np.ndarray, solution: np.ndarray) -> float:
-    """Energy norm of the error relative to that of the solution."""
+    """Return the energy norm of the error relative to the energy norm of the solution."""
     matrix = grid_operator(*planes)
     error, full = (x - solution).ravel(), solution.ravel()
     return float(np.sqrt(error @ (matrix @ error) / (full @ (matrix @ full))))
@@ -89,19 +89,19 @@ def test_preconditioner_is_symmetric_and_never_overshoots(shape):
 
 @pytest.mark.parametrize("seed", [1, 26, 33, 38])
 def test_firmly_held_pixels_between_strips_do_not_make_it_overshoot(seed):
-    # They give coarse grids negative masses.
+    # Pixels with a strong data term give coarse grids negative masses.
     values = spectrum(heavy_planes((17, 16), seed))
     assert values.min() > 0
     assert values.max() < 1 + 1e-6
 
 
 def spectrum(planes: Planes) -> np.ndarray:
-    """Eigenvalues of the preconditioned operator."""
+    """Return the eigenvalues of the preconditioned operator."""
     return np.linalg.eigvals(preconditioner_of(planes) @ grid_operator(*planes).toarray()).real
 
 
 def preconditioner_of(planes: Planes) -> np.ndarray:
-    """A V-cycle as a matrix."""
+    """Return the matrix of one V-cycle."""
     shape = planes[0].shape
     solver = Multigrid(*shape)
     solver.update(*planes)
@@ -130,7 +130,7 @@ def test_coarse_energy_is_that_of_the_interpolated_map(shape):
 
 
 def level_energy(level) -> float:
-    """x' A x of a nine-point level."""
+    """Return x' A x of a multigrid level with nine-point stencils."""
     x = level.x
     total = (level.mass * x**2).sum()
     total += (level.east[:, :-1] * np.diff(x, axis=1) ** 2).sum()

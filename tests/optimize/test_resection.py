@@ -1,4 +1,4 @@
-"""Pose from segments: against finite differences, Ceres' reprojection error, and known truth."""
+"""Tests of the pose from ray segments: derivatives, optimum against scipy and COLMAP, truth."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ def project(pose: Pose, points: Float64) -> Float64:
 def segments(
     count: int = 60, *, slack: float = 0.1, noise_px: float = 0.0, limit: float = 4.0, seed: int = 0
 ) -> RaySegments:
-    """Points seen from the truth, each somewhere between the ends of its segment; those lie along
-    the rays of a camera at the origin."""
+    """Return ray segments of a camera at the origin, whose points the true pose observes."""
     rng = np.random.default_rng(seed)
     points = rng.uniform([-2, -2, 3], [2, 2, 8], (count, 3))
     middle = points * np.exp(rng.uniform(-slack, slack, (count, 1)))
@@ -50,7 +49,7 @@ def segments(
 
 
 def errors(pose: Pose) -> tuple[float, float]:
-    """Of a pose: degrees, and distance of the translations."""
+    """Return the rotation error in degrees and the translation error of a pose."""
     turn = float(rotation_angle_deg(pose[0] @ TRUTH[0].T))
     return turn, float(np.linalg.norm(pose[1] - TRUTH[1]))
 
@@ -62,7 +61,7 @@ def objective(pose: Pose, seen: RaySegments, scale: float = 1.0) -> tuple[float,
 
 
 def densely(pose: Pose, seen: RaySegments) -> tuple[Float64, Float64]:
-    """Distances and depths by looking at many points of each segment."""
+    """Compute pixel distances and depths from many points of each segment."""
     share = np.linspace(0, 1, 20001)[:, None, None]
     points = (1 - share) * seen.near + share * seen.far
     camera = points @ pose[0].T + pose[1]
@@ -106,7 +105,7 @@ def test_gradient_is_that_of_finite_differences(slack: float, scale: float) -> N
 
 
 def test_matrix_is_that_of_the_residuals_finite_differences() -> None:
-    """Of points (the ends coincide), whose weights a huge limit makes equal."""
+    """Segments have length zero, and a large limit gives all weights the same value."""
     limit = 1e5
     seen = segments(slack=0.0, noise_px=1.0, limit=limit)
     pose = moved(TRUTH, np.full(POSE, 0.01))
@@ -155,7 +154,7 @@ def test_optimum_of_noisy_points_is_that_of_scipy() -> None:
 
 
 def test_points_are_as_good_as_colmap_makes_of_them() -> None:
-    """COLMAP minimises another robust loss of the same errors."""
+    """COLMAP minimizes another robust loss of the same errors."""
     seen = segments(200, slack=0.0, noise_px=0.5, seed=3)
     start = moved(TRUTH, np.array([0.01, -0.01, 0.01, 0.05, 0.05, -0.05]))
     found = refine_pose(start, INTRINSICS, seen, scales=NARROWING)

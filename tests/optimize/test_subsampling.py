@@ -1,4 +1,4 @@
-"""Thinned maps: where their pixels lie, and the way back."""
+"""Tests of subsampled maps: positions of their pixels, and interpolation to full size."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def test_a_plane_comes_back_from_its_thinned_form(step: int) -> None:
     plane = 0.3 * rows - 0.2 * columns + 1.0
     thin = subsample(plane, step)
     back = upsample(thin, np.ones(thin.shape, dtype=np.bool_), plane.shape)
-    inside = (slice(step, -step),) * 2  # beyond the outer pixels nothing is known
+    inside = (slice(step, -step),) * 2  # values outside of the outer pixels are unknown
     np.testing.assert_allclose(back[inside], plane[inside], atol=1e-5)
 
 

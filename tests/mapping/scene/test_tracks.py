@@ -1,4 +1,4 @@
-"""What is derived from the one array of a track table, and the part of it that some points need."""
+"""Tests of observations, angles and filtering of all points and of a subset of the tracks."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_observations_are_sorted_by_point_then_keypoint() -> None:
 
 def test_observations_of_some_points() -> None:
     tracks = random_tracks()
-    points = np.array([7, 85, 3, 20])  # nothing observes the second
+    points = np.array([7, 85, 3, 20])  # no keypoint observes point 85
     keypoints, rows = tracks.observations_of(points)
     np.testing.assert_array_equal(tracks.point_of[keypoints], points[rows])
     np.testing.assert_array_equal(rows, np.sort(rows))
@@ -60,7 +60,8 @@ def test_angles_of_some_points_are_those_of_all() -> None:
 
 
 def test_filtering_the_points_of_an_image_leaves_the_others() -> None:
-    """A camera that moved spoils the observations of its points; the rest is looked at by all."""
+    """Moving one camera only affects points that its image observes, so filtering these
+    suffices."""
     near, whole = posed_scene(), posed_scene()
     for scene in (near, whole):
         scene.translations[0] += [0.0, 0.03, 0.0]
