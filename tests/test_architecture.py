@@ -1,4 +1,5 @@
-"""Packages import in one direction, in the order of the table in docs/architecture.md."""
+"""Tests that packages import in one direction, in the order of the table in
+docs/architecture.md."""
 
 from __future__ import annotations
 
@@ -13,13 +14,13 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "mpsfm_core"
 FRONT_DOOR = "__init__"
-"""Exports the public functions of :mod:`mpsfm_core.api`."""
+"""Package ``__init__`` that exports the public functions of :mod:`mpsfm_core.api`."""
 NUMERICS = {"optimize", "mapping", "dense"}
 BELOW_NUMERICS = {"data", "support", "geometry", *NUMERICS}
 
 
 def documented_packages() -> dict[str, int]:
-    """Map each package of the table to its row; a dotted name is a subpackage of its own rank."""
+    """Map each package of the table to its row; a dotted name is a subpackage with its own row."""
     text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (`.*?) \|", text, re.MULTILINE)
     return {name: row for row, cell in enumerate(rows) for name in re.findall(r"`([\w.]+)`", cell)}

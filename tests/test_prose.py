@@ -1,4 +1,4 @@
-"""The language of the code: docstrings open with a sentence, and private words do not come back."""
+"""Tests of the prose: docstrings start with a sentence, and rejected words are not used."""
 
 from __future__ import annotations
 

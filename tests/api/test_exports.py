@@ -1,4 +1,4 @@
-"""The names that ``mpsfm_core`` exports."""
+"""Tests of the names that ``mpsfm_core`` exports."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exported functions fit what they call, and are documented with an example."""
+"""Tests that exported functions pass valid arguments on, and are documented with an example."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ MODULES_WITH_DOCTESTS = (
 
 
 def calls(function: Any, names: dict[str, Any]) -> Iterator[tuple[ast.Call, Any]]:
-    """Yield the calls of a function whose target a name or dotted name of its module is."""
+    """Yield the calls in a function whose target is a name or dotted name of the module."""
     tree = ast.parse(textwrap.dedent(inspect.getsource(function)))
     for node in ast.walk(tree):
         if isinstance(node, ast.Call):
@@ -49,7 +49,7 @@ def calls(function: Any, names: dict[str, Any]) -> Iterator[tuple[ast.Call, Any]
 
 
 def misfit(node: ast.Call, target: Any) -> str:
-    """Return what a call passes that its target does not take, or an empty string."""
+    """Return the arguments of a call that its target does not accept, or an empty string."""
     try:
         parameters = inspect.signature(target).parameters.values()
     except (TypeError, ValueError):  # a class of a C extension
@@ -72,7 +72,7 @@ def test_exported_function_passes_only_known_arguments(name: str) -> None:
 
 @pytest.mark.parametrize("module", [reconstruct_module, work_folder_module, demo_module])
 def test_commands_pass_arguments_of_reconstruct(module: ModuleType) -> None:
-    """The commands pass ``**arguments`` on, which mypy cannot check."""
+    """Command functions pass ``**arguments`` to other functions, which mypy cannot check."""
     known = {*inspect.signature(mpsfm_core.reconstruct).parameters, "viewer", "quiet"}
     tree = ast.parse(inspect.getsource(module))
     passed = [

@@ -1,4 +1,4 @@
-"""The stages of a reconstruction as public functions, with arrays and objects of the caller."""
+"""Tests of the stages as public functions, with arrays and objects of the caller."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The commands extract, match and map on a work folder, whose files other programs can replace."""
+"""Tests of the commands extract, match and map on a work folder with replaceable files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Images that show the view of another image are only matched with it."""
+"""Tests that an image that shows the view of another image is only matched with that image."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Stages of the extraction on workers elsewhere, here of an executor in this process.
+"""Tests of extraction stages on remote workers, with an executor in this process.
 
-Real clusters are in the tests of mpsfm-dask and mpsfm-ray.
+The tests of mpsfm-dask and mpsfm-ray use real clusters.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Cached results are computed again after the code of a provider has changed."""
+"""Tests that cached results are computed again after the code of a provider has changed."""
 
 from __future__ import annotations
 

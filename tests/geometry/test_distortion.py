@@ -1,4 +1,4 @@
-"""Radial distortion of rays, compared with pycolmap's SIMPLE_RADIAL."""
+"""Tests of the radial distortion of rays against pycolmap's SIMPLE_RADIAL."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Focal lengths as 35 mm equivalents."""
+"""Tests of focal lengths as 35 mm equivalents."""
 
 from __future__ import annotations
 

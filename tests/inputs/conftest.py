@@ -1,4 +1,4 @@
-"""Image files with EXIF data, made byte by byte."""
+"""Fixtures that write image files with EXIF data byte by byte."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _EXIF_IFD = 0x8769
 
 
 def exif_block(tags: Mapping[int, float], order: str = "<") -> bytes:
-    """A TIFF structure with orientation in its first directory, the rest in the EXIF one."""
+    """Return a TIFF structure with the orientation in IFD0 and all other tags in the EXIF IFD."""
     first = {tag: value for tag, value in tags.items() if tag < _EXIF_IFD}
     second = {tag: value for tag, value in tags.items() if tag > _EXIF_IFD}
     exif_offset = 8 + 2 + 12 * (len(first) + 1) + 4
@@ -49,7 +49,7 @@ def _padded(value: float, kind: int) -> tuple[int, ...]:
 
 
 def with_exif(data: bytes, block: bytes) -> bytes:
-    """An encoded JPEG, PNG or WebP image with an EXIF block added."""
+    """Return an encoded JPEG, PNG or WebP image with an added EXIF block."""
     if data.startswith(b"\xff\xd8"):
         payload = b"Exif\x00\x00" + block
         return data[:2] + b"\xff\xe1" + struct.pack(">H", len(payload) + 2) + payload + data[2:]
@@ -64,7 +64,8 @@ def with_exif(data: bytes, block: bytes) -> bytes:
 
 @pytest.fixture
 def photo() -> UInt8:
-    """(60, 80, 3) RGB whose corners and channels all differ, smooth enough for JPEG."""
+    """Return an RGB image (60, 80, 3) with different corners and channels, smooth enough for
+    JPEG."""
     rows, columns = np.mgrid[0:60, 0:80]
     image = np.stack([columns * 3, rows * 4, (columns + rows) // 2 + 100], axis=-1)
     return image.astype(np.uint8)
@@ -72,7 +73,8 @@ def photo() -> UInt8:
 
 @pytest.fixture
 def write_image(tmp_path: Path, photo: UInt8) -> WriteImage:
-    """``write(name, image=photo, tags=None, order="<")`` below ``tmp_path / "images"``."""
+    """Return ``write(name, image=photo, tags=None, order="<")``, which writes to the image
+    folder."""
 
     def write(
         name: str,

@@ -1,4 +1,4 @@
-"""Which images share a camera, and with which guessed focal length."""
+"""Tests of which images share a camera, and of the shared initial focal length."""
 
 from __future__ import annotations
 

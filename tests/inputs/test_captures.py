@@ -1,4 +1,4 @@
-"""Tests with captures of phone programs, written to the formats' documentation."""
+"""Tests of phone captures that follow the documentation of each program's format."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ CAMERA = PinholeCamera(*SIZE, 130.0, 130.0, 80.0, 60.0)
 DEPTH_SIZE = (40, 30)
 POSES = arc_poses(24, 2.0)
 FLIP = np.diag([1.0, -1.0, -1.0])
-"""Converts camera axes between OpenCV and ARKit."""
+"""Rotation that converts camera axes between OpenCV and ARKit."""
 
 
 @pytest.fixture(scope="module")
 def rendered() -> list[Any]:
-    """Rendered views of a room with image and depth."""
+    """Return rendered views of a room with image and depth."""
     scene = room_scene()
     return [scene.render(CAMERA, pose) for pose in POSES]
 

@@ -1,4 +1,4 @@
-"""Files as other programs and systems write them: marks, blank lines, paths, spaces, scales."""
+"""Tests of files of other programs: byte order marks, blank lines, paths, spaces, scales."""
 
 from __future__ import annotations
 

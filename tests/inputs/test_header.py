@@ -1,4 +1,4 @@
-"""Focal lengths from EXIF, and damaged headers."""
+"""Tests of focal lengths from EXIF, and of damaged headers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def header(**tags: float) -> ImageHeader:
 
 
 def test_equivalent_of_full_frame_sensor() -> None:
-    """On a 3:2 sensor 36 mm are as wide as the image."""
+    """On a 3:2 sensor, the image width corresponds to 36 mm of the 35 mm format."""
     assert header(f35=36).focal_px(6000, 4000) == pytest.approx(6000)
 
 
@@ -37,7 +37,7 @@ def test_equivalent_is_by_diagonal() -> None:
 
 
 def test_focal_plane_resolution() -> None:
-    """A Canon 5D: 35.8 mm for 4368 pixels, resolution in inches."""
+    """The sensor of a Canon 5D has 35.8 mm for 4368 pixels, with the resolution per inch."""
     resolution = 4368 / 35.8 * 25.4
     found = header(mm=50, resolution=resolution, unit=2).focal_px(4368, 2912)
     assert found == pytest.approx(50 / 35.8 * 4368)
@@ -46,7 +46,7 @@ def test_focal_plane_resolution() -> None:
 
 
 def test_resized_photo() -> None:
-    """The resolution is that of the sensor, the photo has a quarter of its pixels."""
+    """The focal plane resolution is that of the sensor; the photo has a quarter of the pixels."""
     tags = {"mm": 50, "resolution": 4368 / 35.8, "unit": 4, "x": 4368, "y": 2912}
     assert header(**tags).focal_px(1092, 728) == pytest.approx(50 / 35.8 * 1092)
 

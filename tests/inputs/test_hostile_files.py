@@ -1,7 +1,7 @@
-"""Damaged and hostile files of every kind that is read: one clear error each, that names the file.
+"""Tests that each damaged or malicious input file causes one error that names the file.
 
-Photos themselves are in test_images.py and test_pixels.py. GLB files are written, never read: there
-they stand where something else is wanted.
+Damaged photos are tested in test_images.py and test_pixels.py. MP-SfM never reads GLB files; these
+tests pass GLB files where another format is expected.
 """
 
 from __future__ import annotations
@@ -336,7 +336,7 @@ GLB_READERS: dict[str, Callable[[Path], object]] = {
 
 
 def untouched(path: Path) -> None:
-    """Well-formed, but not what is wanted."""
+    """Leave the file unchanged: well-formed, but of another format than the reader expects."""
 
 
 @pytest.mark.parametrize("damage", [untouched, emptied, cut, noise_inside])

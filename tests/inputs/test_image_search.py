@@ -1,4 +1,4 @@
-"""Search for images: links, formats, and pictures that are not read."""
+"""Tests of the search for images: links, formats, and pictures that are not read."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a folder to views: what is found, refused, loaded, and kept."""
+"""Tests from an image folder to views: found, refused, loaded and cached images."""
 
 from __future__ import annotations
 
@@ -177,7 +177,7 @@ def test_other_focal_lengths_where_they_were_the_default(folder: Path, intrinsic
 
 
 def partial_model(path: Path, **focals: float) -> Path:
-    """A ``transforms.json`` of photos of 80 x 60 pixels."""
+    """Write a ``transforms.json`` of photos of 80 x 60 pixels."""
     frames = [
         {
             "file_path": f"images/{stem}.jpg",

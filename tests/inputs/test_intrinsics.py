@@ -1,4 +1,4 @@
-"""Cameras from intrinsics.yaml and COLMAP models, and what is wrong with them."""
+"""Tests of cameras from intrinsics.yaml and COLMAP models, and of wrong camera files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Masks: names, orientation, formats, and what is wrong with them."""
+"""Tests of masks: names, orientation, formats and errors."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from mpsfm_core.inputs.options import InputOptions
 
 WIDTH, HEIGHT = 64, 48
 INVERSE = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
-"""EXIF flag -> flag of the inverse transform."""
+"""EXIF orientation of the inverse transform, by EXIF orientation."""
 
 
 def upright_mask(width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
-    """Only the upper left corner is allowed: no flip or rotation maps it to itself."""
+    """Mask that allows only the upper left corner, which no flip or rotation maps to itself."""
     mask = np.zeros((height, width), np.uint8)
     mask[: height // 3, : width // 4] = 255
     return mask
@@ -71,7 +71,7 @@ def test_mask_names_in_use_are_found(tmp_path: Path, name: str) -> None:
     if name.startswith(("mask_", "dynamic")):
         write_mask(tmp_path / "masks" / name.replace("_a.", "_b."), upright_mask())
     images = load(tmp_path / "photos", tmp_path / "masks")
-    if name.lower().endswith((".jpg", ".jpeg")):  # borders are blurred by the compression
+    if name.lower().endswith((".jpg", ".jpeg")):  # compression blurs borders
         mask = images.view(0).mask
         assert mask is not None
         assert (mask == (upright_mask() > 0)).mean() > 0.95

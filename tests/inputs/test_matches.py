@@ -1,4 +1,4 @@
-"""Keypoints and matches of other programs: COLMAP's own, and files as hloc writes them."""
+"""Tests of keypoints and matches from COLMAP databases and from files of hloc."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ def images(tmp_path_factory: pytest.TempPathFactory) -> ImageSet:
 
 @pytest.fixture(scope="module")
 def seen() -> list[np.ndarray]:
-    """Pixels of the same forty surface points in each photo."""
+    """Return the pixels of the same forty surface points in each photo."""
     rng = np.random.default_rng(0)
     points = room_scene().sample(CAMERA, POSES[0], rng.uniform([50, 35], [110, 85], (40, 2))).points
     return [project(CAMERA, pose, points)[0] for pose in POSES]
 
 
 def write_database(path: Path, seen: list[np.ndarray], *, verified_only: bool = False) -> Path:
-    """Keypoints in another order in each image, so that rows differ."""
+    """Return keypoints in another order in each image, so that keypoint indices differ."""
     with pycolmap.Database.open(str(path)) as database:
         camera = pycolmap.Camera(
             model="SIMPLE_RADIAL", width=160, height=120, params=[140, 80, 60, 0]
@@ -74,7 +74,7 @@ def write_database(path: Path, seen: list[np.ndarray], *, verified_only: bool = 
 def check(imported, images: ImageSet, seen: list[np.ndarray]) -> None:
     assert sorted(imported.matches) == [(0, 1), (1, 2)]
     for (first, second), matches in imported.matches.items():
-        assert len(matches) >= 30  # those that the undistorted views show
+        assert len(matches) >= 30  # keypoints inside the undistorted views
         for side, index in enumerate((first, second)):
             xy = imported.keypoints[index][matches.indices[:, side]]
             original = images[index].original_pixels(xy)

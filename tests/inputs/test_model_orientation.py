@@ -1,4 +1,4 @@
-"""Models, cameras and keypoints of stored pixels, for all EXIF orientations."""
+"""Tests of models, cameras and keypoints in stored pixels, for all EXIF orientations."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ CAMERA = PinholeCamera(160, 120, 140.0, 145.0, 83.0, 57.0)
 POSES = arc_poses(4, 12.0)
 NAMES = tuple(f"{number}.jpg" for number in range(4))
 INVERSE = {1: 1, 2: 2, 3: 3, 4: 4, 5: 5, 6: 8, 7: 7, 8: 6}
-"""EXIF flag -> flag of the inverse transform."""
+"""EXIF orientation of the inverse transform, by EXIF orientation."""
 MIRRORED = (2, 4, 5, 7)
 ALL = range(1, 9)
 
 
 @pytest.fixture(scope="module")
 def rendered() -> tuple[list[np.ndarray], Float64, list[Float64]]:
-    """Upright images, points (n, 3), and their pixels in each image."""
+    """Return upright images, points (n, 3), and the pixels of the points in each image."""
     scene = room_scene()
     rng = np.random.default_rng(0)
     points = scene.sample(CAMERA, POSES[0], rng.uniform([40, 30], [120, 90], (60, 2))).points
@@ -44,7 +44,7 @@ def rendered() -> tuple[list[np.ndarray], Float64, list[Float64]]:
 
 
 def write_photos(folder: Path, images: list[np.ndarray], flags: tuple[int, ...]) -> Path:
-    """Write upright images as photos of these EXIF orientations."""
+    """Write upright images as photos with the given EXIF orientations."""
     folder.mkdir(parents=True)
     for name, rgb, flag in zip(NAMES, images, flags, strict=True):
         exif = Image.Exif()
@@ -56,7 +56,7 @@ def write_photos(folder: Path, images: list[np.ndarray], flags: tuple[int, ...])
 def upright_model(
     rendered: tuple[list[np.ndarray], Float64, list[Float64]], *, colored: bool = True
 ) -> pycolmap.Reconstruction:
-    """The true model of the upright images."""
+    """Return the true model of the upright images."""
     images, points, pixels = rendered
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
@@ -78,7 +78,8 @@ def upright_model(
 def stored_model(
     upright: pycolmap.Reconstruction, flags: tuple[int, ...]
 ) -> pycolmap.Reconstruction:
-    """The model of the stored pixels, as COLMAP makes it. Independent of the code under test."""
+    """Return the model of the stored pixels, as COLMAP reconstructs it. This conversion does not
+    use the code under test."""
     model = pycolmap.Reconstruction()
     mirror = np.diag([1.0, 1.0, -1.0]) if flags[0] in MIRRORED else np.eye(3)
     for number, flag in enumerate(flags, start=1):
@@ -125,7 +126,7 @@ def write(model: pycolmap.Reconstruction, folder: Path) -> Path:
 
 
 def check_upright(model: pycolmap.Reconstruction, truth: pycolmap.Reconstruction) -> None:
-    """Relative rotations, cameras and keypoints are those of the upright model."""
+    """Check that relative rotations, cameras and keypoints are those of the upright model."""
     assert {image.name for image in model.images.values()} == set(NAMES)
     first, true_first = (m.find_image_with_name(NAMES[0]).cam_from_world() for m in (model, truth))
     for name in NAMES:
@@ -158,7 +159,8 @@ def test_model_of_stored_pixels_is_turned_upright(
 
 @pytest.mark.parametrize("flag", ALL)
 def test_model_of_upright_pixels_stays(rendered, tmp_path: Path, flag: int) -> None:
-    """COLMAP applies the orientation itself if its version does so; the colors tell."""
+    """Some versions of COLMAP apply EXIF orientation, so colors decide whether a model is
+    upright."""
     photos = write_photos(tmp_path / "photos", rendered[0], (flag,) * 4)
     truth = upright_model(rendered)
     check_upright(read_model(write(truth, tmp_path / "model"), photos), truth)
@@ -261,7 +263,7 @@ def test_distorted_cameras_see_the_same_pixels(flag: int, model: str, params: li
 
 
 def test_photos_of_a_stored_model_look_like_its_points(rendered, tmp_path: Path) -> None:
-    """The end of the chain: upright views and projected points agree in color."""
+    """Upright views and projected points of the imported model have the same colors."""
     photos = write_photos(tmp_path / "photos", rendered[0], (3, 3, 6, 6))
     truth = upright_model(rendered)
     folder = write(stored_model(truth, (3, 3, 6, 6)), tmp_path / "model")
@@ -279,7 +281,7 @@ def test_photos_of_a_stored_model_look_like_its_points(rendered, tmp_path: Path)
 def test_evaluate_rotates_truth_and_depth_of_rotated_photos(
     rendered, tmp_path: Path, flag: int
 ) -> None:
-    """The result is upright, and COLMAP's model and the sensor's depth are of stored pixels."""
+    """The result is upright; COLMAP's model and sensor depth refer to stored pixels."""
     photos = write_photos(tmp_path / "photos", rendered[0], (flag,) * 4)
     truth = upright_model(rendered)
     result = tmp_path / "result"

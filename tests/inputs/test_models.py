@@ -1,4 +1,4 @@
-"""Reading models, and whose images they are."""
+"""Tests of reading models, and of identifying their images by name."""
 
 from __future__ import annotations
 
@@ -48,5 +48,5 @@ def test_names_match_without_extension_or_folder() -> None:
     assert match_names(["2.v1"], ["c/d/2.v1.png"]) == {"2.v1": "c/d/2.v1.png"}
     assert match_names(["d/2"], ["c/d/2.png", "c/2.png"]) == {"d/2": "c/d/2.png"}
     assert match_names(["2.v1.jpg"], available) == {"2.v1.jpg": "2.v1.png"}
-    # 3.jpg is itself asked for, so 3.png must not be taken for it.
+    # The photo 3.jpg is requested too, so 3.png of the model must not match it.
     assert match_names(["3.jpg", "3.png"], ["3.jpg"]) == {"3.jpg": "3.jpg"}

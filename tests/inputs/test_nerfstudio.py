@@ -1,4 +1,4 @@
-"""``transforms.json``: read and written, and what can be wrong in it."""
+"""Tests of reading and writing ``transforms.json``, and of errors in the file."""
 
 from __future__ import annotations
 

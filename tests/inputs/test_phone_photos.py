@@ -1,4 +1,4 @@
-"""What phones and cameras write: HEIC, raw files, GPS positions, panoramas."""
+"""Tests of files of phones and cameras: HEIC, raw photos, GPS positions, panoramas."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mpsfm_core.inputs.images import load_images
 
 
 def picture(width: int = 96, height: int = 64) -> np.ndarray:
-    """Red grows to the right, green downwards."""
+    """Return an image whose red increases to the right and green downwards."""
     x, y = np.meshgrid(np.linspace(20, 235, width), np.linspace(20, 235, height))
     return np.stack([x, y, np.full_like(x, 128)], axis=-1).astype(np.uint8)
 
@@ -38,7 +38,7 @@ def exif(orientation: int = 1, **gps: object) -> Image.Exif:
 
 
 def write_dng(path: Path, rgb: np.ndarray) -> None:
-    """An uncompressed RGGB mosaic of a camera with identity colours."""
+    """Write an uncompressed RGGB mosaic of a camera whose color matrix is the identity."""
     mosaic = np.empty(rgb.shape[:2], np.uint16)
     linear = (rgb / 255.0) ** 2.2 * 65535
     for row, column, channel in ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)):

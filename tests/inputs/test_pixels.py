@@ -1,4 +1,4 @@
-"""Every format, depth and orientation becomes upright 8-bit RGB."""
+"""Tests that every format, bit depth and orientation is decoded to upright 8-bit RGB."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mpsfm_core.inputs.masks import decode_mask
 
 ORIENTATION = 0x0112
 
-# What a viewer does to the stored image, in words of the EXIF standard.
+# Transform from stored to upright image, as the EXIF standard defines each orientation.
 UPRIGHT: dict[int, Callable[[UInt8], UInt8]] = {
     1: lambda image: image,
     2: lambda image: cv2.flip(image, 1),
@@ -89,14 +89,15 @@ def test_grayscale_and_alpha(photo, write_image) -> None:
 
 
 def test_rotated_tiff_is_turned_once(tmp_path: Path, photo: UInt8) -> None:
-    """The decoder applies the tag of a TIFF itself."""
+    """The TIFF decoder applies the orientation tag itself, so the image must not be rotated
+    again."""
     path = tmp_path / "a.tif"
     path.write_bytes(_tiff(photo, orientation=6))
     assert np.array_equal(decode(path), UPRIGHT[6](photo))
 
 
 def _tiff(image: UInt8, orientation: int) -> bytes:
-    """An uncompressed RGB TIFF of one strip."""
+    """Return an uncompressed RGB TIFF of one strip."""
     height, width, _ = image.shape
     shorts = {258: 8, 259: 1, 262: 2, 274: orientation, 277: 3}
     longs = {256: width, 257: height, 273: 0, 278: height, 279: image.nbytes}

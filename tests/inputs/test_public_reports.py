@@ -1,4 +1,4 @@
-"""Inputs of public reports to other programs; docs/tested-inputs.md lists the reports."""
+"""Tests of inputs from public issues of other programs, which docs/tested-inputs.md lists."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_cameras_of_rare_models_are_undistorted(tmp_path: Path, model: str) -> N
 @pytest.mark.parametrize("flag", [1, 6])
 @pytest.mark.parametrize("suffix", [".png", ".webp"])
 def test_transparent_pixels_of_photos_are_masked(tmp_path: Path, suffix: str, flag: int) -> None:
-    """colmap/colmap#3806: PNG with transparent pixels are not read."""
+    """colmap/colmap#3806: Transparent pixels of PNG photos are not read."""
     pixels = np.dstack([np.asarray(picture()), np.full(SIZE[::-1], 255, np.uint8)])
     for name, top in (("a", 0), ("b", 255), ("c", 255)):
         pixels[:20, :, 3] = top
@@ -202,7 +202,7 @@ def test_bands_of_16_bits_next_to_photos_are_photos(tmp_path: Path) -> None:
 
 
 def test_exif_of_rendered_tiffs_is_read(tmp_path: Path) -> None:
-    """alicevision/Meshroom#601: TIFF files with a focal length."""
+    """alicevision/Meshroom#601: TIFF files of a renderer contain a focal length."""
     for name in ("a.tif", "b.tif"):
         tags = [(0xA405, "H", 1, 36, True)]
         tifffile.imwrite(tmp_path / name, np.asarray(picture()), extratags=tags)

@@ -1,4 +1,4 @@
-"""Tests with videos of drones and action cameras that recorded their positions."""
+"""Tests of videos in which drones and action cameras recorded GPS positions."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CAMERA = PinholeCamera(*SIZE, 130.0, 130.0, 80.0, 60.0)
 FPS = 10
 NUM_FRAMES = 24
 START, STEP = (47.3, 8.5, 410.0), (1e-5, -2e-5, 0.5)
-"""Latitude, longitude and altitude at the start, and their change in 0.1 s."""
+"""Latitude, longitude and altitude at the start, and the change of each in 0.1 s."""
 
 
 def position(time_s: float) -> np.ndarray:
@@ -32,7 +32,7 @@ def position(time_s: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def pixels() -> list[np.ndarray]:
-    """Frames of a camera that turns around the middle of a room."""
+    """Return frames of a camera that turns around the center of a room."""
     scene = room_scene()
     poses = arc_poses(NUM_FRAMES, 2.0)
     return [cv2.cvtColor(scene.render(CAMERA, pose).rgb, cv2.COLOR_RGB2BGR) for pose in poses]
@@ -109,7 +109,8 @@ def box(kind: bytes, content: bytes) -> bytes:
 
 
 def add_gopro_track(video: Path, samples: list[bytes], wide: bool = False) -> None:
-    """Add a track ``gpmd`` with one sample a second to an MP4 file whose moov is at the end."""
+    """Add a track ``gpmd`` with one sample per second to an MP4 file with the box moov at the
+    end."""
     data = video.read_bytes()
     moov = data.rindex(b"moov") - 4
     assert moov + struct.unpack_from(">I", data, moov)[0] == len(data)

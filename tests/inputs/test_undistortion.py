@@ -1,4 +1,4 @@
-"""Undistorted views against COLMAP's undistortion."""
+"""Tests of undistorted views against COLMAP's undistortion."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def test_pinhole_needs_no_warp() -> None:
         model="SIMPLE_RADIAL", width=640, height=480, params=[500, 320, 240, 0.0]
     )
     assert is_pinhole(straight) and undistort_camera(straight).size == (640, 480)
-    # Without distortion a fisheye is still no pinhole camera.
+    # A fisheye camera with zero distortion coefficients is no pinhole camera.
     assert not is_pinhole(camera("SIMPLE_FISHEYE"))
 
 

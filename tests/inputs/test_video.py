@@ -1,4 +1,4 @@
-"""Frames of rendered videos, chosen by what is in them."""
+"""Tests of the selection of frames from rendered videos by their content."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CAMERA = PinholeCamera(*SIZE, 130.0, 130.0, 80.0, 60.0)
 
 @pytest.fixture(scope="module")
 def turn() -> list[np.ndarray]:
-    """A camera that turns around the middle of a room by 2 degrees a frame."""
+    """Return frames of a camera that turns around the center of a room by 2 degrees per frame."""
     scene = room_scene()
     return [
         cv2.cvtColor(scene.render(CAMERA, pose).rgb, cv2.COLOR_RGB2BGR)
@@ -102,7 +102,7 @@ def test_a_video_that_is_cut_off_is_used_as_far_as_it_goes(turn, tmp_path: Path)
 
 
 def test_a_phone_that_is_held_upright_gives_upright_frames(turn, tmp_path: Path) -> None:
-    """Phones store the sensor's rows and note in the track's header how to turn them."""
+    """Phones store frames in sensor orientation, with their rotation in the header of the track."""
     video = tmp_path / "v.mp4"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 30, SIZE)
     for frame in turn:

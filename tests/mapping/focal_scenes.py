@@ -1,4 +1,4 @@
-"""Scenes of unknown focal lengths."""
+"""Test scenes with unknown focal lengths."""
 
 from __future__ import annotations
 

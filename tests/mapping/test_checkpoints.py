@@ -1,4 +1,4 @@
-"""Checkpoints of the mapper: a resumed run gives the result of an uninterrupted run."""
+"""Tests that a run resumed from a checkpoint gives the result of an uninterrupted run."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
 
 
 class Killed(Exception):
-    """Interruption of the mapper."""
+    """Exception that interrupts the mapper."""
 
 
 class Memory:

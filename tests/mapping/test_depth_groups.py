@@ -1,4 +1,4 @@
-"""Depth groups: images of one group share a scale, and network poses are hypotheses."""
+"""Tests of depth groups, whose images share a scale and have network poses as hypotheses."""
 
 from __future__ import annotations
 

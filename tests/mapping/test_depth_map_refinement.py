@@ -1,4 +1,4 @@
-"""Refinement of the depth maps of a finished reconstruction."""
+"""Test of the depth refinement of a finished reconstruction."""
 
 from __future__ import annotations
 

@@ -121,7 +121,7 @@ def test_noise_is_measured_where_a_prior_is_off(views: int) -> None:
     assert noise.shape == scene.maps[1].valid.shape
     columns = noise.shape[1]
     middle = noise[round(0.4 * columns), round(0.45 * columns)]
-    declared = DECLARED / np.exp(0.2)  # keypoints at the depth that is too far
+    declared = DECLARED / np.exp(0.2)  # relative to the depth that is 20 % too far
     assert middle == pytest.approx(0.2 / declared / np.sqrt(2), rel=0.1)
     assert np.median(noise) == 1.0
     no_points = np.zeros(len(scene.maps[1].keypoints), np.bool_)

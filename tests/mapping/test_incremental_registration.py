@@ -1,4 +1,4 @@
-"""Incremental registration: rollback, rejection history, drift, and competing components."""
+"""Tests of incremental registration: rollback, rejections, drift and competing components."""
 
 from __future__ import annotations
 

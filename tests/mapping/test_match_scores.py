@@ -1,4 +1,4 @@
-"""Match scores as weights of correspondences and keypoints."""
+"""Tests of match scores as weights of correspondences and keypoints."""
 
 from __future__ import annotations
 

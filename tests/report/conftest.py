@@ -1,4 +1,4 @@
-"""Result folders as runs write them, and a real browser."""
+"""Fixtures: result folders of real runs, and a real browser."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
 HOSTILE = "a</script><b onload='x'>&amp; \"{{DATA}}\u2028.png"
-"""A file name that would leave its place in a page, if it could."""
+"""File name that would inject code into the report if it were not escaped."""
 CONFIG = """
 features: {{use: sift}}
 matcher: {{use: mutual-nearest}}
@@ -32,7 +32,7 @@ runtime: {{workers: 1}}
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The result folder of a run with four photos that fit and one of noise."""
+    """Return the result folder of a run with four photos of a room and a photo of noise."""
     folder = tmp_path_factory.mktemp("finished")
     photos, depth = folder / "photos", folder / "depth"
     room = room_scene()
@@ -48,7 +48,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def failed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What a run leaves of three photos of noise."""
+    """Return the result folder of a failed run with three photos of noise."""
     folder = tmp_path_factory.mktemp("failed")
     (folder / "photos").mkdir()
     for number in range(3):
@@ -60,7 +60,7 @@ def failed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
-    """Headless Chromium, with its logs of console and network."""
+    """Start headless Chromium, with logs of console and network."""
     webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
     chromium = shutil.which("chromium") or shutil.which("google-chrome")
     driver = shutil.which("chromedriver")

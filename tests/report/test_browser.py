@@ -1,4 +1,4 @@
-"""The page in a real browser, opened as a file."""
+"""Tests of the report in a real browser, opened as a file."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Open = Callable[[Path], Any]
 
 @pytest.fixture
 def opened(browser: Any) -> Open:
-    """Opens the page of a result folder and forgets what was logged before."""
+    """Function that opens the report of a result folder and clears earlier logs."""
 
     def open_page(folder: Path) -> Any:
         browser.get("about:blank")
@@ -30,7 +30,7 @@ def opened(browser: Any) -> Open:
 
 
 def wait_for(browser: Any, script: str, *arguments: object, seconds: float = 60) -> Any:
-    """The value of an expression once it is true."""
+    """Wait until a JavaScript expression is true, and return its value."""
     end = time.monotonic() + seconds
     while not (value := browser.execute_script(f"return {script}", *arguments)):
         assert time.monotonic() < end, f"never true: {script}"
@@ -68,7 +68,7 @@ COLORED = """(() => {
 LOWEST_ADVICE = """Math.max(...[...document.querySelectorAll('.finding:not(.note) .do')].map(
   (advice) => advice.getBoundingClientRect().bottom))"""
 SCREEN = 800
-"""The height of the page, without scrolling."""
+"""Height in pixels of the page that is visible without scrolling."""
 
 
 def test_it_renders_and_asks_nobody(opened: Open, finished: Path) -> None:

@@ -1,4 +1,4 @@
-"""Reasons in plain words."""
+"""Tests that the report renders reasons in plain words."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_every_code_is_explained_with_all_its_fields(code: ReasonCode) -> None:
     for name in code.fields:
         values = {**example(code).values, name: "final-check" if name == "step" else 0.75}
         other = {**values, name: "re-registration" if name == "step" else 0.5}
-        with contextlib.suppress(ValueError):  # a text field takes no number format
+        with contextlib.suppress(ValueError):  # number formats fail for text fields
             assert explain(Reason(code, values)).text != explain(Reason(code, other)).text
 
 
@@ -198,7 +198,7 @@ def test_findings_of_a_kept_guess_give_the_reason() -> None:
     reason = CameraReason.NOT_OBSERVABLE.because(focal_length_std_ratio=0.4)
     report["images"]["details"]["a"] |= {
         "focal_length_from": "default",
-        "refined_focal_length_px": 520.0,  # of an earlier refinement
+        "refined_focal_length_px": 520.0,  # value of an earlier refinement
         "focal_length_reason": reason.to_json(),
     }
     (finding,) = findings(report)
@@ -228,7 +228,7 @@ def test_explain_of_a_refused_distortion_gives_the_estimate() -> None:
 
 
 def doubts(report: dict[str, Any]) -> list[DoubtReason]:
-    """Return the codes of the doubts of a run."""
+    """Return the codes of the reasons why a run is doubtful."""
     return [doubt.reason.code for doubt in judge(report).doubts]
 
 

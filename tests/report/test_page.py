@@ -1,4 +1,4 @@
-"""What goes into the page, and what it is made from."""
+"""Tests of the content of the report, and of its source files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What viewers are given: of a run, of a result, of any COLMAP model."""
+"""Tests of the scenes that viewers get: of a run, of a result, of any COLMAP model."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_what_is_no_model_is_said(tmp_path: Path) -> None:
 
 def test_photos_are_reduced_and_may_be_damaged(tmp_path: Path) -> None:
     picture = np.zeros((600, 800, 3), np.uint8)
-    picture[..., 2] = 200  # red, as OpenCV orders it
+    picture[..., 2] = 200  # red in OpenCV's BGR order
     cv2.imwrite(str(tmp_path / "a.png"), picture)
     (tmp_path / "b.png").write_bytes(b"nothing")
     small = pictures_from_photos(tmp_path)("a.png")

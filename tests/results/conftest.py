@@ -1,4 +1,4 @@
-"""An exact reconstruction of an analytic room, as the mapper would hand it on."""
+"""Fixture of an exact reconstruction of an analytic room, in the form of a mapper's result."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ GRID = (80, 60)
 
 @dataclass(frozen=True)
 class Solved:
-    """``images/3.png`` is in the problem but not registered."""
+    """Mapping problem and result, in which ``images/3.png`` is not registered."""
 
     problem: MappingProblem
     result: MappingResult
@@ -57,7 +57,7 @@ def solved() -> Solved:
         depth = DepthPrior(small.depth, 1e-4 * ones, small.depth > 0)
         seen = points if index != 1 else np.vstack([points, single])
         xy, _ = project(CAMERA, pose, seen)
-        # The last keypoint has no point; with the single-view ones they are the rows behind.
+        # The last keypoint has no 3D point; keypoints of single-view points are the rows before.
         keypoints = np.vstack([xy, [[1.0, 2.0]]])
         ids = np.append(np.arange(len(seen)), -1)
         normals = NormalPrior.from_arrays(small.normals, 0.01 * ones)
@@ -80,6 +80,6 @@ def solved() -> Solved:
 
 
 def _surface_points(scene, pose, rng: np.random.Generator) -> np.ndarray:
-    """World points seen in the middle of a view, where the neighbours see them as well."""
+    """Return world points in the middle of a view, which the neighboring views see too."""
     xy = rng.uniform([50, 35], [110, 85], (40, 2))
     return scene.sample(CAMERA, pose, xy).points

@@ -1,4 +1,4 @@
-"""The COLMAP model that pycolmap reads back."""
+"""Tests of the written COLMAP model, read with pycolmap."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_the_model_holds_what_the_reconstruction_holds(solved, model, tmp_path, 
     read = pycolmap.Reconstruction(str(tmp_path))
     assert read.num_reg_images() == 3
     assert read.num_cameras() == 1
-    # 40 points in three images; the five that only one image sees are left out.
+    # Three images observe 40 points; the five points that only one image observes are left out.
     assert read.num_points3D() == 40
     assert read.compute_num_observations() == 120
     for image in solved.best.images:
@@ -83,7 +83,7 @@ def test_points_have_the_colour_of_the_photos(solved, model) -> None:
     for xyz, color in zip(solved.best.points[:40], expected[:40], strict=True):
         np.testing.assert_array_equal(stored[tuple(xyz)], color)
     image, view = solved.best.images[1], solved.views["images/1.png"]
-    # A point that one image sees has just that pixel's colour.
+    # A point that one image observes has the color of its pixel.
     x, y = solved.problem.images[1].keypoints[41]
     np.testing.assert_array_equal(expected[image.point_ids[41]], view.image[int(y), int(x)])
 

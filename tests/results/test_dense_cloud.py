@@ -1,4 +1,4 @@
-"""Fusing refined depth maps."""
+"""Tests of fusing refined depth maps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def with_depth(solved, row: int, depth: np.ndarray, variance: np.ndarray | None 
 
 
 def lifted(image) -> np.ndarray:
-    """World points of all valid pixels of a map."""
+    """Return the world points of all valid pixels of a depth map."""
     height, width = image.depth.shape
     camera = image.camera.resized(width, height)
     xy = pixel_centers(width, height)[image.depth.valid]
@@ -70,7 +70,7 @@ def test_exact_maps_give_points_on_the_surfaces_in_their_colours(solved) -> None
     xy, depth = project(image.camera, pose, points)
     inside = (depth > 0) & (xy > 1).all(1) & (xy < np.array(image.camera.size) - 1).all(1)
     surface = scene.sample(image.camera, pose, xy[inside]).depth
-    # In front of the surface there is nothing; behind it, what other images see.
+    # No point is in front of the surface; points behind the surface are from other images.
     assert (depth[inside] > surface - 0.02).mean() > 0.999
     first = slice(0, int(image.depth.valid.sum() * 0.9))
     near = (
@@ -116,7 +116,7 @@ def test_where_most_is_unsure_the_surest_quarter_stays(solved, sure: float, left
 
 def test_a_wall_in_free_space_is_left_out(solved) -> None:
     depth = solved.best.images[1].depth.depth.copy()
-    depth[20:40, 30:50] = 1.0  # other images see right through
+    depth[20:40, 30:50] = 1.0  # a wall that other images contradict
     walled = with_depth(solved, 1, depth)
     points, *_ = fuse_depth_maps(walled, solved.views.__getitem__)
     image = solved.best.images[1]

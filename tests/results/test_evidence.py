@@ -1,4 +1,4 @@
-"""Evidence for a reconstruction, against scenes with known answers."""
+"""Tests of the evidence for a reconstruction on scenes with known values."""
 
 from __future__ import annotations
 

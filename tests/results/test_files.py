@@ -1,4 +1,4 @@
-"""Point clouds and depth maps as files, read back by other means."""
+"""Tests of written point clouds and depth maps, read with other libraries."""
 
 from __future__ import annotations
 

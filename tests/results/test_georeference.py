@@ -1,4 +1,4 @@
-"""GPS positions of known noise over a reconstruction in a world of its own."""
+"""Tests of georeferencing with GPS positions of known noise."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CAMERA = PinholeCamera(40, 30, 40.0, 40.0, 20.0, 15.0)
 
 
 def walk(centers: np.ndarray, pitch_deg: float = 0.0, turn: float = 0.3) -> Reconstruction:
-    """Level cameras, or pitched ones, at places in metres east, north, up."""
+    """Return a reconstruction of level or pitched cameras at ``centers`` (m east, north, up)."""
     images = []
     ones = np.ones((3, 4), np.float32)
     for index, center in enumerate(centers):
@@ -82,7 +82,7 @@ def check(found, truth: np.ndarray, up_deg: float, scale: float, off_m: float) -
 
 
 def test_a_street_takes_gravity_from_its_cameras() -> None:
-    """Positions on a line say nothing of the roll about it."""
+    """Positions on a line do not determine the rotation about this line."""
     found = georeference(scrambled(walk(STREET)), positions(STREET, 2.0, altitudes=True))
     assert "cameras" in found[1].up
     assert found[1].inliers >= 23

@@ -1,4 +1,5 @@
-"""Views that are undistorted again with a radial distortion that the mapper estimated."""
+"""Tests of views that are undistorted again with the radial distortion that the mapper
+estimated."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A whole output folder, read back with pycolmap."""
+"""Tests of a whole output folder, read with pycolmap."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def photos_of(solved, folder: Path, camera: pycolmap.Camera, known: bool = True)
 
 
 def seen_through(solved, images: ImageSet) -> tuple[MappingProblem, Reconstruction]:
-    """The problem and reconstruction with the pinhole cameras of the image set."""
+    """Return problem and reconstruction with the pinhole cameras of the image set."""
     pinhole = images[0].pinhole
     registered, problem_images = [], list(solved.problem.images)
     for image in solved.best.images:
@@ -121,7 +121,7 @@ def test_a_distorted_camera_gives_the_original_and_an_undistorted_model(
 
 @pytest.mark.parametrize("flag", [3, 6])
 def test_photos_that_exif_rotates_get_upright_images(solved, tmp_path: Path, flag: int) -> None:
-    """Most programs ignore the flag, so the model does not fit the photos themselves."""
+    """Most programs ignore the EXIF orientation, so the model refers to written upright images."""
     plain = photos_of(solved, tmp_path / "photos", PINHOLE)
     turn = {3: Image.Transpose.ROTATE_180, 6: Image.Transpose.ROTATE_90}[flag]
     exif = Image.Exif()
@@ -155,7 +155,7 @@ def test_transforms_project_points_where_the_photos_show_them(
     params = [*DISTORTED.params] + [0.0] * (4 if model == "FULL_OPENCV" else 0)
     camera = pycolmap.Camera(model=model, width=160, height=120, params=params, camera_id=1)
     output = write(solved, tmp_path, camera, ResultOptions(nerfstudio=True))
-    # The format has no FULL_OPENCV: there the undistorted views stand in.
+    # The format does not support FULL_OPENCV, so it refers to the undistorted views.
     folder = "sparse" if model == "OPENCV" else "undistorted/sparse"
     reference = pycolmap.Reconstruction(str(output / folder))
     frames = json.loads((output / "transforms.json").read_text())["frames"]

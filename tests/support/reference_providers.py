@@ -75,7 +75,7 @@ class PaintedMask:
         self.options = options
 
     def mask(self, view: View) -> Bool:
-        """Return True where a depth is painted."""
+        """Return the mask of the pixels into which a depth is painted."""
         return np.asarray(read_depth(view.image) > 0)
 
 

@@ -17,8 +17,8 @@ from tests.support.result_files import content
 pytestmark = pytest.mark.slow
 
 MOST = {"computed": (1e-6, 1e-7), "cached": (1e-8, 1e-9)}
-"""What docs/robustness.md promises between kernels for different processors, without and with the
-extraction from a cache: degrees, and parts of the longest baseline."""
+"""Maximum pose differences between processors according to docs/robustness.md, for computed and for
+cached extraction: degrees, and ratio to the longest baseline."""
 
 
 def run(photo_scene, output: Path, workers: int = 1, cache: Path | None = None) -> dict[str, str]:

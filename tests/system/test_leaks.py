@@ -13,8 +13,9 @@ from mpsfm_core.testing.leak_probe import ProcessUsage, measure_usage
 
 RUNS = 20
 MOST_MB = 15.0
-"""That memory may grow from the first half of the runs to the second: twice what was seen. The
-allocator does that at first: 80 runs grew no further, nor do 200 (benchmarks/results/leaks.md)."""
+"""Maximum memory growth in MB from the first to the second half of the runs, twice the measured
+growth. The allocator causes this initial growth; memory does not grow further in 200 runs
+(benchmarks/results/leaks.md)."""
 
 
 @pytest.mark.slow

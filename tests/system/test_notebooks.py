@@ -1,4 +1,4 @@
-"""The notebooks of the examples run, pass mypy, and their numbers are plausible."""
+"""Tests that the example notebooks run, pass mypy, and print plausible numbers."""
 
 from __future__ import annotations
 

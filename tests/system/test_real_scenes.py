@@ -65,5 +65,5 @@ def test_room_with_motion_blur(reconstruct, shared_data: Path, tmp_path: Path) -
     output = reconstruct("hololens_room", "features.options.max_keypoints=1500", images=listed)
     report = evaluate(read_poses(output), read_poses(room / "gt"), names)
     assert report["registered"] >= 0.8 * len(names)
-    assert report["auc"]["20"] > 6  # COLMAP's mappers: 4 to 11 (benchmarks/results)
+    assert report["auc"]["20"] > 6  # 4 to 11 with COLMAP (benchmarks/results)
     assert pycolmap.Reconstruction(str(output / "sparse")).num_reg_images() == report["registered"]

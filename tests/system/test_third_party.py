@@ -76,7 +76,7 @@ def test_example_plugin_is_trained_as_documented(
 
 @pytest.mark.slow
 def test_example_plugin_reconstructs(installed: Mapping[str, str], tmp_path: Path) -> None:
-    """The last step of the tutorial reaches the printed result: AUC 67, 93 and 98 %, 0.5 cm."""
+    """The last step of the tutorial reaches the stated pose AUC of 67, 93 and 98 %, and 0.5 cm."""
     mpsfm = [sys.executable, "-m", "mpsfm_core"]
     cameras = ("--intrinsics", SCENE / "intrinsics.yaml", "--config", EXAMPLE / "config.yaml")
     cache = ("--set", f"runtime.cache_dir={tmp_path / 'cache'}", "--set", "runtime.workers=1")

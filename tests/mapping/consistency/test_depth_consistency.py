@@ -1,4 +1,4 @@
-"""Depth consistency: violations, their explanations by depth errors, and twin rooms."""
+"""Tests of depth consistency: violations, explanations by depth errors, and twin rooms."""
 
 from __future__ import annotations
 

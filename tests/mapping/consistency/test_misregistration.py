@@ -1,4 +1,4 @@
-"""Misregistration: detection by minimum cuts, and re-registration."""
+"""Tests of misregistration: detection by minimum cuts, and re-registration."""
 
 from __future__ import annotations
 

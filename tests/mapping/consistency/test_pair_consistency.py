@@ -1,4 +1,4 @@
-"""Pair consistency: depth contradicts look-alike pairs but not correct ones."""
+"""Tests of pair consistency: depth contradicts look-alike pairs but not correct pairs."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_check_pair_accepts_correct_pairs_and_rejects_look_alikes() -> None:
 
 
 class FixedResults(PairConsistencyCheck):
-    """Returns given results by image pair."""
+    """Replacement of the pair check that returns given results by image pair."""
 
     results: Mapping[tuple[int, int], PairConsistency]
 
@@ -104,7 +104,7 @@ def test_match_scores_are_multiplied_by_support_ratio() -> None:
 
 
 def test_only_pairs_of_candidate_images_are_checked() -> None:
-    """Images of earlier components are settled and may be the majority."""
+    """Images of earlier components keep their poses, and may be the majority."""
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 14.0))
     check = checker(problem, FixedResults)
     check.results = {(1, 2): PairConsistency(np.eye(3), 0.5)}

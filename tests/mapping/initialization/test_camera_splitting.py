@@ -1,4 +1,4 @@
-"""Images of one assumed camera that have another zoom get their own camera."""
+"""Tests that images with another zoom than their assumed camera get their own camera."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def room() -> MappingProblem:
 
 @pytest.fixture(scope="module")
 def model(room: MappingProblem) -> Reconstruction:
-    """Model of all images except image 1."""
+    """Return the model of all images except image 1."""
     return convert_scene(register_true_poses(room, (0, 2, 3, 4)).scene)
 
 

@@ -1,4 +1,4 @@
-"""Global initialization: accuracy, robustness, and fallback to an initial pair."""
+"""Tests of global initialization: accuracy, robustness, and fallback to an initial pair."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Initial pair: reference image, relaxed thresholds, and ranking."""
+"""Tests of the initial pair: reference image, relaxed thresholds, and ranking."""
 
 from __future__ import annotations
 

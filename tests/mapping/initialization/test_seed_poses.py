@@ -1,4 +1,4 @@
-"""Seed poses: a reconstruction initializes another one with more matches."""
+"""Tests of seed poses: a reconstruction initializes another reconstruction with more matches."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Self-calibration: guessed focal lengths are refined camera by camera."""
+"""Tests of self-calibration: estimated focal lengths are refined for each camera."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pose correspondences of keypoints with unknown depth."""
+"""Tests of pose correspondences of keypoints with unknown depth."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pose hypotheses with unknown focal length."""
+"""Tests of pose hypotheses with unknown focal length."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Support of a pose by its correspondences, and its maximization."""
+"""Tests of the support of a pose by correspondences, and of maximizing the support."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def scene() -> Scene:
 
 @pytest.fixture
 def correspondences(scene: Scene) -> PoseCorrespondences:
-    """Every fifth correspondence is wrong: it has the keypoint of another one."""
+    """Return correspondences of which every fifth has the keypoint of another correspondence."""
     right = find_correspondences(scene, NEW, list(range(NEW)), OPTIONS)
     assert len(right.keypoints) > 50
     keypoints = right.keypoints.copy()

@@ -1,4 +1,4 @@
-"""The history of registration attempts comes back from a checkpoint."""
+"""Tests that the history of registration attempts is restored from a checkpoint."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Tentative registration of images that no verification confirms."""
+"""Tests of tentative registration of images that cannot be verified."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Threshold schedule: inlier thresholds relax, the depth threshold tightens."""
+"""Test of the threshold schedule: inlier thresholds relax, the depth threshold tightens."""
 
 from __future__ import annotations
 

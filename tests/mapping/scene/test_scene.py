@@ -1,4 +1,4 @@
-"""Scene: rollback of focal lengths and distortion, and state of a checkpoint."""
+"""Tests of the scene: rollback of focal lengths and distortion, and checkpoint state."""
 
 from __future__ import annotations
 

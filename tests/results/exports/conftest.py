@@ -1,4 +1,4 @@
-"""Result folders of an exact reconstruction, with photos through a distorted camera."""
+"""Fixtures: result folders of an exact reconstruction, with photos of a distorted camera."""
 
 from __future__ import annotations
 
@@ -33,7 +33,8 @@ NAMES = ("a/0.png", "a/1.jpg", "2.webp", "guess.png")
 
 @pytest.fixture(scope="session")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``out`` with ``photos`` beside it; the last image is not confirmed. World as the room's."""
+    """Write ``out/`` and ``photos/`` in room coordinates; the last image is tentatively
+    registered."""
     folder = tmp_path_factory.mktemp("result")
     scene, poses = room_scene(), arc_poses(4, 12.0)
     pinhole = undistort_camera(CAMERA)

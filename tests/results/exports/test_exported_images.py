@@ -1,4 +1,4 @@
-"""Exported images and names are readable by programs that expect 8-bit RGB and plain names."""
+"""Tests that programs that expect 8-bit RGB and plain names can read exported images."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_rgb_image_is_copied_without_loss(tmp_path: Path, suffix: str) -> None:
 
 @pytest.fixture
 def spaced_model(tmp_path: Path) -> Path:
-    """A binary model of three images whose names differ only behind a space."""
+    """Write a binary model of three images whose names differ only after a space."""
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
         model="PINHOLE", width=WIDTH, height=HEIGHT, params=[70, 70, 32, 24], camera_id=1

@@ -1,4 +1,4 @@
-"""Every format, opened by the program or library that reads it where that can be installed."""
+"""Tests of every export format with the program or library that reads the format."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from mpsfm_core.results.exports.formats import FORMATS, export
 from mpsfm_core.results.ply import read_ply
 
 REGISTERED = ["2.webp.jpg", "a/0.png", "a/1.jpg"]
-"""As the undistorted photos are called; the fourth is not confirmed."""
+"""Names of the undistorted photos; the fourth photo is only tentatively registered."""
 
 
 def model_of(result: Path) -> pycolmap.Reconstruction:
@@ -29,7 +29,7 @@ def model_of(result: Path) -> pycolmap.Reconstruction:
 
 
 def median_error(image, camera, depth, points) -> float:
-    """Relative error of a depth map that covers the photo, at the points that project into it."""
+    """Return the median relative depth error of a depth map at the projections of points."""
     local = image.cam_from_world() * points
     scale = depth.shape[1] / camera.width
     column, row = (camera.img_from_cam(local) * scale).astype(int).T
@@ -77,7 +77,7 @@ def test_plugins_bring_formats(result: Path, tmp_path: Path, install_plugin) -> 
 
 @pytest.mark.parametrize("turn", [True, False])
 def test_gsplat_reads_the_folder(result: Path, tmp_path: Path, turn: bool) -> None:
-    """What gsplat's examples/datasets/colmap.py asks for, step by step."""
+    """Read the folder step by step like gsplat's examples/datasets/colmap.py."""
     export(result, "gsplat", tmp_path, turn=turn)
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     names = [model.images[i].name for i in model.reg_image_ids()]
@@ -108,7 +108,7 @@ def test_gaussians_have_place_colour_and_size(result: Path, tmp_path: Path) -> N
     red = 0.28209479177387814 * column["f_dc_0"] + 0.5
     np.testing.assert_allclose(red * 255, colors[:, 0], atol=1e-3)
     nearest = np.median(np.exp(column["scale_0"]))
-    assert 0.001 < nearest < 0.2  # metres, in a room seen by 80 x 60 pixels
+    assert 0.001 < nearest < 0.2  # meters in a room, in images of 80 x 60 pixels
     assert (column["rot_0"] == 1).all()
 
 
@@ -161,7 +161,7 @@ def test_colmap_maps_from_the_database(result: Path, tmp_path: Path) -> None:
     export(result, "colmap-db", tmp_path / "db")
     path = tmp_path / "db" / "database.db"
     with pycolmap.Database.open(str(path)) as database:
-        assert database.num_images() == 4  # the guess has keypoints, but no matches
+        assert database.num_images() == 4  # the tentative image has no matches
         assert database.num_verified_image_pairs() == 3
     options = pycolmap.IncrementalPipelineOptions()
     options.ba_refine_focal_length = options.ba_refine_extra_params = False
@@ -175,7 +175,7 @@ def test_colmap_maps_from_the_database(result: Path, tmp_path: Path) -> None:
 
 
 def test_trimesh_reads_the_glb(result: Path, tmp_path: Path) -> None:
-    """Blender 5.0 was tried by hand: it has points with colour, and a camera for each photo."""
+    """Tested by hand: Blender 5.0 shows colored points and a camera for each photo."""
     export(result, "glb", tmp_path)
     scene = trimesh.load(tmp_path / "scene.glb")
     points, colors = read_ply(result / "dense.ply")
@@ -196,7 +196,8 @@ def test_trimesh_reads_the_glb(result: Path, tmp_path: Path) -> None:
 
 
 def test_bundler_projects_by_its_own_formula(result: Path, tmp_path: Path) -> None:
-    """x = f * -P / P.z with P = R X + t (Snavely's manual). MeshLab was tried by hand."""
+    """Project by x = f * -P / P.z with P = R X + t (Snavely's manual). Tested by hand in
+    MeshLab."""
     export(result, "bundler", tmp_path)
     names = (tmp_path / "list.txt").read_text().split()
     assert names == [f"images/{name}" for name in REGISTERED]
@@ -219,7 +220,8 @@ def test_bundler_projects_by_its_own_formula(result: Path, tmp_path: Path) -> No
 
 
 def test_nvm_projects_by_its_own_formula(result: Path, tmp_path: Path) -> None:
-    """x = f * (R (X - C)), R from the quaternion (VisualSFM's page). MeshLab was tried by hand."""
+    """Project by x = f * (R (X - C)) with R from the quaternion (VisualSFM). Tested by hand in
+    MeshLab."""
     export(result, "nvm", tmp_path)
     lines = (tmp_path / "reconstruction.nvm").read_text().splitlines()
     assert lines[0].strip() == "NVM_V3"
@@ -246,7 +248,7 @@ def test_turned_worlds_have_gravity_down_and_their_middle_at_the_origin(
     described = export(result, "gsplat", tmp_path)
     assert "gravity from cameras and surfaces" in described["orientation"]
     turned = np.array(described["world_from_model"])
-    truth = np.array([0.0, 0.0, 1.0])  # z is up in the analytic room
+    truth = np.array([0.0, 0.0, 1.0])  # z is up in the synthetic room
     assert angle_between_deg(turned[:, :3] @ truth, np.array([0, 0, 1.0])) < 0.5
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
     middle = np.median([point.xyz for point in model.points3D.values()], axis=0)
@@ -254,7 +256,7 @@ def test_turned_worlds_have_gravity_down_and_their_middle_at_the_origin(
 
 
 def test_a_turned_world_is_in_metres_as_far_as_they_are_known(result: Path, tmp_path: Path) -> None:
-    """A scale that is not trusted stays out of the model, and goes into what is rendered."""
+    """An uncertain metric scale changes rendered formats only, not the exported COLMAP model."""
     folder = tmp_path / "result"
     shutil.copytree(result, folder)
     summary = json.loads((folder / "summary.json").read_text())
@@ -287,7 +289,7 @@ def test_a_colmap_model_is_exported_with_the_photos_that_are_named(
     with pytest.raises(InputError, match="give it with --images"):
         export(folder, "gsplat")
     described = export(folder, "gsplat", photos=result.parent / "photos")
-    assert described["images"] == 4  # nobody says here that one is a guess
+    assert described["images"] == 4  # a COLMAP model marks no tentative image
     assert described["metres_per_unit"] is None
     assert "gravity from how the cameras are held" in described["orientation"]
     assert not (folder / "exports" / "gsplat" / "maps").exists()
