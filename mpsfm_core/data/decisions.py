@@ -161,8 +161,12 @@ class DoubtReason(ReasonCode):
     ``min_ratio``."""
     GPS_MISFIT = ("gps-misfit", "num_inliers", "num_positions")
     """Only ``num_inliers`` of ``num_positions`` GPS positions fit the camera centers."""
-    UNKNOWN_FOCAL_LENGTH = ("unknown-focal-length", "num_images")
-    """``num_images`` images have a guessed focal length that bundle adjustment did not refine."""
+    UNKNOWN_FOCAL_LENGTH = ("unknown-focal-length", "num_images", "std_ratio")
+    """The relative std of the guessed focal length of ``num_images`` images is up to
+    ``std_ratio``."""
+    UNCERTAIN_POSES = ("uncertain-poses", "num_images", "error_deg")
+    """Other focal lengths, principal points and distortions fit the matches as well or better. They
+    change the relative poses of ``num_images`` images by up to ``error_deg`` degrees."""
 
 
 @dataclass(frozen=True)

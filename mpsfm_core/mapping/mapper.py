@@ -317,7 +317,8 @@ class Mapper:
         if size >= min_size:
             # known poses define the world and its unit, unless they are only an initial guess
             keep_units = self._uses_known_poses and self.options.known_poses != "guess"
-            self.models.append(convert_scene(scene, keep_units=keep_units))
+            errors = self.component.refiner.predict_calibration_errors()
+            self.models.append(convert_scene(scene, errors, keep_units=keep_units))
         else:
             reason = ImageReason.COMPONENT_TOO_SMALL.because(num_images=size, min_images=min_size)
             self._reject(scene.registered, reason)

@@ -247,9 +247,16 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
     ),
     DoubtReason.UNKNOWN_FOCAL_LENGTH: (
         "unknown focal length",
-        "The focal length of {num_images} photos is a guess that the photos could not refine; a "
-        "wrong one bends the whole model.",
+        "The focal length of {num_images} photos is known to {std_ratio:.0%} only; a wrong focal "
+        "length bends the whole model.",
         "Give it with --intrinsics, or use photos with EXIF as they come from the camera.",
+    ),
+    DoubtReason.UNCERTAIN_POSES: (
+        "poses depend on an uncertain camera",
+        "Cameras with another focal length, principal point or distortion fit the matches as well "
+        "or better, and change the poses of {num_images} photos by up to {error_deg:.2g} degrees. "
+        "Zoomed or cropped photos cause such errors, and so does little parallax.",
+        "Use photos as they come from the camera, or give the true camera with --intrinsics.",
     ),
     CameraReason.KNOWN: ("known focal length", "The focal length is given.", _NO_REMEDY),
     CameraReason.NOT_ESTIMATED: (

@@ -27,6 +27,12 @@ MIN_ANGLE_DEG = 0.5
 MIN_POINTS = 30
 """Minimum number of 3D points that support the pose of an image [COLMAP
 abs_pose_min_num_inliers]."""
+MAX_FOCAL_STD_RATIO = 0.1
+"""Relative standard deviation of a focal length above which the focal length is unknown [std of
+EXIF focal lengths]."""
+MAX_POSE_ERROR_DEG = 2.0
+"""Predicted relative pose error in degrees above which a pose is uncertain [largest error of a good
+model in benchmarks.verdicts]."""
 MIN_EXPLAINED_RATIO = 0.2
 """Minimum share of the matches of an image that the model must explain [ours]."""
 
@@ -82,14 +88,32 @@ def find_doubts(summary: Mapping[str, Any]) -> Iterator[Doubt]:
     if place.get("why_not", {}).get("code") == GpsReason.FEW_INLIERS.value:
         values = {name: place["why_not"][name] for name in GpsReason.FEW_INLIERS.fields}
         yield Doubt(DoubtReason.GPS_MISFIT.because(**values))
-    guessed = tuple(
-        name
-        for name, image in summary["images"]["details"].items()
-        if image["focal_length_from"] == "default" and not is_focal_refined(image)
-        if name in summary["images"]["registered"]
-    )
+    registered = summary["images"]["registered"]
+    details = {name: summary["images"]["details"][name] for name in registered}
+    ratios = {name: _focal_std_ratio(image) for name, image in details.items()}
+    guessed = {name: ratio for name, ratio in ratios.items() if ratio > MAX_FOCAL_STD_RATIO}
     if guessed:
-        yield Doubt(DoubtReason.UNKNOWN_FOCAL_LENGTH.because(num_images=len(guessed)), guessed)
+        reason = DoubtReason.UNKNOWN_FOCAL_LENGTH.because(
+            num_images=len(guessed), std_ratio=round(max(guessed.values()), 3)
+        )
+        yield Doubt(reason, tuple(guessed))
+
+
+def _focal_std_ratio(image: Mapping[str, Any]) -> float:
+    """Return the relative standard deviation of the focal length of an image.
+
+    Args:
+        image: entry of the image in ``images.details`` of ``summary.json``.
+
+    Returns:
+        Standard deviation relative to the focal length. Without a stated standard deviation, 1 for
+        an unrefined default focal length, and else 0.
+    """
+    if "focal_length_std_px" in image:
+        focal_px = image.get("refined_focal_length_px", image["focal_length_px"])
+        return float(image["focal_length_std_px"] / focal_px)
+    is_guess = image["focal_length_from"] == "default" and not is_focal_refined(image)
+    return 1.0 if is_guess else 0.0
 
 
 def is_focal_refined(image: Mapping[str, Any]) -> bool:
@@ -122,7 +146,7 @@ def _unexplained_pairs(pairs: list[Mapping[str, Any]]) -> Iterator[Doubt]:
 
 
 def _weak_evidence(evidence: Mapping[str, Any]) -> Iterator[Doubt]:
-    """Yield doubts from connectivity, parallax, point counts and explained matches of a model."""
+    """Yield doubts from connectivity, parallax, points, pose errors and explained matches."""
     parts = evidence["parts"]
     if len(parts) > 1:
         apart = tuple(name for part in parts[1:] for name in part)
@@ -135,6 +159,15 @@ def _weak_evidence(evidence: Mapping[str, Any]) -> Iterator[Doubt]:
     if few:
         reason = DoubtReason.FEW_POINTS.because(num_images=len(few), min_points=MIN_POINTS)
         yield Doubt(reason, few)
+    errors = {
+        name: image.get("pose_error_deg") or 0.0 for name, image in evidence["images"].items()
+    }
+    uncertain = tuple(name for name, error in errors.items() if error > MAX_POSE_ERROR_DEG)
+    if uncertain:
+        reason = DoubtReason.UNCERTAIN_POSES.because(
+            num_images=len(uncertain), error_deg=max(errors.values())
+        )
+        yield Doubt(reason, uncertain)
     unexplained = tuple(
         name
         for name, image in evidence["images"].items()

@@ -53,7 +53,8 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
         Plain data with the keys ``parts``, ``median_angle_deg`` and ``images``. ``parts`` are the
         image names of each connected part of the covisibility graph, largest part first.
         ``median_angle_deg`` is the median over the 3D points of the maximum triangulation angle.
-        ``images`` are the number of 3D points and the share of explained matches, by image name.
+        ``images`` are the number of 3D points, the share of explained matches and the predicted
+        relative pose error (None without a prediction), by image name.
     """
     images = reconstruction.confirmed_images
     explained = count_explained_matches(reconstruction, problem)
@@ -74,6 +75,9 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
                 "explained_ratio": round(
                     supported.get(image.name, 0) / max(matched.get(image.name, 0), 1), 4
                 ),
+                "pose_error_deg": None
+                if image.pose_error_deg is None
+                else round(image.pose_error_deg, 3),
             }
             for image in images
         },

@@ -256,6 +256,10 @@ def test_verdict_doubts_pairs_that_share_no_points() -> None:
     [
         ({"parts": [["a", "b"], ["c"]]}, DoubtReason.DISCONNECTED),
         ({"median_angle_deg": 0.1}, DoubtReason.LOW_PARALLAX),
+        (
+            {"images": {"a": {"points": 99, "explained_ratio": 0.9, "pose_error_deg": 4.2}}},
+            DoubtReason.UNCERTAIN_POSES,
+        ),
         ({"images": {"a": {"points": 12, "explained_ratio": 0.9}}}, DoubtReason.FEW_POINTS),
         (
             {"images": {"a": {"points": 99, "explained_ratio": 0.05}}},
@@ -281,6 +285,22 @@ def test_verdict_doubts_guessed_focal_lengths_that_were_not_refined() -> None:
     report["images"]["details"]["b"]["focal_length_from"] = "default"
     (doubt,) = judge(report).doubts
     assert doubt.images == ("b",)
+
+
+@pytest.mark.parametrize("source", ["default", "exif"])
+@pytest.mark.parametrize(("std_px", "is_doubtful"), [(80.0, True), (20.0, False)])
+def test_verdict_doubts_focal_lengths_with_large_std(
+    source: str, std_px: float, is_doubtful: bool
+) -> None:
+    report = summary()
+    report["images"]["details"]["b"] |= {
+        "focal_length_from": source,
+        "focal_length_px": 500.0,
+        "refined_focal_length_px": 600.0,
+        "focal_length_std_px": std_px,
+    }
+    expected = [DoubtReason.UNKNOWN_FOCAL_LENGTH] if is_doubtful else []
+    assert doubts(report) == expected
 
 
 def test_images_that_were_left_out_are_a_finding() -> None:

@@ -29,6 +29,14 @@ def test_evidence_of_a_connected_model(solved) -> None:
     assert [len(part) for part in evidence["parts"]] == [len(model.images)]
     assert evidence["median_angle_deg"] > 1
     assert all(image["points"] > 0 for image in evidence["images"].values())
+    assert all(image["pose_error_deg"] is None for image in evidence["images"].values())
+
+
+def test_evidence_contains_predicted_pose_errors(solved) -> None:
+    model = solved.result.reconstructions[0]
+    images = tuple(replace(image, pose_error_deg=1.23456) for image in model.images)
+    evidence = describe_evidence(replace(model, images=images), solved.problem)
+    assert all(image["pose_error_deg"] == 1.235 for image in evidence["images"].values())
 
 
 def test_image_without_common_points_is_a_part_of_its_own(solved) -> None:

@@ -9,6 +9,7 @@ Therefore bundle adjustment uses the scaled depth priors, unless the option ``bu
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,15 +19,20 @@ from mpsfm_core.mapping.refinement.depth_noise import DepthNoise, measure_depth_
 from mpsfm_core.mapping.refinement.filtering import filter_points
 from mpsfm_core.mapping.refinement.keypoint_noise import measure_loss_scale
 from mpsfm_core.mapping.refinement.self_calibration import calibrate_cameras, has_guessed_camera
-from mpsfm_core.mapping.scene.estimated_intrinsics import MIN_FOCAL_IMAGES
+from mpsfm_core.mapping.scene.estimated_intrinsics import (
+    MIN_FOCAL_IMAGES,
+    IntrinsicParameter,
+    PredictedErrors,
+)
 from mpsfm_core.mapping.scene.local_bundle import find_local_bundle
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, lift_low_parallax
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
+from mpsfm_core.optimize.calibration_errors import predict_calibration_errors
 from mpsfm_core.optimize.covariance import compute_point_covariances, propagate_depth_variance
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
-from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, Loss
+from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, BundleOptions, Loss
 from mpsfm_core.optimize.subsampling import (
     compute_subsampling_step,
     subsample_camera,
@@ -63,6 +69,18 @@ MAX_NOISE_CHANGE = 1.25
 MIN_SCALE_POINTS = 20
 """Smallest number of well triangulated points for which the depth scale shared by several images is
 estimated again. [ours]"""
+
+
+class _Bundle(NamedTuple):
+    """Bundle adjustment problem of some images of the scene."""
+
+    problem: BundleProblem
+    images: Int64
+    """(n,) scene index of each image of the problem."""
+    points: Int64
+    """(p,) row in the tracks of each point of the problem."""
+    representatives: Int64
+    """(k,) scene index of one image of each camera of the problem."""
 
 
 class Refiner:
@@ -212,6 +230,81 @@ class Refiner:
             max_iterations: Maximum number of bundle adjustment iterations, or None to use the
                 option.
         """
+        scene = self.scene
+        bundle = self._collect_bundle(
+            variable, local=local, refined_depth=self._alternates and not focal
+        )
+        if bundle is None:
+            return
+        options = self._scale_losses(reprojection_scale, depth_scale)
+        if max_iterations:
+            options = options.model_copy(update={"max_iterations": max_iterations})
+        if focal:
+            result = calibrate_cameras(
+                scene,
+                bundle.problem,
+                options,
+                bundle.representatives,
+                refine_distortion=self.options.refine_distortion,
+            )
+        else:
+            result = adjust_bundle(bundle.problem, options)
+        images = bundle.images
+        scene.rotations[images] = result.rotations
+        scene.translations[images] = result.translations
+        scene.tracks.xyz[bundle.points] = result.points
+        for row in np.flatnonzero(result.log_scales):
+            depth_map = scene.maps[images[row]]
+            depth_map.set_scale(depth_map.scale * float(np.exp(result.log_scales[row])))
+
+    def predict_calibration_errors(self) -> PredictedErrors:
+        """Predict the errors of poses and guessed intrinsics of the registered images."""
+        scene = self.scene
+        bundle = self._collect_bundle([int(image) for image in scene.registered_images()])
+        predicted = PredictedErrors.unknown(scene.num_images)
+        if bundle is None:
+            return predicted
+        cameras = [scene.problem.images[image] for image in bundle.representatives]
+        problem = replace(
+            bundle.problem,
+            prior_log_focals=np.log([image.focal_prior_px for image in cameras]),
+            prior_std_log_focals=np.array([image.focal_log_std for image in cameras]),
+        )
+        errors = predict_calibration_errors(
+            problem,
+            self._scale_losses(),
+            ~has_guessed_camera(scene, bundle.representatives),
+            np.array([max(image.camera.size) for image in cameras], dtype=np.float64),
+        )
+        if errors is not None:
+            predicted.pose_deg[bundle.images] = errors.pose_deg
+            radial = errors.radial[problem.camera_of_image]
+            predicted.stds[bundle.images, IntrinsicParameter.FOCAL_LENGTH] = errors.log_focal
+            predicted.stds[bundle.images, IntrinsicParameter.RADIAL_DISTORTION] = radial
+        return predicted
+
+    def _scale_losses(
+        self, reprojection_scale: float = 1.0, depth_scale: float = 1.0
+    ) -> BundleOptions:
+        """Return the options of bundle adjustment with losses scaled by factors and noise."""
+        options = self.options.bundle
+        return options.model_copy(
+            update={
+                "reprojection_scale": self.loss_scale * reprojection_scale,
+                "depth_scale": depth_scale * (options.depth_scale * self.noise.loss_factor),
+            }
+        )
+
+    def _collect_bundle(
+        self, variable: list[int], *, local: bool = False, refined_depth: bool = False
+    ) -> _Bundle | None:
+        """Return the bundle adjustment problem of images, or None if they observe no points.
+
+        Args:
+            variable: Images with variable pose.
+            local: Keep points with long tracks fixed.
+            refined_depth: Use refined depth instead of the scaled depth priors.
+        """
         scene, tracks = self.scene, self.scene.tracks
         observations = tracks.observations()
         image_of = scene.graph.image_of[observations]
@@ -219,18 +312,16 @@ class Refiner:
         seen[tracks.point_of[observations[scene.mask(variable)[image_of]]]] = True
         observations = observations[seen[tracks.point_of[observations]]]
         if not len(observations):
-            return
+            return None
         images, image_rows = np.unique(scene.graph.image_of[observations], return_inverse=True)
         points, point_rows = np.unique(tracks.point_of[observations], return_inverse=True)
         moving = (scene.mask(variable) & ~self.fixed)[images]
         if moving.all():
             moving[0] = False
         long_track = np.bincount(point_rows) >= MAX_LOCAL_TRACK_LENGTH
-        log_depth, log_std = self._depth_observations(observations, self._alternates and not focal)
+        log_depth, log_std = self._depth_observations(observations, refined_depth)
         regularized = self.options.depth_regularization and bool(np.isfinite(log_depth).any())
         free_scale = not regularized and moving.any() and np.count_nonzero(~moving) == 1
-        options = self.options.bundle
-        depth_scale *= options.depth_scale * self.noise.loss_factor
         weight = scene.graph.keypoint_weight[observations]
         expected, std = self._expected_log_scales(images)
         _, first, camera_rows = np.unique(
@@ -256,29 +347,7 @@ class Refiner:
             variable_point=~long_track if local else None,
             scale_anchor=int(np.argmax(moving)) if free_scale else None,
         )
-        options = options.model_copy(
-            update={
-                "reprojection_scale": self.loss_scale * reprojection_scale,
-                "depth_scale": depth_scale,
-                "max_iterations": max_iterations or options.max_iterations,
-            }
-        )
-        if focal:
-            result = calibrate_cameras(
-                scene,
-                problem,
-                options,
-                images[first],
-                refine_distortion=self.options.refine_distortion,
-            )
-        else:
-            result = adjust_bundle(problem, options)
-        scene.rotations[images] = result.rotations
-        scene.translations[images] = result.translations
-        tracks.xyz[points] = result.points
-        for row in np.flatnonzero(result.log_scales):
-            depth_map = scene.maps[images[row]]
-            depth_map.set_scale(depth_map.scale * float(np.exp(result.log_scales[row])))
+        return _Bundle(problem, images, points, images[first])
 
     def refine_locally(self, image: int) -> None:
         """Adjust the local bundle of an image and update its tracks until few tracks change.

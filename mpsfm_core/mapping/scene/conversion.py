@@ -12,6 +12,7 @@ from mpsfm_core.mapping.scene.estimated_intrinsics import (
     MIN_FOCAL_IMAGES,
     CalibrationOutcome,
     IntrinsicParameter,
+    PredictedErrors,
 )
 from mpsfm_core.mapping.scene.reconstruction import (
     CalibratedParameter,
@@ -53,11 +54,14 @@ def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | No
     return MetricScale(float(np.exp(-center)), spread, len(log_scales), trusted)
 
 
-def convert_scene(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
+def convert_scene(
+    scene: Scene, errors: PredictedErrors | None = None, *, keep_units: bool = False
+) -> Reconstruction:
     """Convert the scene to a reconstruction, in meters if the metric scale is reliable.
 
     Args:
         scene: The scene, from whose tracks the rows of deleted points are removed.
+        errors: Predicted errors of all images, or None without a prediction.
         keep_units: Keep the unit of the world instead of scaling the reconstruction to meters.
     """
     scene.tracks.compact()
@@ -67,12 +71,12 @@ def convert_scene(scene: Scene, *, keep_units: bool = False) -> Reconstruction:
     tracks = scene.tracks
     observations = tracks.observations()
     points = tracks.point_of[observations]
-    errors, _ = scene.project(observations, tracks.xyz[points])
+    errors_px, _ = scene.project(observations, tracks.xyz[points])
     num_points = len(tracks.xyz)
     lengths = np.bincount(points, minlength=num_points)
-    mean_errors = np.bincount(points, errors, minlength=num_points) / np.maximum(lengths, 1)
+    mean_errors = np.bincount(points, errors_px, minlength=num_points) / np.maximum(lengths, 1)
     images = tuple(
-        convert_image(scene, int(i), factor, in_metres) for i in scene.registered_images()
+        convert_image(scene, int(i), factor, in_metres, errors) for i in scene.registered_images()
     )
     return Reconstruction(images, tracks.xyz * factor, mean_errors, metric)
 
@@ -88,7 +92,13 @@ def capture_scene_state(scene: Scene) -> SceneState:
     )
 
 
-def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> RegisteredImage:
+def convert_image(
+    scene: Scene,
+    index: int,
+    factor: float,
+    in_metres: bool,
+    errors: PredictedErrors | None = None,
+) -> RegisteredImage:
     """Convert a registered image of the scene to an image of the reconstruction.
 
     Args:
@@ -96,7 +106,10 @@ def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> R
         index: Index of the image in the mapping problem.
         factor: Factor from world units to the unit of the reconstruction.
         in_metres: Whether the unit of the reconstruction is the meter.
+        errors: Predicted errors of all images, or None without a prediction.
     """
+    errors = PredictedErrors.unknown(scene.num_images) if errors is None else errors
+    pose_error_deg = float(errors.pose_deg[index])
     image, depth_map = scene.problem.images[index], scene.maps[index]
     depth = depth_map.depth * np.float32(factor)
     variance = (depth_map.log_std * depth) ** 2
@@ -110,19 +123,31 @@ def convert_image(scene: Scene, index: int, factor: float, in_metres: bool) -> R
         depth=DepthPrior.from_arrays(depth, variance, depth_map.valid, metric=in_metres),
         scale=depth_map.scale * factor,
         radial=float(scene.radial[index]),
-        calibration={p: _describe_calibration(scene, index, p) for p in IntrinsicParameter},
+        pose_error_deg=pose_error_deg if np.isfinite(pose_error_deg) else None,
+        calibration={
+            p: _describe_calibration(scene, index, p, float(errors.stds[index, p]))
+            for p in IntrinsicParameter
+        },
     )
 
 
 def _describe_calibration(
-    scene: Scene, index: int, parameter: IntrinsicParameter
+    scene: Scene, index: int, parameter: IntrinsicParameter, predicted_std: float
 ) -> CalibratedParameter:
-    """Return estimate and std of a parameter, and the reason why the parameter is not refined."""
+    """Return estimate and std of a parameter, and the reason why the parameter is not refined.
+
+    The predicted standard deviation includes systematic errors of the camera model, and replaces
+    the posterior standard deviation of bundle adjustment. The focal length also has a predicted
+    standard deviation if bundle adjustment did not estimate the focal length.
+    """
     get_reason = {
         IntrinsicParameter.FOCAL_LENGTH: _get_focal_reason,
         IntrinsicParameter.RADIAL_DISTORTION: _get_radial_reason,
     }[parameter]
     estimate = scene.estimated_intrinsics.get(index, parameter)
+    is_stated = parameter == IntrinsicParameter.FOCAL_LENGTH or np.isfinite(estimate.std)
+    if is_stated and np.isfinite(predicted_std) and not scene.problem.images[index].focal_known:
+        estimate = estimate._replace(std=predicted_std)
     return CalibratedParameter(estimate, get_reason(scene, index))
 
 

@@ -50,6 +50,25 @@ class IntrinsicEstimate(NamedTuple):
     """Posterior standard deviation (of the log focal length), or NaN without an estimate."""
 
 
+class PredictedErrors(NamedTuple):
+    """Predicted root mean square errors of all images of a scene, NaN without a prediction.
+
+    See :func:`~mpsfm_core.optimize.calibration_errors.predict_calibration_errors`.
+    """
+
+    pose_deg: Float64
+    """(n,) relative pose error of each image in degrees."""
+    stds: Float64
+    """(n, p) error of each :class:`IntrinsicParameter` of each image, 0 for known cameras."""
+
+    @classmethod
+    def unknown(cls, num_images: int) -> PredictedErrors:
+        """Return NaN for all errors of ``num_images`` images."""
+        return cls(
+            np.full(num_images, np.nan), np.full((num_images, len(IntrinsicParameter)), np.nan)
+        )
+
+
 class EstimatedIntrinsics:
     """Estimates of all intrinsic parameters of all images.
 

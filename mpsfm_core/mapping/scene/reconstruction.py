@@ -46,7 +46,7 @@ class CalibratedParameter:
 
     @property
     def std(self) -> float | None:
-        """Standard deviation of the estimate, or None if the parameter was not estimated."""
+        """Standard deviation with predicted systematic errors, or None if neither is known."""
         return self.estimate.std if np.isfinite(self.estimate.std) else None
 
     def state_dict(self) -> StateDict:
@@ -86,6 +86,9 @@ class RegisteredImage:
     """Scale of the depth prior, in world units per unit of the prior."""
     confirmed: bool = True
     """False if the image was registered tentatively, without verification."""
+    pose_error_deg: float | None = None
+    """Predicted root mean square of the relative pose error with other images in degrees, or None
+    without a prediction."""
     radial: float = 0.0
     """Radial distortion coefficient (SIMPLE_RADIAL) of the original image. The keypoints were
     undistorted with an initial coefficient, which the mapper refines."""

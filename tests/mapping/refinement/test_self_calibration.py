@@ -51,6 +51,7 @@ def test_reconstruct_with_wrong_focal_lengths_refines_all(
         focal_std = image.calibration[FOCAL].std
         assert focal_std is not None and 0 < focal_std < 0.01
         assert image.calibration[FOCAL].is_refined
+        assert image.pose_error_deg is not None and 0 < image.pose_error_deg < 1
         for other in model.images:
             relative = image.rotation @ other.rotation.T
             true_relative = POSES[image.index][:, :3] @ POSES[other.index][:, :3].T
