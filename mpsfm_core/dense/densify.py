@@ -53,7 +53,7 @@ from mpsfm_core.support.threads import thread_limit
 
 _T = TypeVar("_T", bound=np.generic)
 _NUM_SOURCES = 5
-"""Maximum number of source views per reference view. Raising this number gives more complete depth,
+"""Maximum number of source views per reference view. More source views give more complete depth,
 but stereo takes longer [ours]."""
 _MATCH_STD_PX = 0.5
 """Assumed std of a stereo match in pixels, for the tolerance of the consistency check [ours]."""

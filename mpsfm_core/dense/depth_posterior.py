@@ -28,7 +28,8 @@ _DOWNSAMPLING = 8
 _MIN_MEASURED_RATIO = 0.3
 """Minimum ratio of pixels with stereo depth in a used block; single pixels may be wrong [ours]."""
 _MIN_KNOWN_ERROR_RATIO = 0.5
-"""Minimum ratio of the input depth's estimated std to its distance from stereo depth [ours].
+"""Minimum ratio of the estimated std of input depth to the distance between input and stereo depth
+[ours].
 
 The std of stereo depth is known with a relative accuracy of about 1/8."""
 MIN_STD = 1e-4

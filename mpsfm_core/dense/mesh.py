@@ -83,8 +83,8 @@ class _WeightedDepth(NamedTuple):
         """Find the mesh vertices on the surface of the depth map.
 
         Behind object edges the TSDF contains false surfaces, because only some images have depth
-        behind the edge. No depth map contains these false surfaces, so the comparison with depth
-        maps rejects the vertices on them.
+        behind the edge. No depth map contains the false surfaces of the TSDF, so the comparison
+        with depth maps rejects vertices on false surfaces.
 
         Args:
             vertices: (n, 3) positions of the vertices, world frame.

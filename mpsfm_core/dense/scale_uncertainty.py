@@ -59,7 +59,8 @@ def measure_scale_constraints(
     All stereo pairs that confirm a pixel are assumed to have equal depth variance. The variance of
     a scale difference is at least the squared mean log depth difference at the pixels that both
     pairs confirm. Errors of input depth are correlated within the pixels that a stereo pair
-    confirms. The std of input depth is therefore its distance to stereo depth at these pixels.
+    confirms. The std of input depth is therefore the distance between input and stereo depth at the
+    pixels that a stereo pair confirms.
 
     Args:
         differences: Source image -> (h, w) log depth differences from

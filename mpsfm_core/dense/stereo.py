@@ -32,13 +32,13 @@ _MAX_LABELS = 96
 _WINDOW_RADIUS = 3
 """Radius of the NCC window in pixels of the pyramid level [ours]."""
 _GRAY_NOISE = 2.0
-"""Std of image noise in gray levels of 255. Raising this std treats more texture as noise
+"""Std of image noise in gray levels of 255. Raising the noise std treats more texture as noise
 [ours]."""
 _MERGED_VIEW_RATIO = 0.5
 """Ratio of source views whose matching costs are averaged, the lowest costs first [ours].
 
-The source views with the highest matching costs are treated as occluded. Raising this ratio is less
-robust to occlusion."""
+The source views with the highest matching costs are treated as occluded. Averaging more source
+views is less robust to occlusion."""
 _PRIOR_WEIGHT = 0.02
 """Matching cost per squared deviation from the input depth, in stds of the input depth [ours]."""
 _SMALL_STEP_PENALTY = 0.04

@@ -20,8 +20,9 @@ class PairOptions(Options):
     After verification, the mode ``auto`` also matches pairs between unconnected components of the
     match graph."""
     partners: int = Field(30, ge=1)
-    """Minimum number of images that each image is matched with, in mode ``auto``. A larger value
-    finds more pairs of small overlap and takes proportionally longer. [tuned: benchmarks.pairs]"""
+    """Minimum number of images that each image is matched with, in mode ``auto``. More partners per
+    image find more pairs of small overlap, but matching takes proportionally longer. [tuned:
+    benchmarks.pairs]"""
     overlap: int = Field(2, ge=1)
     """Number of following images that each image is paired with, in modes ``sequential`` and
     ``auto``. [reference noverlap]"""
@@ -44,11 +45,12 @@ class VerificationOptions(Options):
     px. The threshold scales with the standard deviation of the keypoints. [COLMAP two-view
     max_error]"""
     min_inliers: int = expert(15, ge=5)
-    """Minimum number of inliers of a verified pair. A larger value drops false pairs and also true
-    pairs of small overlap. [COLMAP min_num_inliers]"""
+    """Minimum number of inliers of a verified pair. Requiring more inliers drops false pairs, and
+    also true pairs of small overlap. [COLMAP min_num_inliers]"""
     max_chance: float = expert(1e-8, ge=0, le=1)
     """Maximum probability that random matches give as many inliers for a fixed epipolar geometry
-    (a-contrario test). The value 1 disables the a-contrario test. [tuned: benchmarks.pairs]"""
+    (a-contrario test). A maximum probability of 1 disables the a-contrario test. [tuned:
+    benchmarks.pairs]"""
 
 
 class AdjustmentOptions(Options):
@@ -63,11 +65,11 @@ class ExtractionOptions(Options):
     """Options for the resolution of prior maps, multi-view networks and dense matches."""
 
     integration_size: int = expert(387, ge=16)
-    """Longer side of the depth and normal maps of the mapper, pixels. A larger map costs memory and
-    time of depth integration. [reference normscale]"""
+    """Longer side of the depth and normal maps of the mapper, pixels. Larger maps take more memory,
+    and more time in depth integration. [reference normscale]"""
     group_size: int = expert(8, ge=1)
     """Number of images per forward pass of a multi-view network. The memory of the network grows
-    with the square of this number."""
+    with the square of the number of images per pass."""
     edge_ratio: float | None = expert(1.015, gt=1)
     """Ratio of neighboring depths above which normals get no weight; null weights all normals.
     [reference continuity]"""

@@ -35,7 +35,7 @@ def run_stage(
         work: Function that computes the result of one item.
         workers: Number of threads.
         remote: Generator that yields whenever a remote worker has written an item's result to the
-            cache. The generator is exhausted before this machine processes the items.
+            cache. The generator is exhausted before the local machine processes the items.
 
     Returns:
         The results in the order of the items.

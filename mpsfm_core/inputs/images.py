@@ -141,7 +141,8 @@ class ImageSet:
     """Images of a run in a fixed order, with undistorted views on demand.
 
     About 512 MB of undistorted images are cached. All methods of the class are thread-safe. The
-    attribute ``left_out`` maps names of unusable images to the reasons.
+    attribute ``left_out`` maps the name of each unusable image to the reason why the image cannot
+    be used.
     """
 
     def __init__(
@@ -318,7 +319,7 @@ def load_images(
             the order of the images.
         options: see :class:`InputOptions`.
         model: COLMAP model or ``transforms.json`` of some of the images. Without ``intrinsics`` the
-            images use the cameras of this model. Images that the model does not list use the camera
+            images use the cameras of ``model``. Images that the model does not list use the camera
             of the model with their image size, if exactly one camera has this size.
         without: subfolder to skip in the search, such as the output folder.
         names: names of the images to read, instead of ``image_list``; a single image is allowed.

@@ -343,7 +343,7 @@ def _check_lists(path: Path, entries: Sequence[CameraEntry]) -> None:
 
 
 def _fault(camera: pycolmap.Camera, entry: CameraEntry, size: tuple[int, int]) -> str | None:
-    """Return why a camera does not fit an image of this size and what to do, else None."""
+    """Return why a camera does not fit an image size and what to do, or None if the camera fits."""
     if entry.size is not None and entry.size != size:
         return (
             f"the intrinsics are for {entry.size[0]}x{entry.size[1]} pixels; give those of the "

@@ -44,9 +44,9 @@ class InputOptions(Options):
     mask_path]."""
     mask_orientation: MapOrientation = expert("auto")
     """Orientation of masks whose size fits the image before and after EXIF rotation, either
-    ``stored`` (before) or ``upright`` (after). With ``auto``, such masks get the orientation of the
-    majority of masks whose size fits only one orientation, or ``stored`` if there is no such mask
-    [COLMAP, which ignores EXIF orientation]."""
+    ``stored`` (before) or ``upright`` (after). With ``auto``, masks that fit both orientations get
+    the orientation of the majority of masks whose size fits only one orientation, or ``stored``
+    without such masks [COLMAP, which ignores EXIF orientation]."""
     camera_per: Literal["auto", "image", "folder", "set"] = "auto"
     """Criterion by which images without given intrinsics share a camera [COLMAP single_camera,
     single_camera_per_folder, single_camera_per_image]. With ``image``, each image has its own

@@ -118,7 +118,7 @@ def reconstruct(
 def _apply_refined_focals(
     problem: MappingProblem, run: MapperRun, options: MapperOptions
 ) -> MappingProblem | None:
-    """Return the problem with refined focal lengths, or None if they changed little."""
+    """Return the problem with refined focal lengths, or None if their changes are small."""
     if not run.models or not options.refinement.refine_focal:
         return None
     return apply_refined_focal_lengths(problem, run.models[0], options)
@@ -221,7 +221,7 @@ class Mapper:
         return self.models
 
     def reconstruct_component(self, save_checkpoint: Callable[[], None] = do_nothing) -> bool:
-        """Reconstruct the next component, or continue an interrupted one.
+        """Reconstruct the next component, or continue an interrupted component.
 
         Returns:
             False if no further component can be reconstructed.
@@ -251,8 +251,8 @@ class Mapper:
     def _initialize(self) -> bool:
         """Initialize the component from globally averaged poses, or else from an image pair.
 
-        If the first global initialization fails, a second one uses match scores reweighted by depth
-        checks of image pairs.
+        If the first global initialization fails, a second global initialization uses match scores
+        reweighted by depth checks of image pairs.
         """
         if self._initialize_globally():
             return True

@@ -21,8 +21,8 @@ class InitializationOptions(Options):
 
     global_initialization: bool = expert(True)
     """Initialize from averaged poses of all well connected images, or from an image pair if these
-    poses fail verification. False initializes every component from an image pair. [tuned:
-    benchmarks.ablation]"""
+    poses fail verification. Without global initialization, an image pair initializes every
+    component. [tuned: benchmarks.ablation]"""
     max_pairs: int = expert(50, ge=1)
     """Maximum number of initial image pairs to try; raising the number takes longer and may
     initialize more components. [ours]"""
@@ -68,17 +68,17 @@ class RegistrationOptions(Options):
     """Number of distinct pose hypotheses whose support is maximized; 0 keeps the poses of RANSAC.
     [tuned: benchmarks.ablation]"""
     num_bundle_adjusted: int = expert(3, ge=1)
-    """Number of distinct pose hypotheses that bundle adjustment refines before one is selected.
-    [ours]"""
+    """Number of distinct pose hypotheses that bundle adjustment refines before the best hypothesis
+    is selected. [ours]"""
     max_bundle_iterations: int = expert(10, ge=1)
     """Maximum number of iterations of the bundle adjustment of a pose hypothesis. [ours]"""
     min_inlier_ratio: float = expert(0.25, gt=0, le=1)
-    """Assumed inlier ratio from which RANSAC computes its number of trials; raising it is faster
-    and may miss poses. [COLMAP abs_pose_min_inlier_ratio]"""
+    """Assumed inlier ratio from which RANSAC computes its number of trials; raising the ratio makes
+    RANSAC faster, but RANSAC may miss poses. [COLMAP abs_pose_min_inlier_ratio]"""
     estimate_focal: bool = expert(True)
     """Estimate a guessed focal length with the pose, unless a registered image shares the camera.
-    False registers the image with the guessed focal length. Needs ``refinement.refine_focal``.
-    [ours]"""
+    If ``estimate_focal`` is False, images are registered with their guessed focal length. Needs
+    ``refinement.refine_focal``. [ours]"""
     lifting: bool = expert(True)
     """Use 3D points that are lifted from the depth map of a single image. [paper 3.2]"""
     min_point_angle_deg: float = expert(1.0, ge=0)
@@ -112,8 +112,8 @@ class RefinementOptions(Options):
     integrate: bool = Field(True)
     """Refine depth maps, whereas False keeps the scaled depth priors, which is faster."""
     map_width: int = expert(200, ge=16)
-    """Width in pixels to which depth maps are subsampled for refinement. Raising the width is
-    slower and refines finer details. [tuned: benchmarks.ablation]"""
+    """Width in pixels to which depth maps are subsampled for refinement. Wider depth maps are
+    slower to refine and show finer details. [tuned: benchmarks.ablation]"""
     bundle_depth: Literal["prior", "refined"] = expert("prior")
     """Depth maps that regularize bundle adjustment, either the scaled priors, or the refined maps
     in alternation with depth integration as in the paper. [tuned: benchmarks.ablation]"""
@@ -126,9 +126,9 @@ class RefinementOptions(Options):
     """Widen the robust reprojection loss if the keypoint errors are normally distributed
     (:mod:`mpsfm_core.mapping.refinement.keypoint_noise`). [tuned: benchmarks.ablation]"""
     free_scales: bool = expert(True)
-    """Estimate the scales of depth priors in bundle adjustment. False alternates scale estimation
-    and bundle adjustment, which converges slowly because poses and points compensate scale errors.
-    [tuned: benchmarks.ablation]"""
+    """Estimate the scales of depth priors in bundle adjustment. If ``free_scales`` is False, scale
+    estimation and bundle adjustment alternate, which converges slowly because poses and points
+    compensate scale errors. [tuned: benchmarks.ablation]"""
     local_images: int = expert(5, ge=2)
     """Number of images of a local bundle, including the new image. [reference]
     [COLMAP ba_local_num_images]"""
@@ -159,8 +159,9 @@ class ConsistencyOptions(Options):
     images."""
     weigh_evidence: bool = expert(True)
     """Measure the noise of a depth prior for each pixel from nearby well-constrained points
-    (:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_local_depth_noise`). False measures
-    one noise level for the whole scene. [tuned: benchmarks.symmetry]"""
+    (:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_local_depth_noise`). If
+    ``weigh_evidence`` is False, one noise level of depth is measured for the whole scene. [tuned:
+    benchmarks.symmetry]"""
     check_pairs: bool = expert(True)
     """If the global initialization fails, check the depth consistency of image pairs and reweight
     their matches (:mod:`~mpsfm_core.mapping.consistency.pair_consistency`). [tuned:

@@ -703,7 +703,7 @@ def eliminate_points(
         eliminated: (p, 10) output with a row per point: 6 entries of ``L^-1`` with the damped block
             ``V = L L^T``, the gradient, and the mean of the diagonal of V. Output rows of constant
             or unobserved points are 0.
-        scratch: Buffers of this range of points.
+        scratch: Buffers of the range of points.
 
     Returns:
         Cost of the observations of the points ``first:last``.

@@ -27,15 +27,15 @@ class BundleOptions(Options):
     """Robust loss of reprojection errors. Errors of learned keypoints have heavier tails than the
     soft-L1 loss of the published code assumes. [tuned: benchmarks.ablation]"""
     reprojection_scale: float = expert(0.65, gt=0)
-    """Scale of the reprojection loss. Raising the scale gives outliers more influence. [tuned:
-    benchmarks.ablation]"""
+    """Scale of the reprojection loss. Raising the scale of the reprojection loss gives outliers
+    more influence. [tuned: benchmarks.ablation]"""
     depth_loss: Loss = expert(Loss.CAUCHY)
     """Robust loss of log-depth errors. [paper appendix B] [reference]"""
     depth_scale: float = expert(2.0, gt=0)
-    """Scale of the log-depth loss. Raising the scale gives wrong depth more influence. [reference
-    rob_std]"""
+    """Scale of the log-depth loss. Raising the scale of the depth loss gives wrong depth more
+    influence. [reference rob_std]"""
     function_tolerance: float = expert(1e-6, ge=0)
-    """Relative decrease of the cost at which bundle adjustment stops. Raising this value stops
+    """Relative decrease of the cost at which bundle adjustment stops. A larger tolerance stops
     bundle adjustment earlier. [Ceres function_tolerance]"""
     max_iterations: int = expert(50, ge=1)
     """Maximum number of Levenberg-Marquardt steps, accepted or rejected. [Ceres
@@ -60,37 +60,39 @@ class IntegrationOptions(Options):
     """Number of independent measurements per depth prior, whatever its resolution.
 
     Depth errors of neighboring pixels are correlated, so each of n pixels has the weight ``min(1,
-    number / n)``. Raising this number keeps the refined depth closer to the prior. [tuned:
-    benchmarks.depth_integration]"""
+    independent_depths / n)``. Raising ``independent_depths`` keeps the refined depth closer to the
+    prior. [tuned: benchmarks.depth_integration]"""
     independent_normals: float = expert(1000.0, gt=0)
-    """Number of independent measurements per normal prior, whatever its resolution. Raising this
-    number makes the refined depth follow the normals more closely. [tuned:
+    """Number of independent measurements per normal prior, whatever its resolution. Raising
+    ``independent_normals`` makes the refined depth follow the normals more closely. [tuned:
     benchmarks.depth_integration]"""
     sharpness: float = expert(2.0, gt=0)
-    """Sharpness k of the soft minimum of a pixel's two one-sided normal residuals. Raising k
-    approaches a hard choice of the smaller residual. [bilateral normal integration: 2; reference:
+    """Sharpness k of the soft minimum of a pixel's two one-sided normal residuals. A larger k makes
+    the soft minimum closer to the smaller residual. [bilateral normal integration: 2; reference:
     1]"""
     normal_limit: float = expert(6.0, gt=0)
-    """Squared normal residual above which depth may be discontinuous between two pixels. Raising
-    this value smooths depth discontinuities. [tuned: benchmarks.depth_integration]"""
+    """Squared normal residual above which depth may be discontinuous between two pixels. A larger
+    limit of the normal residual smooths depth discontinuities. [tuned:
+    benchmarks.depth_integration]"""
     prior_scale: float = expert(1.0, gt=0)
     """Scale of the Charbonnier loss of the depth prior, in standard deviations. Raising the scale
-    gives wrong depth more influence. [tuned: benchmarks.depth_integration]"""
+    of the depth loss gives wrong depth priors more influence. [tuned:
+    benchmarks.depth_integration]"""
     point_scale: float = expert(2.0, gt=0)
-    """Scale of the Cauchy loss of sparse points, in standard deviations. Raising the scale gives
-    outlier points more influence. [reference rob_std]"""
+    """Scale of the Cauchy loss of sparse points, in standard deviations. Raising the scale of the
+    loss gives outlier points more influence. [reference rob_std]"""
     max_iterations: int = expert(10, ge=0)
     """Maximum number of IRLS re-weightings per depth map. [reference]"""
     cg_iterations: int = expert(2, ge=1)
-    """Conjugate-gradient iterations per IRLS re-weighting. Raising this number makes each
+    """Number of conjugate-gradient iterations per IRLS re-weighting. More iterations make each IRLS
     re-weighting more exact and slower. [tuned: benchmarks.depth_integration]"""
     over_relaxation: float = expert(1.4, gt=0)
     """Factor that lengthens all IRLS steps after the first, because the majorizer gives too short
     steps for concave losses. [tuned: benchmarks.depth_integration]"""
     tolerance: float = expert(5e-2, ge=0)
-    """Relative decrease of the energy at which depth integration stops. Raising this value stops
+    """Relative decrease of the energy at which depth integration stops. A larger tolerance stops
     depth integration earlier. [reference]"""
     max_point_growth: float = expert(1.2, ge=0)
     """Maximum increase of the sparse points' mean energy for which a depth map is not refined
-    again. Raising this value skips more refinements of depth maps. [tuned:
+    again. Raising ``max_point_growth`` skips more refinements of depth maps. [tuned:
     benchmarks.depth_integration]"""

@@ -60,7 +60,8 @@ def restrict_matches(
     Args:
         pairs: Verified pairs of all images.
         duplicates: Original image by index of the duplicate.
-        min_matches: Minimum number of matches that remain; a pair with fewer keeps all its matches.
+        min_matches: Minimum number of matches that remain; a pair with fewer remaining matches
+            keeps all its matches.
     """
     matched: dict[int, list[Int64]] = {}
     for pair in pairs:

@@ -3,9 +3,9 @@
 The match score of two images counts mutual nearest neighbors among their strongest descriptors,
 weighted by the ratio of nearest to second nearest distance. The similarity is the match score minus
 the score that both images reach by chance, because images with repetitive texture match many
-images. Diffusion of the similarities then raises the similarity of two images that are both similar
-to a third image. Diffusion finds pairs of small overlap (Zhou et al., Ranking on Data Manifolds,
-NIPS 2003).
+images. Diffusion of the similarities raises the similarity of two images that are both similar to a
+third image. Diffusion finds pairs of small overlap (Zhou et al., Ranking on Data Manifolds, NIPS
+2003).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from mpsfm_core.data import Features, Float32, Float64
 
 NUM_DESCRIPTORS = 512
 """Number of descriptors per image that are compared. The cost of comparison grows with the square
-of this number. [tuned: benchmarks.pairs]"""
+of the number of descriptors. [tuned: benchmarks.pairs]"""
 DIFFUSION_RATIO = 0.8
 """Diffusion weight ``alpha`` of manifold ranking. [tuned: benchmarks.pairs]"""
 _TINY = np.float32(1e-12)

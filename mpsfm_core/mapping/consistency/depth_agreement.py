@@ -17,8 +17,8 @@ def measure_depth_agreement(model: Reconstruction, options: ConsistencyOptions) 
     """Measure the share of pixels whose depth agrees with the depth of other images.
 
     The depth of a misregistered image may contradict no other image, because the two images may see
-    different surfaces. The depth of a misregistered image then agrees with that of other images at
-    few pixels.
+    different surfaces. However, the depth of a misregistered image agrees with the depth of other
+    images at few pixels.
 
     Args:
         model: The reconstructed model, with refined depth maps.

@@ -51,8 +51,8 @@ class Misregistration(NamedTuple):
     matches that support the poses."""
     splits: bool = False
     """True if only one image pair connects the misregistered images to the model and several image
-    pairs contradict their poses. In this case, the misregistered images are deregistered if
-    re-registration fails."""
+    pairs contradict their poses. Misregistered images that only one image pair connects to the
+    model are deregistered if re-registration fails."""
 
 
 class ContradictedCut(NamedTuple):

@@ -2,8 +2,9 @@
 
 Photos without EXIF may differ in zoom or crop although their sizes are equal. The pose of a zoomed
 or cropped image is estimated with the shared focal length and with a focal length of its own. The
-image gets its own camera if clearly more keypoints then support the pose. Where focal length and
-distance are ambiguous, for example for a frontal plane, both poses have equal support.
+image gets its own camera if clearly more keypoints support the pose with an own focal length. Where
+focal length and distance are ambiguous, for example for a frontal plane, the poses with own and
+shared focal length have equal support.
 """
 
 from __future__ import annotations

@@ -30,8 +30,8 @@ from mpsfm_core.mapping.triangulation import triangulate_midpoints
 class InitialPair(NamedTuple):
     """Two images with their relative pose, from which a component is initialized.
 
-    The camera frame of the reference image is the world frame, and its depth prior defines the unit
-    of length.
+    The camera frame of the reference image is the world frame, and the depth prior of the reference
+    image defines the unit of length.
     """
 
     reference: int

@@ -95,7 +95,7 @@ def estimate_relative_poses(problem: MappingProblem, changed: Bool, seed: int) -
 
 
 def _estimate_relative_pose(problem: MappingProblem, pair: VerifiedPair, seed: int) -> VerifiedPair:
-    """Return a pair with the relative pose of an essential matrix if RANSAC finds one."""
+    """Return a pair with a new relative pose if RANSAC finds an essential matrix."""
     image_a, image_b = problem.images[pair.image_a], problem.images[pair.image_b]
     result = pycolmap.estimate_essential_matrix(
         image_a.keypoints[pair.matches[:, 0]],

@@ -1,7 +1,7 @@
 """Local and global refinement by bundle adjustment and depth integration (paper 3.3).
 
 The paper alternates bundle adjustment and depth integration. A depth map that was refined with
-points agrees with these points, and so keeps the points from moving in the next bundle adjustment.
+points agrees with these points, and keeps the points from moving in the next bundle adjustment.
 Therefore bundle adjustment uses the scaled depth priors, unless the option ``bundle_depth`` is
 ``refined``.
 """
@@ -454,7 +454,7 @@ class Refiner:
             self.loss_scale = measure_loss_scale(self.scene, bundle.reprojection_scale)
 
     def _measure_noise(self) -> None:
-        """Measure the depth noise, and discard depth integrators built for other noise."""
+        """Measure the depth noise, and discard depth integrators if the noise has changed."""
         if not self.options.measure_depth_noise:
             return
         self.noise = measure_depth_noise(self.scene)
@@ -527,8 +527,9 @@ class Refiner:
         Metric depth priors share one unit, so their log scales are expected to equal the mean log
         scale of the registered images. The mean log scale, unlike the median, keeps the free unit
         of the world constant. The standard deviation is the spread of the log scales of the
-        registered images, with the declared noise as one more sample (a unit information prior).
-        The log scale of a relative depth prior has an infinite standard deviation.
+        registered images, with the declared noise of the depth prior as an additional sample (a
+        unit information prior). The log scale of a relative depth prior has an infinite standard
+        deviation.
 
         Returns:
             Expected changes (m,) of the log scales, and standard deviations (m,).

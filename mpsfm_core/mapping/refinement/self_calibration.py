@@ -112,7 +112,7 @@ def _decide(
     representatives: Int64,
     problem: BundleProblem,
 ) -> tuple[Bool, Bool]:
-    """Record the outcome of each variable intrinsic parameter, and return the refused ones.
+    """Record the outcome of each variable intrinsic parameter, and return those refused.
 
     If the focal length of a camera with variable radial distortion is refused, only the radial
     distortion is fixed at first, because the focal length may be determined without distortion.

@@ -47,11 +47,11 @@ FOCAL_RANGE = (0.4, 10.0)
 MAX_FOCAL_DEVIATION = 3.0
 """Largest deviation of a focal length to try from its prior, in standard deviations. [ours]"""
 MAX_FOCAL_CORRESPONDENCES = 200
-"""Approximate number of correspondences by which a focal length is selected; raising the number is
-slower. [ours]"""
+"""Approximate number of correspondences by which a focal length is selected; with more
+correspondences, the selection is slower. [ours]"""
 FOCAL_STEP = 1.2
-"""Largest ratio of consecutive focal lengths to try. PnP tolerates focal length errors of half of
-this ratio on a logarithmic scale. [ours]"""
+"""Largest ratio of consecutive focal lengths to try. On a logarithmic scale, PnP tolerates focal
+length errors of half the step between the tried focal lengths. [ours]"""
 
 
 class PoseHypothesis(NamedTuple):
@@ -264,7 +264,7 @@ class PoseHypothesisGenerator:
         """Yield pose estimators that use random halves of the matches with one reference image.
 
         Only matches with the reference image with the most correspondences are drawn. The
-        probability of drawing a match is proportional to its weight.
+        probability of drawing a match is proportional to the weight of the match.
         """
         correspondences = self.correspondences
         if len(correspondences.keypoints) < MIN_CORRESPONDENCES:
@@ -365,8 +365,8 @@ class PoseHypothesisGenerator:
     def _use_network_pose(self, reference: int) -> PoseHypothesis | None:
         """Generate a hypothesis from the pose that a multi-view network predicts for the image.
 
-        Both images must have been processed by the network together, so that their predicted poses
-        share a frame and a unit.
+        The network must have processed the image and the reference image together, so that their
+        predicted poses share a frame and a unit.
         """
         scene = self.scene
         images, depth_map = scene.problem.images, scene.maps[reference]

@@ -2,9 +2,9 @@
 
 The ray of a matched keypoint, between the nearest and farthest depth that the depth prior allows,
 projects to a segment in the new image. A correspondence is an inlier if its keypoint is close to
-this segment and the resulting depth agrees with the new image's depth prior. The support of a pose
-is the weighted MSAC score ``sum_i w_i (1 - r_i^2)``, where ``r_i`` is the larger of the
-reprojection and depth residuals relative to their thresholds, truncated at 1.
+the projected ray segment and the resulting depth agrees with the new image's depth prior. The
+support of a pose is the weighted MSAC score ``sum_i w_i (1 - r_i^2)``, where ``r_i`` is the larger
+of the reprojection and depth residuals relative to their thresholds, truncated at 1.
 """
 
 from __future__ import annotations
