@@ -129,7 +129,9 @@ def pack(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
     if not is_dataclass(value):
         array = np.asarray(value)
         if array.dtype.hasobject:
-            raise TypeError(f"{prefix}: a {type(value).__name__} cannot be converted to an array")
+            raise TypeError(
+                f"{prefix}: the type {type(value).__name__} cannot be converted to an array"
+            )
         return {prefix or "value": array}
     arrays: dict[str, NDArray[Any]] = {}
     for field in fields(value):

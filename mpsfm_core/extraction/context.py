@@ -77,7 +77,7 @@ class ExtractionContext:
         Args:
             stage: Name of the stage, for progress messages.
             items: Items to process, each by one call of ``work``.
-            work: Function that computes the result of one item.
+            work: Function that processes one item and returns the result.
             providers: Providers that the stage uses; each provider limits the number of threads.
             local: If true, the stage runs on this machine even if a remote executor is configured.
         """
@@ -162,7 +162,7 @@ class ExtractionContext:
     def _record_failure(self, images: Sequence[int], error: MpsfmError) -> None:
         """Record a provider failure; raise ProviderRunError if over half of the images failed."""
         names = " and ".join(self.images[index].name for index in images)
-        _log.warning("a provider failed, so %s is skipped: %s", names, error)
+        _log.warning("a provider failed, so the result for %s is left out: %s", names, error)
         if len(images) == 1:
             self.failures[images[0]] = str(error)
         if len(self.failures) > len(self.images) / 2:

@@ -32,7 +32,7 @@ def run_stage(
         events: Receiver of progress; called in the calling thread.
         stage: Name of the extraction stage, for progress messages.
         items: Items to process, each by one call of ``work``.
-        work: Function that computes the result of one item.
+        work: Function that processes one item and returns the result.
         workers: Number of threads.
         remote: Generator that yields whenever a remote worker has written an item's result to the
             cache. The generator is exhausted before the local machine processes the items.

@@ -141,7 +141,7 @@ class _Builder:
     def _check_name(self, what: str, name: str) -> None:
         if name not in self._rows:
             hint = did_you_mean(name, self.names)
-            raise InputError(f"{what}: {name!r} is not one of the images{hint}")
+            raise InputError(f"{what}: {name!r} is not the name of an image{hint}")
 
     def set_keypoints(self, keypoints: Keypoints, std_px: Mapping[str, float]) -> None:
         """Replace the keypoints of some images."""

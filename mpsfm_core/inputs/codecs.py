@@ -78,7 +78,7 @@ def _decode_heif(data: bytes, path: Path) -> UInt8:
     try:
         image = library.read_heif(data)  # pillow_heif applies the EXIF rotation
         pixels = np.asarray(image.to_pillow().convert("RGB"))
-    except Exception as error:  # pillow_heif documents no exception types
+    except Exception as error:  # pillow_heif does not document exceptions
         raise InputError(f"image file {path} cannot be decoded: {error}") from error
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
@@ -91,9 +91,9 @@ def _decode_avif(data: bytes, path: Path) -> UInt8:
             pixels = np.asarray(operations.exif_transpose(image).convert("RGB"))
     except pillow.UnidentifiedImageError as error:
         raise InputError(
-            f"image {path}: this Pillow does not read AVIF: pip install 'mpsfm-core[avif]'"
+            f"image {path}: the installed Pillow does not read AVIF: pip install 'mpsfm-core[avif]'"
         ) from error
-    except Exception as error:  # Pillow's decoder documents no exception types
+    except Exception as error:  # Pillow does not document all exceptions
         raise InputError(f"image file {path} cannot be decoded: {error}") from error
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 
@@ -103,7 +103,7 @@ def _decode_raw(data: bytes, path: Path) -> UInt8:
     try:
         with library.imread(BytesIO(data)) as raw:
             pixels = raw.postprocess(use_camera_wb=True, output_bps=8)
-    except Exception as error:  # rawpy documents no exception types
+    except Exception as error:  # rawpy does not document exceptions
         raise InputError(f"image {path} cannot be decoded: {error!r}") from error
     return np.ascontiguousarray(pixels, dtype=np.uint8)
 

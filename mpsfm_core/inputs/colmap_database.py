@@ -93,7 +93,7 @@ def _matches(
         f"SELECT pair_id, rows, cols, data FROM {table}"
     ):
         if not isinstance(pair_id, int):
-            raise InputError(f"{path}, {table}: {pair_id!r} is not a pair id")
+            raise InputError(f"{path}, {table}: {pair_id!r} is not a pair id of COLMAP")
         second = pair_id % _MAX_IMAGES
         pair = (pair_id - second) // _MAX_IMAGES, second
         where = f"{path}, {table} of images {pair[0]} and {pair[1]}"

@@ -75,4 +75,4 @@ _RECORDS = {
     "frames": _frame_end,
     "rigs": _rig_end,
 }
-"""Functions by file stem that return a lower bound of a record's end from its start offset."""
+"""Functions that compute the minimum end offset of a record from its start offset, by file stem."""

@@ -61,7 +61,7 @@ def _boxes(data: bytes) -> Iterator[tuple[bytes, bytes]]:
             header = 16
         size = size or len(data) - start
         if size < header:
-            raise ValueError(f"box {kind!r} has {size} bytes")
+            raise ValueError(f"MP4 box {kind!r} has an invalid size of {size} bytes")
         yield kind, data[start + header : start + size]
         start += size
 

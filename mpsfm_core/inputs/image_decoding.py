@@ -48,7 +48,9 @@ def read_bytes(path: Path) -> bytes:
 def check_decodable(data: bytes, path: Path) -> None:
     """Decode an image at 1/8 size; raise :class:`InputError` if it is damaged or not an image."""
     if is_cut_jpeg(data):
-        raise InputError(f"image {path} is cut off: its end is missing. Copy the image file again")
+        raise InputError(
+            f"image {path} is cut off: the end of the file is missing. Copy the image file again"
+        )
     if find_decoder(data, path) is None:  # other formats are decoded in ``upright_size``
         decode_stored(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
@@ -165,7 +167,7 @@ def decode_stored(data: bytes, path: Path, flags: int = cv2.IMREAD_UNCHANGED) ->
         raise InputError(f"image {path} cannot be decoded: {error.err}") from error
     if pixels is None:
         raise InputError(
-            f"image {path} cannot be decoded: it is damaged or not an image. "
+            f"image {path} cannot be decoded: the file is damaged or not an image. "
             f"Replace or remove the image file"
         )
     return np.asarray(pixels)

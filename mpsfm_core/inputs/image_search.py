@@ -46,13 +46,13 @@ def find_images(folder: Path, without: Path | None = None) -> list[str]:
     """
     if (capture := find_format(folder)) is not None:
         raise InputError(
-            f"{folder} is a capture of {capture.name}; convert it first: "
+            f"{folder} is a capture of {capture.name}; convert the capture first: "
             f"mpsfm import '{folder}' --output DIR"
         )
     if not folder.is_dir():
         if folder.exists():
             raise InputError(
-                f"{folder} is neither a folder of photos nor a video; give one of them"
+                f"{folder} is neither a folder of photos nor a video; give one of the two"
             )
         raise InputError(f"images folder {folder} does not exist")
     names, unread, undecodable = [], [], []
@@ -69,22 +69,21 @@ def find_images(folder: Path, without: Path | None = None) -> list[str]:
     masks = _find_mask_names(names)
     if undecodable:
         _log.warning(
-            "%s in %s: %s; rename these files, for example with convmv",
-            _count(len(undecodable), "name is not UTF-8", "names are not UTF-8"),
+            "files in %s are skipped because their names are not UTF-8: %s; rename these files, "
+            "for example with convmv",
             escape(str(folder)),
             escape(list_names(undecodable)),
         )
     if unread:
         _log.warning(
-            "%s in %s: %s; convert the pictures to JPEG or PNG, with the extension in their names",
-            _count(len(unread), "picture is not read", "pictures are not read"),
+            "pictures in %s are skipped because their format is not supported: %s; convert the "
+            "pictures to JPEG or PNG, with the extension in their names",
             folder,
             list_names(sorted(unread, key=_natural_sort_key)),
         )
     if masks:
         _log.warning(
-            "%s in %s: %s; masks are not reconstructed. To use these masks: --set inputs.masks=%s",
-            _count(len(masks), "file is a mask", "files are masks"),
+            "masks in %s are not reconstructed: %s. To use these masks: --set inputs.masks=%s",
             folder,
             list_names(masks),
             folder,
@@ -125,7 +124,7 @@ def check_output_folder(output: Path, folder: Path) -> None:
     """Raise :class:`InputError` if ``output`` is the images folder or a subfolder with images."""
     if not is_utf8(str(output)):
         raise InputError(
-            f"the name of the output folder {escape(str(output))} is not UTF-8; choose another one"
+            f"the name of the output folder {escape(str(output))} is not UTF-8; choose another name"
         )
     if output.resolve() == folder.resolve():
         raise InputError(
@@ -137,8 +136,9 @@ def check_output_folder(output: Path, folder: Path) -> None:
         return
     if photos := find_images(inside):
         raise InputError(
-            f"{output} is a subfolder of the photos with {len(photos)} of them, such as "
-            f"{photos[0]}. Results must not be mixed with photos; choose another output folder"
+            f"{output} is a subfolder of the photos with {_count(len(photos), 'photo', 'photos')}, "
+            f"such as {photos[0]}. Results must not be mixed with photos; "
+            f"choose another output folder"
         )
 
 

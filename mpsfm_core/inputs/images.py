@@ -559,7 +559,7 @@ def _report_left_out(left_out: Mapping[str, str], total: int, options: InputOpti
     rest = len(faults) - MAX_LISTED
     text = "; ".join(faults[:MAX_LISTED]) + (f"; and {rest} more" if rest > 0 else "")
     if options.strict:
-        raise InputError(f"{text} (set inputs.strict=false to leave out such photos)")
+        raise InputError(f"{text} (set inputs.strict=false to leave out unusable photos)")
     if len(faults) > total / 2 or total - len(faults) < 2:
         raise InputError(f"{len(faults)} of {total} photos cannot be used: {text}")
     _log.warning("%d of %d photos cannot be used and are left out: %s", len(faults), total, text)

@@ -161,7 +161,7 @@ class Intrinsics:
         listed = [image for entry in self.entries for image in entry.images or ()]
         raise InputError(
             f"{self.source} has no camera for image {name!r}{did_you_mean(name, listed)}; "
-            f"add it, or write 'images: all' for one camera of all images"
+            f"add the camera, or write 'images: all' for one camera of all images"
         )
 
 
@@ -230,7 +230,7 @@ def _yaml_entry(path: Path, key: object, value: object) -> CameraEntry:
         size = None
     elif not _is_list_of(size, int):
         raise InputError(
-            f"{where}: camera 'width' and 'height' must both be whole numbers, or absent"
+            f"{where}: camera 'width' and 'height' must be whole numbers, or both absent"
         )
     images: Any = value.get("images", "all")
     if images != "all" and not _is_list_of(images, str):
@@ -323,7 +323,8 @@ def _entry(
     camera = pycolmap.Camera(model=model, width=1, height=1, params=list(params))
     if not camera.verify_params():
         raise InputError(
-            f"{where}: {model} has the parameters {camera.params_info}, got {len(params)} values"
+            f"{where}: model {model} has the parameters {camera.params_info}, "
+            f"got {len(params)} values"
         )
     images = None if names is None else frozenset(names)
     return CameraEntry(number, str(model), tuple(float(p) for p in params), size, images)
@@ -331,7 +332,7 @@ def _entry(
 
 def _check_lists(path: Path, entries: Sequence[CameraEntry]) -> None:
     if sum(entry.images is None for entry in entries) > 1:
-        raise InputError(f"{path}: only one camera can be for 'all' images")
+        raise InputError(f"{path}: only one camera can have 'images: all'")
     owners: dict[str, int] = {}
     for entry in entries:
         for name in entry.images or ():

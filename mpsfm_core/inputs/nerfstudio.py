@@ -172,7 +172,7 @@ def _numbers(where: str, values: Mapping[str, Any]) -> dict[str, float]:
     numbers = {key: values[key] for key in _CAMERA_KEYS if values.get(key) is not None}
     for name, value in numbers.items():
         if not isinstance(value, (int, float)) or not math.isfinite(value):
-            raise InputError(f"{where}: {name!r} must be a number, it is {value!r}")
+            raise InputError(f"{where}: {name!r} must be a number, but is {value!r}")
     return numbers
 
 
@@ -194,7 +194,7 @@ def _picture_size(where: str, file: Path | None) -> dict[str, float]:
     """Return (width, height) of the image file of a frame."""
     if file is None:
         raise InputError(
-            f"{where}: 'w' and 'h' are missing, and so is the image file; "
+            f"{where}: 'w' and 'h' are missing, and the image file does not exist; "
             f"add 'w' and 'h' to transforms.json"
         )
     data = read_bytes(file)

@@ -70,7 +70,7 @@ def read_telemetry(video: Path) -> Telemetry:
         elif video.suffix.lower() in _GOPRO_EXTENSIONS:
             points = read_positions(video)
     except (OSError, ValueError, InputError) as error:
-        _log.warning("the positions of video %s are not used: %s", video, error)
+        _log.warning("the GPS positions of video %s are not used: %s", video, error)
     focal = focals.pop() if len(focals) == 1 else None
     capture = cv2.VideoCapture(str(video), cv2.CAP_FFMPEG) if points else None
     fps = capture.get(cv2.CAP_PROP_FPS) if capture is not None else 0.0

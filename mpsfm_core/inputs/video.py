@@ -210,7 +210,7 @@ class _Track:
         self._last = frame.gray
 
     def follow(self, gray: UInt8, options: VideoOptions) -> float:
-        """Track points into a frame; return the motion over the motion required for selection."""
+        """Track points into a frame; return the ratio of their motion to the required motion."""
         height, width = gray.shape
         if len(self._now) >= _MIN_POINTS:
             there, ok, _ = cv2.calcOpticalFlowPyrLK(self._last, gray, self._now, None)
@@ -269,7 +269,7 @@ def _opened(video: Path) -> Iterator[cv2.VideoCapture]:
         raise InputError(f"video {video} cannot be opened: {error.err}") from error
     try:
         if not capture.isOpened():
-            raise InputError(f"{video} cannot be decoded: it is damaged or not a video")
+            raise InputError(f"video {video} cannot be decoded: the file is damaged or not a video")
         yield capture
     finally:
         capture.release()

@@ -6,11 +6,12 @@ Kernels allocate no memory, so numba's reference counting is disabled (``_nrt=Fa
 times faster.
 
 Observations are sorted by point, then by image. Each image with a variable pose or depth scale has
-a pose slot, an index into the camera parameters. Each variable focal length and each variable
-radial distortion has an intrinsic slot. A vector of camera parameters contains 7 parameters per
-pose slot (rotation, translation, log scale of the depth map), followed by one parameter per
-intrinsic slot. A step updates rotation, translation, log scale, focal length and radial distortion
-by ``R <- exp(w) R``, ``t <- t + dt``, ``s <- s + ds``, ``f <- f exp(a)`` and ``k <- k + dk``.
+a pose slot, the index of its 7 parameters among the variable parameters. Each variable focal length
+and radial distortion has an intrinsic slot, its index among the variable intrinsic parameters. A
+vector of camera parameters contains 7 parameters per pose slot (rotation, translation, log scale of
+the depth map), followed by one parameter per intrinsic slot. A step updates rotation, translation,
+log scale, focal length and radial distortion by ``R <- exp(w) R``, ``t <- t + dt``, ``s <- s +
+ds``, ``f <- f exp(a)`` and ``k <- k + dk``.
 
 The camera model is COLMAP's SIMPLE_RADIAL with two focal lengths, ``(fx u (1 + k r^2) + cx, fy v
 (1 + k r^2) + cy)`` with ``u = x / z``, ``v = y / z`` and ``r^2 = u^2 + v^2``.
@@ -83,9 +84,10 @@ class ParameterLayout(NamedTuple):
     camera_of_image: Int32
     pose_slot: Int32
     focal_slot: Int32
-    """(k,) intrinsic slot of the focal length of each camera."""
+    """(k,) intrinsic slot (index among the variable intrinsics) of each camera's focal length."""
     radial_slot: Int32
-    """(k,) intrinsic slot of the radial distortion of each camera."""
+    """(k,) intrinsic slot (index among the variable intrinsics) of each camera's radial
+    distortion."""
     variable_point: Bool
     variable_scale: Bool
     pair: Int32
@@ -159,7 +161,8 @@ class EliminationBuffers(NamedTuple):
     before: Float64
     """(longest, 2) cost and point depth of each observation before a step."""
     block: Float64
-    """(1, 10) normal equations of one point, with the same columns as ``eliminated``."""
+    """(1, 10) normal equations of one point: 6 entries of the block, gradient, mean of the
+    diagonal."""
     vector: Float64
 
 
@@ -244,7 +247,7 @@ def number_covisible_poses(
 
     Args:
         obs: Observations.
-        pose_slot: (n,) pose slot of each image.
+        pose_slot: (n,) pose slot (index in the linear system) of each image.
         variable: (p,) bool.
         pair: (s, s) array of -1, which receives the block numbers on and above the diagonal.
 

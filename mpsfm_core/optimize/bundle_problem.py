@@ -105,7 +105,7 @@ class ScalePrior(NamedTuple):
     image: Int64
     """(s,) index of the image of each log scale."""
     slot: Int64
-    """(s,) pose slot of the image of each log scale."""
+    """(s,) pose slot (index in the linear system) of the image of each log scale."""
     log_scale: Float64
     """(s,) mean."""
     weight: Float64
@@ -123,7 +123,7 @@ class FocalPrior(NamedTuple):
     camera: Int64
     """(s,) index of the camera of each focal length."""
     slot: Int64
-    """(s,) intrinsic slot of each focal length."""
+    """(s,) intrinsic slot (index among the variable intrinsics) of each focal length."""
     log_focal: Float64
     """(s,) mean."""
     weight: Float64
@@ -146,7 +146,7 @@ class RadialPrior(NamedTuple):
     camera: Int64
     """(s,) index of the camera of each radial distortion."""
     slot: Int64
-    """(s,) intrinsic slot of each radial distortion."""
+    """(s,) intrinsic slot (index among the variable intrinsics) of each radial distortion."""
     weight: Float64
     """(s,) inverse variance of the prior on each radial distortion."""
 

@@ -157,7 +157,7 @@ class DepthIntegrator:
             )
         if not depth.shape == normals.shape == (camera.height, camera.width):
             raise DataError(
-                "camera", "depth prior, normal prior and camera must have one grid size"
+                "camera", "depth prior, normal prior and camera must have equal width and height"
             )
         self.options = options = options or IntegrationOptions()
         self._normals = normals

@@ -25,7 +25,7 @@ _Pixel = tuple[int, int]
 
 
 class _Part(NamedTuple):
-    """Rectangular part of the pixel grid, with its size and the sides that have neighbors."""
+    """Size of a rectangular part of the pixel grid, and True for sides that adjoin other parts."""
 
     height: int
     width: int
@@ -36,14 +36,15 @@ class _Part(NamedTuple):
 
 
 class _Child(NamedTuple):
-    """First or second halves of all parts in a group of equally shaped grid parts."""
+    """Parts of equal shape that result from dividing the equally shaped parts of a group."""
 
     group: int
-    """Number of the group of grid parts that contains the halves."""
+    """Index of the group that contains the smaller parts."""
     members: slice
-    """Indices of the halves within their group."""
+    """Indices of the smaller parts in their group."""
     where: Int64
-    """Indices of a half's boundary pixels among the inner and outer pixels of the divided part."""
+    """Indices of the boundary pixels of a smaller part in the list of inner and outer pixels of the
+    divided part."""
 
 
 class _Group(NamedTuple):
@@ -56,7 +57,8 @@ class _Group(NamedTuple):
     outer: list[_Pixel]
     """Boundary pixels around the grid part, relative to the top left pixel of the part."""
     children: list[_Child]
-    """First and second halves of the grid parts, empty for parts that are not divided."""
+    """Smaller parts into which the parts of the group are divided, empty if the group is not
+    divided."""
 
 
 class _Elimination(NamedTuple):
@@ -127,7 +129,7 @@ def _dissect(height: int, width: int) -> list[_Group]:
 
 
 def _halve(part: _Part) -> tuple[list[_Pixel], list[tuple[_Pixel, _Part]]]:
-    """Return the separator of a grid part, and the offsets and shapes of both halves."""
+    """Return the separator pixels of a grid part, and offsets and shapes of its two halves."""
     height, width = part.height, part.width
     if max(height, width) <= _BLOCK_SIDE:
         return [(r, c) for r in range(height) for c in range(width)], []
@@ -147,7 +149,7 @@ def _halve(part: _Part) -> tuple[list[_Pixel], list[tuple[_Pixel, _Part]]]:
 
 
 def _surrounding(part: _Part) -> list[_Pixel]:
-    """Return the boundary pixels around a part of the grid."""
+    """Return the pixels outside a part of the grid that adjoin the part."""
     rows, columns = range(part.height), range(part.width)
     return (
         [(-1, c) for c in columns if part.top]

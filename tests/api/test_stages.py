@@ -157,7 +157,7 @@ def test_wrong_arrays_are_explained(known: Any) -> None:
     cameras = {image.name: image.camera for image in known.images}
     a, b = list(cameras)[:2]
     wrong: list[tuple[dict[str, Any], str]] = [
-        ({"matches": {(a, "c"): np.zeros((1, 2), int)}}, "'c' is not one of the images"),
+        ({"matches": {(a, "c"): np.zeros((1, 2), int)}}, "'c' is not the name of an image"),
         ({"matches": {(a, b): np.zeros((1, 2), int)}}, "give keypoints"),
         ({"matches": {(a, b): np.zeros((1, 3), int)}}, r"expected integers (m, 2)"),
         ({"matches": {}, "poses": {a: np.eye(3)}}, "expected shape (3, 4)"),

@@ -296,5 +296,5 @@ def test_reconstruct_of_a_capture_names_the_import_command(
     tmp_path: Path, rendered: list[Any]
 ) -> None:
     capture = write_polycam(tmp_path / "capture", rendered)
-    with pytest.raises(InputError, match="is a capture of Polycam; convert it first: mpsfm import"):
+    with pytest.raises(InputError, match="of Polycam; convert the capture first: mpsfm"):
         find_images(capture)

@@ -118,7 +118,7 @@ def test_masks_next_to_the_photos_are_named_and_can_be_used(tmp_path: Path, capl
     with caplog.at_level(logging.WARNING):
         images = load_images(tmp_path)
     assert images.names == ["a.jpg", "b.jpg"]
-    assert "2 files are masks" in caplog.text and "a_mask.png" in caplog.text
+    assert "are not reconstructed" in caplog.text and "a_mask.png" in caplog.text
     assert f"--set inputs.masks={tmp_path}" in caplog.text
     check_masked(load(tmp_path, tmp_path), upright_mask(), 0, 1)
 

@@ -130,7 +130,7 @@ def test_few_digits_are_enough(tmp_path: Path) -> None:
         ({"transform_matrix": (2 * np.eye(4)).tolist()}, "is not a rotation"),
         ({"transform_matrix": np.diag([1.0, 1, -1, 1]).tolist()}, "is not a rotation"),
         ({"fl_x": None}, "no focal length"),
-        ({"fl_x": "wide"}, "'fl_x' must be a number, it is 'wide'"),
+        ({"fl_x": "wide"}, "'fl_x' must be a number, but is 'wide'"),
         ({"camera_model": "EQUIRECTANGULAR"}, "camera model EQUIRECTANGULAR is not supported"),
         ({"k4": 0.1}, "k4 is not supported"),
     ],

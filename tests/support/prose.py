@@ -41,11 +41,13 @@ def docstrings(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def split_docstring(text: str) -> Iterator[str]:
-    """Yield the paragraphs and section items of a docstring, without commands and code."""
+    """Yield the paragraphs, list items and section items of a docstring, without code."""
     for paragraph in re.split(r"\n\s*\n", inspect.cleandoc(text)):
         if all(line.startswith("    ") for line in paragraph.splitlines()):
             continue  # a command or code
-        yield from re.split(r"^\w+:\n    |\n    (?=\w+: )", paragraph)
+        yield from re.split(
+            r"^\w+:\n    |\n    (?=\w+: )|(?:^|\n)(?:[*-]|\d+\.) (?=[A-Z`:])", paragraph
+        )
 
 
 def messages(tree: ast.Module) -> Iterator[tuple[int, str]]:

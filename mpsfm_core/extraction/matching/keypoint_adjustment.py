@@ -143,7 +143,7 @@ class KeypointAdjuster:
 def select_best_matches(
     pairs: Sequence[VerifiedPair], counts: Sequence[int], max_matches: int
 ) -> list[VerifiedPair]:
-    """Select the matches that are among the best of one of their two keypoints.
+    """Select the matches that are among the best matches of either of their keypoints.
 
     Args:
         pairs: Verified pairs.

@@ -49,7 +49,7 @@ class CandidateMatches:
     sparse: SparseMatches
     """Matches between detected keypoints."""
     points: PointMatches
-    """Matches sampled from dense matches; match indices count ``sparse`` first, then ``points``."""
+    """Matches sampled from dense matches, which are numbered after the matches in ``sparse``."""
     std_px: float
     """Standard deviation of the sampled ``points``, pixels."""
     precision: tuple[float, float] = (0.0, 0.0)

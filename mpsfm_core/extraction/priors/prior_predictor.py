@@ -59,7 +59,7 @@ class PriorPredictor:
         return self._context.each("normals", images, self._prepare_maps, slowest, local=local)
 
     def _predict_only(self, index: int) -> None:
-        """Predict depth into the disk cache; full-size maps of all images may exceed memory."""
+        """Predict depth into the disk cache, because full-size maps may exceed the memory."""
         self.predicted(index)
 
     def _prepare_maps(self, index: int) -> tuple[DepthPrior, NormalPrior]:
@@ -119,7 +119,7 @@ def check_depth_source(config: Config, registry: Registry) -> None:
 
 
 def _best_pairs(candidates: list[CandidateMatches]) -> dict[int, tuple[CandidateMatches, int]]:
-    """Return the pair with the most precise depth of each image, and its index 0 or 1 there."""
+    """Return the pair with the most precise depth of each image, and whether it is image 0 or 1."""
     best: dict[int, tuple[float, CandidateMatches, int]] = {}
     for matches in candidates:
         for side, image in enumerate(matches.pair):

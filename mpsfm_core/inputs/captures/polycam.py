@@ -47,7 +47,9 @@ def _read_frames(path: Path) -> Iterator[CapturedFrame]:
     prefix = "corrected_" if is_corrected and (folder / "corrected_images").is_dir() else ""
     files = sorted((folder / f"{prefix}cameras").glob("*.json"))
     if not files:
-        raise InputError(f"{folder}: the capture has no cameras; export it again as raw data")
+        raise InputError(
+            f"{folder}: the capture has no cameras; export the capture again as raw data"
+        )
     for file in files:
         image = folder / f"{prefix}images" / f"{file.stem}.jpg"
         size, params, pose = _read_camera(file)

@@ -135,12 +135,12 @@ def _decompress(
         raise InputError(f"{where}: the depth is damaged: {error}") from error
     width, height = depth_size if min(depth_size) > 0 else _infer_size(len(values), size)
     if len(values) != width * height:
-        raise InputError(f"{where}: the depth has {len(values)} values, not {width} x {height}")
+        raise InputError(f"{where}: the depth map has {len(values)} values, not {width} x {height}")
     return values.reshape(height, width)
 
 
 def _infer_size(count: int, size: tuple[int, int]) -> tuple[int, int]:
-    """Return (width, height) of a depth map of ``count`` values, shaped as an image of ``size``."""
+    """Return (width, height) of a depth map with ``count`` values and the image's aspect ratio."""
     width = round(float(np.sqrt(count * size[0] / size[1])))
     return width, count // max(width, 1)
 

@@ -182,7 +182,7 @@ class DepthConsistencyCheck:
         )
 
     def state_dict(self) -> StateDict:
-        """Return cached depth maps for a checkpoint, without the maps of outdated refined depth.
+        """Return the cached depth maps for a checkpoint, except depth maps that are outdated.
 
         The local depth noise of a cached depth map depends on the points from which the map was
         computed.

@@ -196,9 +196,9 @@ def find_contradicted_cuts(
 ) -> list[ContradictedCut]:
     """Find cuts of the match graph whose matches mostly contradict the poses of the images.
 
-    Candidates are the cuts at the edges of the maximum spanning tree of explained matches. The
-    candidate cuts include every part of the model that a single pair connects to the rest. The
-    matches of all image pairs across a cut are counted.
+    Each candidate cut removes an edge of the maximum spanning tree of the numbers of explained
+    matches. The candidate cuts include every part of the model that a single pair connects to the
+    rest. The matches of all image pairs across a cut are counted.
 
     Args:
         registered: (n,) bool.
@@ -234,9 +234,8 @@ def find_contradicted_cuts(
 def _count_separating_matches(registered: Bool, contradicting: Int64) -> Int64:
     """Count the matches (n, n) of each two registered images that contradict their poses.
 
-    The contradicting matches of a pair are its unexplained matches. If both images of a pair match
-    an unregistered image, the smaller of both numbers of matches with the unregistered image also
-    counts.
+    The contradicting matches of a pair are its unexplained matches. Each unregistered image that
+    matches both images of a pair adds the smaller of its two numbers of matches.
     """
     both_registered = registered[:, None] & registered
     separating = np.where(both_registered, contradicting, 0)

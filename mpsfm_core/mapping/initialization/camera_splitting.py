@@ -75,7 +75,7 @@ def find_deviating_focals(
         max_error_px = MAX_ERROR_PX * image.keypoint_std_px
         shared = estimate_absolute_pose(camera, xy, xyz, options, seed)
         support = _measure_support(camera, shared[:2], xy, xyz, max_error_px) if shared else 0.0
-        # A pose with any focal length has at most the support len(xy).
+        # The support of a pose is at most len(xy), whatever its focal length.
         if MIN_SUPPORT_RATIO * support >= len(xy):
             continue
         own = estimate_pose_with_focal(camera, xy, xyz, sample_focal_lengths(image), options, seed)

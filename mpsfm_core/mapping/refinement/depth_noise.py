@@ -35,9 +35,9 @@ POSE_UNKNOWNS = 6
 MULTIPLIER_RANGE = (0.1, 10.0)
 """Range of the factor between the measured and the declared standard deviation of depth. [ours]"""
 MIN_CONSTRAINED_ANGLE_DEG = 2.0
-"""Minimum triangulation angle of a point that rays constrain well without depth. Observations of a
-point in two images suffice, because a wrong pose moves all points of an image, while a depth prior
-that only a few points contradict is wrong at these points. [ours]"""
+"""Minimum triangulation angle of a point that rays constrain well without depth. Two observations
+of a point suffice, because a wrong pose makes all points of an image contradict the depth prior,
+but a wrong prior only some points. [ours]"""
 NUM_NEIGHBORS = 7
 """Number of nearest well-constrained points whose median error measures the depth prior. The median
 error changes if at least four of the seven points contradict the depth prior. [ours]"""
@@ -121,7 +121,7 @@ def find_well_constrained_keypoints(scene: Scene, image: int) -> Bool:
 def measure_local_depth_noise(
     scene: Scene, image: int, is_constrained: Bool, min_factor: float
 ) -> Float32:
-    """Measure the standard deviation of a depth prior relative to its declaration, per pixel.
+    """Measure the ratio of measured to declared standard deviation of a depth prior, per pixel.
 
     The depth error at a grid node is the median error of the nearest well-constrained points. The
     median error counts as one observation, and ``min_factor`` as a second observation (a unit

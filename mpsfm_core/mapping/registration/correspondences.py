@@ -119,7 +119,7 @@ def _depth_weights(depth_known: Bool) -> Float64:
 def _depth_ranges(
     scene: Scene, keypoints: Int64, options: RegistrationOptions
 ) -> tuple[Float64, Float64, Bool]:
-    """Return the depth (m,), half its log range (m,) and known-depth mask (m,) of keypoints.
+    """Return depth (m,), half length (m,) of its log interval, and known-depth mask (m,).
 
     A keypoint of unknown depth gets the range of the known depths in its image, or depth 0 if no
     depth of the image is known.

@@ -50,7 +50,7 @@ class Tracks:
         """
         row_of = np.full(len(self.xyz) + 1, NO_POINT, dtype=np.int64)
         row_of[points] = np.arange(len(points))
-        row_of_keypoint = row_of[self.point_of]  # row -1, of keypoints without a point, is NO_POINT
+        row_of_keypoint = row_of[self.point_of]  # NO_POINT = -1 reads the last row
         keypoints = sort_keypoints_by_point(row_of_keypoint, len(points))
         return keypoints, row_of_keypoint[keypoints]
 
