@@ -90,7 +90,7 @@ class ActiveProvider:
 
     @property
     def workers(self) -> int:
-        """Number of threads that run the provider, 1 on a GPU or for a provider object."""
+        """Number of threads that run the provider, 1 on a GPU or for an instance of the caller."""
         if isinstance(self.spec.factory, ProviderInstance):
             return 1
         return 1 if _device(self._runtime, self.spec) == "cuda" else worker_count(self._runtime)

@@ -136,9 +136,9 @@ def check_output_folder(output: Path, folder: Path) -> None:
         return
     if photos := find_images(inside):
         raise InputError(
-            f"{output} is a subfolder of the photos with {_count(len(photos), 'photo', 'photos')}, "
-            f"such as {photos[0]}. Results must not be mixed with photos; "
-            f"choose another output folder"
+            f"{output} is a subfolder of the photos and has "
+            f"{_count(len(photos), 'photo', 'photos')}, such as {photos[0]}. "
+            f"Results must not be mixed with photos; choose another output folder"
         )
 
 

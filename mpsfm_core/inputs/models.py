@@ -48,9 +48,9 @@ def read_model(path: Path, images_folder: Path | None = None) -> pycolmap.Recons
 
     Args:
         path: folder of the COLMAP model, or path of the ``transforms.json``.
-        images_folder: folder of the images. If given, a model of stored pixels is converted to
-            upright images (see :func:`orient_model`). A ``transforms.json`` without image sizes
-            needs the folder.
+        images_folder: folder of the images. If ``images_folder`` is given, a model of stored pixels
+            is converted to upright images (see :func:`orient_model`). A ``transforms.json`` without
+            image sizes needs the folder.
 
     Raises:
         InputError: the model does not exist or cannot be read.

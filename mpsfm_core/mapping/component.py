@@ -237,8 +237,8 @@ class Component:
         Args:
             candidates: (n,) bool mask of the images that may be registered.
             save_checkpoint: Function that is called after each image registration.
-            wide: If no image can be registered by the local bundle of its best match, use its best
-                matching images before the acceptance thresholds relax.
+            wide: If registration with the local bundle of the best matching image fails, try the
+                best matching images as references before the acceptance thresholds relax.
         """
         while self.registration.register_next_image(candidates, wide=wide):
             self.maintenance.refine_if_grown()

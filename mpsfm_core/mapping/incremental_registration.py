@@ -45,8 +45,8 @@ class IncrementalRegistration:
 
         Args:
             candidates: (n,) bool mask of the images that may be registered.
-            wide: If no image can be registered by the local bundle of its best match, use its best
-                matching images before the acceptance thresholds relax.
+            wide: If registration with the local bundle of the best matching image fails, try the
+                best matching images as references before the acceptance thresholds relax.
 
         Returns:
             False if no image can be registered at the most relaxed thresholds.

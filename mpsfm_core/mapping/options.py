@@ -1,9 +1,9 @@
 """Options of the mapper, with the source of each default.
 
-``[paper ...]`` cites a section of MP-SfM and ``[reference ...]`` its published code.
-``[COLMAP ...]`` names an option of COLMAP's incremental mapper. ``[tuned: ...]`` names the
-benchmark that chose the value; ``[ours]`` marks a choice without a benchmark. Triangulation angles
-are true angles, while the published code overestimates them.
+``[paper ...]`` cites a section of MP-SfM and ``[reference ...]`` its published code. ``[COLMAP
+...]`` names an option of COLMAP's incremental mapper. ``[tuned: ...]`` names the benchmark that
+chose the value. ``[ours]`` marks a choice without a benchmark. Triangulation angles are true
+angles, while the published code overestimates them.
 """
 
 from __future__ import annotations

@@ -197,7 +197,8 @@ class DepthIntegrator:
             scale: Scale factor on the depth prior.
             start: Earlier refined depth of this integrator, which is rescaled and used as initial
                 depth map. The earlier depth map is returned unrefined if the anchors fit about as
-                well as before. With None, the refinement starts from the scaled prior.
+                well as before. Without an earlier depth map, the refinement starts from the scaled
+                prior.
         """
         if start is None:
             solver = _Solver(self._terms(anchors, scale))

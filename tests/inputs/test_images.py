@@ -137,7 +137,7 @@ def test_results_below_the_photos_are_no_input(folder: Path) -> None:
     shutil.copy(folder / names[0], inner)
     assert len(find_images(folder)) == len(names) + 1
     assert find_images(folder, folder / "out") == names
-    with pytest.raises(InputError, match="with 1 photo,"):
+    with pytest.raises(InputError, match="and has 1 photo,"):
         check_output_folder(folder / "out", folder)
     (folder / "out" / "summary.json").write_text("{}")
     assert find_images(folder) == names

@@ -7,14 +7,15 @@ occluded. A contradiction of depth maps has one of two causes, wrong depth or a 
 
 * The depth of an image may be wrong. The errors of log depth in both images have normal
   distributions with standard deviations ``s`` and ``s'``. The likelihood of the contradiction is
-  ``L = E_e[exp(-(e' / s')^2 / 2)]`` over the errors ``e`` of the pixel's log depth, where ``e'`` is
-  the log-depth difference between the other surface and the shifted pixel, or 0 if the shifted
-  pixel is occluded or outside the other image. At wide angles, an error of depth also shifts the
-  pixel laterally in the other image. The likelihood ``L`` is the expectation over the depth error
-  ``e`` instead of the maximum, because some error nearly always shifts the pixel past a depth edge.
+  ``L = E_e[exp(-(e' / s')^2 / 2)]`` over the errors ``e`` of the pixel's log depth. An error ``e``
+  shifts the pixel, and ``e'`` is the log-depth difference between the other surface and the shifted
+  pixel, or 0 if the shifted pixel is occluded or outside the other image. At wide angles, an error
+  of depth also shifts the pixel laterally in the other image. The likelihood ``L`` is the
+  expectation over the depth error ``e`` instead of the maximum, because some error nearly always
+  shifts the pixel past a depth edge.
 
-* The pose of an image may be wrong. A wrong pose makes the depth that the other image has along the
-  pixel's ray independent of the pixel's depth.
+* The pose of an image may be wrong. If the pose is wrong, the depth that the other image has along
+  a pixel's ray is independent of the pixel's depth.
 
 A pixel is a violation if its likelihood ``L`` is below that of a depth error of ``max_deviation``
 standard deviations. The violation ratio (beta in the paper) is the share of violating pixels,

@@ -35,7 +35,8 @@ contradict the poses of both images. If both poses are correct, well over half o
 observe common 3D points. [ours]"""
 MIN_SIGNIFICANCE = 0.5
 """Minimum excess of the matches that contradict the pose of an image over those that support it, in
-standard deviations of the excess for random pairs. [tuned: benchmarks.symmetry]"""
+standard deviations of the excess if each image pair supports or contradicts the pose at random.
+[tuned: benchmarks.symmetry]"""
 
 
 class Misregistration(NamedTuple):
@@ -234,8 +235,8 @@ def find_contradicted_cuts(
 def _count_separating_matches(registered: Bool, contradicting: Int64) -> Int64:
     """Count the matches (n, n) of each two registered images that contradict their poses.
 
-    The contradicting matches of a pair are its unexplained matches. Each unregistered image that
-    matches both images of a pair adds the smaller of its two numbers of matches.
+    A pair has at least the number of its unexplained matches. If an unregistered image matches both
+    images of the pair, the pair has at least the smaller of these two numbers of matches.
     """
     both_registered = registered[:, None] & registered
     separating = np.where(both_registered, contradicting, 0)

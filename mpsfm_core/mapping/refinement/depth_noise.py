@@ -26,8 +26,8 @@ CELLS = 4
 """Rows and columns of a grid of image cells; errors of depth in the same cell are treated as
 correlated. [ours]"""
 MIN_RESIDUALS = 25
-"""Minimum number of depth residuals for a measurement of the noise. With fewer depth residuals, the
-declared variance of the depth prior applies. [ours]"""
+"""Minimum number of depth residuals for a measurement of the noise. With fewer than
+``MIN_RESIDUALS`` depth residuals, the declared variance of the depth prior applies. [ours]"""
 MIN_INDEPENDENT = 0.05
 """Minimum share of the variance of depth that is independent between pixels. [ours]"""
 POSE_UNKNOWNS = 6
@@ -86,9 +86,9 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
     """Measure the noise of the scaled depth priors from all pairs of registered images.
 
     The median residual of each image pair is subtracted, because bundle adjustment estimates the
-    depth scales. The variance is the sum of squared residuals divided by the degrees of freedom,
-    which are the effective number of residuals minus the fitted scales and poses. The declared
-    variance counts as one additional residual (a unit information prior).
+    depth scales. The variance of the noise is the sum of squared residuals divided by the degrees
+    of freedom, which are the effective number of residuals minus the fitted scales and poses. The
+    declared variance counts as one additional residual (a unit information prior).
 
     Returns:
         Measured depth noise, or the declared noise if too few residuals exist.

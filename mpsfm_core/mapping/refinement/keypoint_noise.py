@@ -6,8 +6,9 @@ statistically efficient. If the keypoint errors have heavy tails, as often for l
 the Cauchy loss of the options is used. A Cauchy loss of scale ``c`` is the likelihood of Student's
 t distribution with ``nu`` degrees of freedom and scale ``s``, ``c^2 = nu s^2``.
 
-Reprojection errors of points would be biased, because a robustly fitted point passes through some
-of its keypoints. Epipolar errors do not depend on 3D points, but only on poses.
+Reprojection errors would give a biased estimate of the keypoint noise, because a robustly fitted
+point passes through some of its keypoints. Epipolar errors do not depend on 3D points, but only on
+poses.
 """
 
 from __future__ import annotations
@@ -23,8 +24,8 @@ from mpsfm_core.mapping.scene.scene import Scene
 MAX_MATCHES = 4000
 """Maximum number of evenly spaced matches that measure the keypoint noise. [ours]"""
 MIN_MATCHES = 100
-"""Minimum number of matches for a measurement of the keypoint noise. With fewer matches, the
-reprojection loss of the options applies. [ours]"""
+"""Minimum number of matches for a measurement of the keypoint noise. With fewer than
+``MIN_MATCHES`` matches, the reprojection loss of the options applies. [ours]"""
 MAX_RESIDUAL = 4.0
 """Maximum epipolar error in standard deviations of the keypoint position. Matches with larger
 errors are outliers. [COLMAP filter_max_reproj_error]"""

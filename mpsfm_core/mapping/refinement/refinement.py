@@ -525,8 +525,8 @@ class Refiner:
         """Return the expected change of the log depth scales of images, and its prior std.
 
         Metric depth priors share one unit, so their log scales are expected to equal the mean log
-        scale of the registered images. The mean log scale, unlike the median, keeps the free unit
-        of the world constant. The standard deviation is the spread of the log scales of the
+        scale of the registered images. Unlike the median, the mean log scale keeps the undetermined
+        unit of the world constant. The standard deviation is the spread of the log scales of the
         registered images, with the declared noise of the depth prior as an additional sample (a
         unit information prior). The log scale of a relative depth prior has an infinite standard
         deviation.

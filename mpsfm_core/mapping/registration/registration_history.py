@@ -75,8 +75,9 @@ class RegistrationHistory:
         """Return the registered image that the most rejected images contradict, and how many do.
 
         If the depth of a new and a registered image contradict each other, the pose of the
-        registered image may be wrong. Each registered image is returned at most once. The
-        contradictions of the returned image are removed from the record.
+        registered image may be wrong. A registered image is returned at most once, even if further
+        images contradict the image. If an image is returned, all recorded contradictions are
+        removed.
 
         Args:
             registered: (n,) bool mask of the images that are registered at present.
