@@ -79,8 +79,8 @@ def fuse_depth_maps(
     Args:
         reconstruction: Posed images with depth maps.
         view_of: Function that returns the undistorted view of an image name, for the colors.
-        max_points: Maximum number of points of the cloud. If more pixels remain, each depth map is
-            subsampled randomly.
+        max_points: Maximum number of points of the cloud. If more than ``max_points`` pixels
+            remain, each depth map is subsampled randomly.
         seed: Random seed of the subsampling of depth maps.
     """
     images = reconstruction.confirmed_images

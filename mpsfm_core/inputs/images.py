@@ -160,7 +160,10 @@ class ImageSet:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (self.images, self._options)  # cached images are not pickled
+        return type(self), (
+            self.images,
+            self._options,
+        )  # the cache of undistorted images is not pickled
 
     def __len__(self) -> int:
         return len(self.images)

@@ -109,8 +109,8 @@ def orient_model(
 
     The pose of an image belongs to stored pixels if its camera has the size before EXIF rotation.
     If the camera size fits the image before and after EXIF rotation, the colors of the 3D points
-    decide, then the majority of the other images. If neither colors nor a majority decide, the pose
-    belongs to stored pixels [COLMAP].
+    decide whether the pose belongs to stored pixels, else the majority of the other images. If
+    neither colors nor a majority decide, the pose belongs to stored pixels [COLMAP].
 
     Args:
         model: COLMAP model of stored or upright images.

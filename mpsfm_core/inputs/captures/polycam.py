@@ -1,9 +1,9 @@
 """Reader of captures that Polycam exports as raw data in developer mode.
 
 The folder ``keyframes`` has images, cameras, depth maps in millimeters and confidence maps. The
-time of a keyframe is the name of its files. Poses that Polycam optimized and images that Polycam
-undistorted (``corrected_*``) are preferred to the poses and images of ARKit [PolyCam/polyform,
-README].
+name of a keyframe's files is the time of the keyframe. Poses that Polycam optimized and images that
+Polycam undistorted (``corrected_*``) are preferred to the poses and images of ARKit
+[PolyCam/polyform, README].
 """
 
 from __future__ import annotations
