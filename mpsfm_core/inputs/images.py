@@ -160,10 +160,7 @@ class ImageSet:
         )
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return type(self), (
-            self.images,
-            self._options,
-        )  # the cache of undistorted images is not pickled
+        return type(self), (self.images, self._options)  # without the cache of images
 
     def __len__(self) -> int:
         return len(self.images)
