@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import cv2
 import pycolmap
+from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from mpsfm_core.data import Float64, MappingProblem, View
 from mpsfm_core.inputs.image_decoding import read_bytes
@@ -22,6 +26,9 @@ _SIGNATURES = {
     ".png": b"\x89PNG\r\n\x1a\n",
 }
 """First bytes of JPEG and PNG files, because file extensions can be wrong."""
+_JPEG_START = b"\xff\xd8"
+_EXIF_IFD = 0x8769
+_EXPOSURE_TIME, _F_NUMBER, _ISO_SPEED = 0x829A, 0x829D, 0x8827
 
 
 class OriginalImages:
@@ -84,17 +91,43 @@ def exported_image_name(name: str) -> str:
 def export_view(images: ImageSet, index: int, path: Path) -> None:
     """Write the upright, undistorted image in the format of the file extension.
 
-    An upright, undistorted 8-bit RGB file of this format is copied without decoding.
+    An upright, undistorted 8-bit RGB file of this format is copied without decoding. Other JPEG
+    files get the exposure of the original file, which Gaussian splatting programs compensate.
     """
     image = images[index]
     path.parent.mkdir(parents=True, exist_ok=True)
     is_unchanged = is_pinhole(image.camera) and image.pinhole.size == image.original_size
-    if is_unchanged and image.pixels is None:
-        data = read_bytes(image.path)
+    original = read_bytes(image.path) if image.pixels is None else b""
+    if is_unchanged and original:
         signature = _SIGNATURES.get(path.suffix.lower(), b"")
-        is_upright = read_header(data).orientation == 1
-        if is_upright and signature and data.startswith(signature) and is_plain_rgb(data):
-            path.write_bytes(data)
+        is_upright = read_header(original).orientation == 1
+        if is_upright and signature and original.startswith(signature) and is_plain_rgb(original):
+            path.write_bytes(original)
             return
     bgr = cv2.cvtColor(images.view(index).image, cv2.COLOR_RGB2BGR)
-    path.write_bytes(cv2.imencode(path.suffix, bgr)[1].tobytes())
+    encoded = cv2.imencode(path.suffix, bgr)[1].tobytes()
+    if encoded.startswith(_JPEG_START):
+        encoded = _JPEG_START + _exposure_segment(original) + encoded[len(_JPEG_START) :]
+    path.write_bytes(encoded)
+
+
+def _exposure_segment(data: bytes) -> bytes:
+    """Return a JPEG segment with exposure time, f-number and ISO speed of an image file.
+
+    Args:
+        data: The encoded image file.
+
+    Returns:
+        An APP1 segment with EXIF, no bytes if the file has no exposure.
+    """
+    tags = read_header(data).tags
+    rationals = (tag for tag in (_EXPOSURE_TIME, _F_NUMBER) if tag in tags)
+    exposure: dict[int, Any] = {tag: IFDRational(tags[tag]) for tag in rationals}
+    if _ISO_SPEED in tags:
+        exposure[_ISO_SPEED] = int(tags[_ISO_SPEED])
+    if not exposure:
+        return b""
+    exif = Image.Exif()
+    exif.get_ifd(_EXIF_IFD).update(exposure)
+    payload = exif.tobytes()
+    return struct.pack(">2sH", b"\xff\xe1", 2 + len(payload)) + payload

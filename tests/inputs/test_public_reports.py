@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from copy import copy
 from pathlib import Path
 from typing import Any
 
@@ -13,15 +14,19 @@ import pycolmap
 import pytest
 import tifffile
 from PIL import Image
+from PIL.TiffImagePlugin import IFDRational
 
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.image_search import find_images
 from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.inputs.matches import matches_from_hloc
+from mpsfm_core.inputs.models import read_poses
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.results.exports.formats import export
+from mpsfm_core.results.original_images import export_view
 
 SIZE = (96, 64)
+NAMES = ("a.jpg", "b.jpg", "c.jpg")
 
 
 def picture(number: int = 0) -> Image.Image:
@@ -34,6 +39,26 @@ def write_photos(folder: Path, names: tuple[str, ...] = ("a.jpg", "b.jpg"), **sa
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         picture(number).save(folder / name, **save)
     return folder
+
+
+def write_model(folder: Path, cameras: dict[str, pycolmap.Camera]) -> Path:
+    """Write a COLMAP model of images that face +z from (-1, 0, 0), (-2, 0, 0), ... by name."""
+    reconstruction = pycolmap.Reconstruction()
+    for number, (name, camera) in enumerate(cameras.items(), start=1):
+        camera.camera_id = number
+        reconstruction.add_camera_with_trivial_rig(camera)
+        image = pycolmap.Image(name=name, camera_id=number, image_id=number)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), [number, 0, 0])
+        reconstruction.add_image_with_trivial_frame(image, pose)
+    for point in np.random.default_rng(0).uniform(3, 5, (30, 3)):
+        reconstruction.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
+    folder.mkdir()
+    reconstruction.write_binary(str(folder))
+    return folder
+
+
+def create_camera(model: str, size: tuple[int, int] = SIZE) -> pycolmap.Camera:
+    return pycolmap.Camera.create_from_model_name(1, model, 90.0, *size)
 
 
 def exif(main: dict[int, Any] | None = None, **directories: dict[int, Any]) -> Image.Exif:
@@ -296,27 +321,75 @@ def test_matches_with_photos_that_are_not_there_are_skipped(tmp_path: Path) -> N
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "SIMPLE_RADIAL_FISHEYE"])
 def test_exports_for_splatting_have_pinhole_cameras(tmp_path: Path, model: str) -> None:
     """nerfstudio-project/gsplat#813, WebODM/OpenSplat#72: camera type not supported."""
-    names = ("a.jpg", "b.jpg", "c.jpg")
-    photos = write_photos(tmp_path / "photos", names)
-    reconstruction = pycolmap.Reconstruction()
-    camera = pycolmap.Camera.create_from_model_name(1, model, 90.0, *SIZE)
+    photos = write_photos(tmp_path / "photos", NAMES)
+    camera = create_camera(model)
     camera.params = [90, 48, 32, 0.02]
-    reconstruction.add_camera_with_trivial_rig(camera)
-    for number, name in enumerate(names, start=1):
-        image = pycolmap.Image(name=name, camera_id=1, image_id=number)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(), [number, 0, 0])
-        reconstruction.add_image_with_trivial_frame(image, pose)
-    for point in np.random.default_rng(0).uniform(3, 5, (30, 3)):
-        reconstruction.add_point3D(point, pycolmap.Track(), np.zeros(3, np.uint8))
-    (tmp_path / "model").mkdir()
-    reconstruction.write_binary(str(tmp_path / "model"))
+    write_model(tmp_path / "model", {name: copy(camera) for name in NAMES})
     export(tmp_path / "model", "gsplat", tmp_path / "out", photos=photos)
     exported = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse" / "0"))
-    (pinhole,) = exported.cameras.values()
-    assert pinhole.model_name == "PINHOLE"
-    for name in names:
+    assert {camera.model_name for camera in exported.cameras.values()} == {"PINHOLE"}
+    for name, pinhole in ((image.name, image.camera) for image in exported.images.values()):
         with Image.open(tmp_path / "out" / "images" / name) as image:
             assert image.size == (pinhole.width, pinhole.height)
+
+
+@pytest.mark.parametrize("flag", [1, 6])
+def test_undistorted_photos_keep_their_exposure(tmp_path: Path, flag: int) -> None:
+    """MrNeRF/LichtFeld-Studio#1783: undistorted copies of photos have no exposure in EXIF."""
+    exposure = {0x829A: IFDRational(1, 250), 0x829D: IFDRational(2.8), 0x8827: 200}
+    tags = exif({0x112: flag, 0x10F: "maker"}, photo={**exposure, 0x920A: 4.2})
+    images = load_images(write_photos(tmp_path / "photos", exif=tags))
+    export_view(images, 0, tmp_path / "copied.jpg")
+    path = tmp_path / "camera.yaml"
+    size = list(SIZE if flag == 1 else SIZE[::-1])
+    path.write_text(
+        f"1:\n  model: SIMPLE_RADIAL\n  params: [90, {size[0] / 2}, {size[1] / 2}, 0.1]\n"
+        f"  width: {size[0]}\n  height: {size[1]}\n  images: all\n"
+    )
+    export_view(load_images(tmp_path / "photos", intrinsics=path), 0, tmp_path / "undistorted.jpg")
+    for name in ("copied.jpg", "undistorted.jpg"):
+        with Image.open(tmp_path / name) as exported:
+            written = exported.getexif()
+        directory = written.get_ifd(0x8769)
+        for tag, value in exposure.items():
+            assert float(directory[tag]) == pytest.approx(float(value))
+        assert written.get(0x112, 1) == 1
+
+
+def test_photos_without_exposure_are_exported_without_exif(tmp_path: Path) -> None:
+    images = load_images(write_photos(tmp_path / "photos", exif=exif({0x112: 6})))
+    export_view(images, 0, tmp_path / "upright.jpg")
+    with Image.open(tmp_path / "upright.jpg") as exported:
+        assert exported.size == SIZE[::-1] and not exported.getexif()
+
+
+def test_models_without_rigs_and_frames_are_read(tmp_path: Path) -> None:
+    """cvg/mpsfm#34: models of COLMAP before version 3.12 have no frames."""
+    photos = write_photos(tmp_path / "photos", NAMES)
+    write_model(tmp_path / "model", {n: create_camera("SIMPLE_PINHOLE") for n in NAMES})
+    for name in ("rigs.bin", "frames.bin"):
+        (tmp_path / "model" / name).unlink()
+    images = load_images(photos, intrinsics=tmp_path / "model")
+    assert [image.pinhole.fx for image in images] == [90, 90, 90]
+    poses = read_poses(tmp_path / "model")
+    assert [poses[image.name][1][0] for image in images] == [1, 2, 3]
+
+
+def test_photos_of_different_sizes_are_exported_in_their_sizes(tmp_path: Path) -> None:
+    """graphdeco-inria/gaussian-splatting#947: all images should have the same size."""
+    sizes = {"a.jpg": (96, 64), "b.jpg": (64, 96), "c.jpg": (48, 32)}
+    (tmp_path / "photos").mkdir()
+    for name, size in sizes.items():
+        picture().resize(size).save(tmp_path / "photos" / name)
+    cameras = {name: create_camera("SIMPLE_PINHOLE", size) for name, size in sizes.items()}
+    write_model(tmp_path / "model", cameras)
+    export(tmp_path / "model", "gsplat", tmp_path / "out", photos=tmp_path / "photos")
+    exported = pycolmap.Reconstruction(str(tmp_path / "out" / "sparse" / "0"))
+    written = {image.name: image.camera for image in exported.images.values()}
+    for name, size in sizes.items():
+        assert (written[name].width, written[name].height) == size
+        with Image.open(tmp_path / "out" / "images" / name) as image:
+            assert image.size == size
 
 
 def test_page_of_tested_inputs_names_existing_tests() -> None:
