@@ -221,9 +221,8 @@ def _scale(summary: Mapping[str, Any]) -> Iterator[Finding]:
             yield Finding(
                 "warning",
                 "The scale is uncertain",
-                f"The depth maps of {_count(metric['num_images'], 'photo')} disagree by "
-                f"{metric['spread']:.0%} on the scale; one unit is about "
-                f"{metric['metres_per_unit']:.3g} m.",
+                f"By the depth maps of {_count(metric['num_images'], 'photo')}, one unit is about "
+                f"{metric['metres_per_unit']:.3g} m, with a spread of {metric['spread']:.0%}.",
                 "Measure one distance, or use a better metric depth network.",
             )
 
