@@ -62,7 +62,8 @@ _MAX_COST = 0.9
 _MAX_SPLAT_STDS = 1.5
 """Maximum log depth difference between projected neighbor depth and input depth, in stds [ours].
 
-If the difference is larger, the projected depth may belong to another surface behind an edge."""
+Projected neighbor depth that differs more from input depth may belong to another surface behind an
+edge."""
 _MAX_SPLAT_VIEWS = 16
 """Maximum number of neighboring views whose depth is projected into a view; bounds the run time."""
 _NUM_CACHED_NEIGHBORHOODS = 4

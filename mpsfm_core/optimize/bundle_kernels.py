@@ -36,8 +36,8 @@ MAX_SLOPE = 1e6
 """Maximum slope ``(|x| + |y|) / z`` of the ray of a point that projects into an image, which keeps
 all derivatives finite. [ours]"""
 MIN_DEPTH_RATIO = 0.1
-"""Minimum ratio of a point's depths after and before a step. The linearized log depth would
-otherwise move distant points behind the camera. [ours]"""
+"""Minimum ratio of a point's depths after and before a step. A step of the linearized log depth can
+move distant points behind the camera. [ours]"""
 STEP_REDUCTION = 0.25
 """Factor that shortens the step of a point whose depth decreases too much. [ours]"""
 MIN_STEP_LENGTH = 0.01

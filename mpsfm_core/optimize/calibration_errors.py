@@ -9,7 +9,8 @@ restricted model predicts the estimates of the extended model. The covariance of
 predicts the remaining uncertainty.
 
 The change of poses is predicted with the deviations of zoomed and cropped images. The change of
-shared intrinsics is predicted without deviations, and the covariance with the deviations of a lens.
+shared intrinsics is predicted without deviations of single images. The covariance includes the
+small deviations of a lens.
 
 With the Gauss-Newton matrix ``H``, gradient ``g`` and precision ``P`` of the priors, the Newton
 step is ``-(H / v + P)^-1 (c g / v + P q)``, and the covariance is ``(H / v + P)^-1``, where ``q``
@@ -46,13 +47,16 @@ deviations, zooming and cropping large deviations. [tuned: benchmarks.verdicts]"
 RADIAL_STDS = (0.1, 0.05)
 """Standard deviations of the radial coefficients ``k1`` and ``k2``. [tuned: benchmarks.verdicts]"""
 MAX_IMAGES = 300
-"""Maximum number of images for a prediction, whose run time is cubic in this number. [ours]"""
+"""Maximum number of images for a prediction, whose run time is cubic in the number of images.
+[ours]"""
 MAX_OBSERVATIONS = 100_000
-"""Number of observations above which evenly spaced points predict the errors. [ours]"""
+"""Maximum number of observations; with more observations, evenly spaced points predict the errors.
+[ours]"""
 MAX_OTHER_IMAGES = 50
 """Maximum number of other images that the pose of an image is compared with. [ours]"""
 MAX_ERROR_DEG = 180.0
-"""Largest rotation or direction error, because the linearized errors are unbounded."""
+"""Upper bound of predicted rotation and direction errors, because linearized errors are
+unbounded."""
 POINT_DAMPING = 1e-8
 """Relative damping of the information matrix of a point, which makes the matrix invertible."""
 STEP = 1e-6
@@ -168,8 +172,8 @@ def _prior_stds(
         columns: First column of each kind of parameter.
         known: (k,) bool, True for cameras with known intrinsics.
         longer_sides: (k,) longer image side of each camera in pixels.
-        deviation_stds: Standard deviations of an image's log focal length and principal point from
-            those of its shared camera, the latter in longer image sides.
+        deviation_stds: Standard deviations of an image's log focal length, and of its principal
+            point in longer image sides, from those of its shared camera.
     """
     num_images, num_cameras = len(problem.rotations), len(known)
     std = np.zeros(columns.point)
@@ -469,7 +473,8 @@ def _relative_pose_jacobians(
 
     Returns:
         Derivatives (m, 3, 12) of the relative rotation, and of the unit translation direction in
-        the frame of ``image``, both by rotation and translation of ``image`` and of the other.
+        the frame of ``image``, both by rotation and translation of ``image`` and of the other
+        image.
     """
     rotation, translation = problem.rotations[image], problem.translations[image]
     other_rotations, other_translations = problem.rotations[others], problem.translations[others]

@@ -152,8 +152,9 @@ def judge_estimate(
 
     Args:
         value: Estimated value.
-        posterior_std: Posterior standard deviation, given observations and prior. A singular
-            reduced camera system may give more than ``prior_std``, which is an upper bound.
+        posterior_std: Posterior standard deviation of the parameter, given observations and prior.
+            If the reduced camera system is singular, the computed value may exceed its upper bound
+            ``prior_std``.
         prior_std: Prior standard deviation.
         is_plausible: True if a lens with the estimated value exists.
     """

@@ -17,8 +17,8 @@ MIN_FOCAL_IMAGES = 3
 class IntrinsicParameter(IntEnum):
     """Intrinsic parameter of a camera that bundle adjustment estimates.
 
-    A member is a column of the arrays of :class:`EstimatedIntrinsics`. Its lower-case name is the
-    prefix of its keys in ``summary.json``.
+    The integer of a parameter is its column in the arrays of :class:`EstimatedIntrinsics`. The
+    lower-case name of a parameter is the prefix of its keys in ``summary.json``.
     """
 
     FOCAL_LENGTH = 0
@@ -45,9 +45,10 @@ class IntrinsicEstimate(NamedTuple):
 
     outcome: CalibrationOutcome = CalibrationOutcome.NOT_ESTIMATED
     value: float = float("nan")
-    """Estimated value, also an implausible one, or NaN without an estimate."""
+    """Estimated value of the parameter, even if implausible, or NaN without an estimate."""
     std: float = float("nan")
-    """Posterior standard deviation (of the log focal length), or NaN without an estimate."""
+    """Posterior standard deviation of the parameter (of the log focal length), or NaN without an
+    estimate."""
 
 
 class PredictedErrors(NamedTuple):
@@ -78,7 +79,8 @@ class EstimatedIntrinsics:
     Attributes:
         outcomes: (n, p) int64 :class:`CalibrationOutcome` of each parameter of each image.
         values: (n, p) float64 estimated value of each parameter, NaN without an estimate.
-        stds: (n, p) float64 posterior standard deviation, NaN without an estimate.
+        stds: (n, p) float64 posterior standard deviation of each parameter, NaN without an
+            estimate.
     """
 
     def __init__(self, num_images: int) -> None:

@@ -34,14 +34,14 @@ class CalibratedParameter:
     """Result of self-calibration for one intrinsic parameter of a registered image."""
 
     estimate: IntrinsicEstimate
-    """Outcome, estimated value and its standard deviation."""
+    """Outcome, estimated value and standard deviation of the intrinsic parameter."""
     reason: Reason | None = None
     """Reason (``CameraReason``) why the parameter is not refined, or None if it is refined or
     known."""
 
     @property
     def is_refined(self) -> bool:
-        """True if the camera takes the estimated value."""
+        """True if the camera takes the estimated value of the parameter."""
         return self.estimate.outcome == CalibrationOutcome.REFINED
 
     @property
