@@ -58,7 +58,7 @@ def avif_exif(data: bytes) -> bytes | None:
     try:
         with importlib.import_module("PIL.Image").open(BytesIO(data)) as image:
             block = image.info.get("exif")
-    except Exception:  # the decoder reports the error later
+    except Exception:  # the decoder reports a damaged file later
         return None
     return bytes(block).removeprefix(b"Exif\x00\x00") if block else None
 
@@ -68,7 +68,7 @@ def heif_exif(data: bytes) -> bytes | None:
     try:
         opened = importlib.import_module("pillow_heif").open_heif(data)
         block = opened.info.get("exif")
-    except Exception:  # the decoder reports the error later
+    except Exception:  # the decoder reports a damaged file later
         return None
     return None if block is None else bytes(block).removeprefix(b"Exif\x00\x00")
 

@@ -27,8 +27,8 @@ MIN_MATCHES = 100
 """Minimum number of matches for a measurement of the keypoint noise. With fewer than
 ``MIN_MATCHES`` matches, the reprojection loss of the options applies. [ours]"""
 MAX_RESIDUAL = 4.0
-"""Maximum epipolar error in standard deviations of the keypoint position. Matches with larger
-errors are outliers. [COLMAP filter_max_reproj_error]"""
+"""Maximum epipolar error in standard deviations of the keypoint position. Matches with an epipolar
+error above ``MAX_RESIDUAL`` are outliers. [COLMAP filter_max_reproj_error]"""
 EFFICIENT_SCALE = 3.644
 """Scale of the Cauchy loss with 98 % efficiency for normal errors, in standard deviations of the
 keypoint position (Holland and Welsch, Communications in Statistics A6, 1977). [tuned:
