@@ -42,7 +42,7 @@ MAX_ERRORS_DEG = (2.0, 5.0)
 """Pose errors in degrees above which the pose of an image counts as wrong."""
 LONGER_SIDE = 640
 """Longer side in pixels of the photos of generated photo sets."""
-NUM_LOW_OVERLAP_SETS = 2
+NUM_LOW_OVERLAP_SETS = 5
 """Number of low-overlap test sets per bucket (group of test sets of similar overlap)."""
 
 Photo = tuple[UInt8, dict[int, float]]
