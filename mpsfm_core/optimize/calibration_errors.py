@@ -49,9 +49,9 @@ RADIAL_STDS = (0.1, 0.05)
 MAX_IMAGES = 300
 """Maximum number of images for a prediction, whose run time is cubic in the number of images.
 [ours]"""
-MAX_OBSERVATIONS = 100_000
-"""Maximum number of observations; with more observations, evenly spaced points predict the errors.
-[ours]"""
+MAX_OBSERVATIONS, MAX_IMAGE_OBSERVATIONS = 30_000, 500
+"""Maximum number of observations in all, and on average per image. If both are exceeded, evenly
+spaced points predict the errors. [ours]"""
 MAX_OTHER_IMAGES = 50
 """Maximum number of other images that the pose of an image is compared with. [ours]"""
 MAX_ERROR_DEG = 180.0
@@ -258,7 +258,8 @@ def _linearize(
     problem: BundleProblem, options: BundleOptions, columns: _Columns
 ) -> _NormalEquations:
     """Linearize the residuals at the solution, eliminate points, and scale by the variance."""
-    step = 1 + len(problem.obs_point) // MAX_OBSERVATIONS
+    max_observations = max(MAX_OBSERVATIONS, MAX_IMAGE_OBSERVATIONS * len(problem.rotations))
+    step = 1 + len(problem.obs_point) // max_observations
     rows = np.flatnonzero(np.asarray(problem.obs_point) % step == 0)
     blocks = _Observations(problem, rows)
     jacobian, residuals, variance_factor, newton_factor = _linearize_reprojection(
