@@ -13,9 +13,10 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.data.options import parse_settings
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.geometry import pixel_centers, sample_nearest, scale_pixels
-from mpsfm_core.providers import validation
 from mpsfm_core.providers.builtin.map_files import find_file
 from mpsfm_core.providers.builtin.options import DepthFileOptions, FileOptions, NormalFileOptions
+from mpsfm_core.providers.kinds.depth import run_depth
+from mpsfm_core.providers.kinds.normals import run_normals
 from mpsfm_core.providers.provider_config import ProviderConfig
 
 EXACT = 1e-4
@@ -61,7 +62,7 @@ class FileTruth:
 
     def depth(self, view: View, index: int) -> DepthTruth:
         """Sample true depth at valid, unmasked pixels of a view."""
-        true = validation.run_depth(self._provider.spec, self._provider.instance, view)
+        true = run_depth(self._provider.spec, self._provider.instance, view)
         rows, xy = self._sample_pixels(true.valid, view, index)
         depth = true.depth[rows].astype(np.float64)
         assert true.variance is not None  # The provider ``files`` always declares a variance.
@@ -69,7 +70,7 @@ class FileTruth:
 
     def normals(self, view: View, index: int) -> NormalTruth:
         """Sample true normals at valid, unmasked pixels of a view."""
-        true = validation.run_normals(self._provider.spec, self._provider.instance, view)
+        true = run_normals(self._provider.spec, self._provider.instance, view)
         rows, xy = self._sample_pixels(true.valid, view, index)
         std = np.zeros(len(xy)) if true.variance is None else np.sqrt(true.variance[rows])
         return NormalTruth(xy, true.normals[rows].astype(np.float64), std.astype(np.float64))

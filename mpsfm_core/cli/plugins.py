@@ -14,10 +14,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import click
 import typer
 
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.providers import Kind
+from mpsfm_core.providers import KINDS
 from mpsfm_core.providers.discovery import subprocess_environment
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ def list_plugins(
 @app.command()
 def check(
     name: Annotated[
-        str, typer.Argument(help="Check a provider (onnx, depth/onnx) or all of a distribution.")
+        str, typer.Argument(help="Check a provider (onnx, depth/onnx) or a distribution.")
     ],
     options: Annotated[
         list[str] | None,
@@ -67,7 +68,7 @@ def check(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
-    """Check that providers pass the contract tests; exit code 1 if a provider fails."""
+    """Check that providers and hooks pass the contract tests; exit code 1 if one fails."""
     if _CHECKING not in os.environ:
         arguments = [name, "--device", device, *(["--json"] if as_json else [])]
         arguments += ["--strict"] if strict else []
@@ -82,19 +83,14 @@ def check(
         parse_setup,
         run_checks,
     )
+    from mpsfm_core.testing.hook_checks import has_hooks, run_hook_checks
 
     registry = Registry.discover(probe=True)
     plugin = find_plugin(registry, name)
-    if plugin is not None and plugin.available and not as_json:
-        hooks = ", ".join(plugin.capabilities)
-        typer.echo(
-            f"{plugin.name} ({plugin.distribution} {plugin.version}) loads; all its hooks are "
-            f"known: {hooks}; it has no provider to check"
-        )
-        return
+    has_providers = plugin is None or not plugin.available
     check_ids = None if only is None else parse_check_ids(only)
     results: list[CheckResult] = []
-    for kind, provider in find_providers(registry, name):
+    for kind, provider in find_providers(registry, name) if has_providers else ():
         results += run_checks(
             registry,
             kind,
@@ -102,6 +98,15 @@ def check(
             parse_setup(options or []),
             only=check_ids,
             device=device,
+            on_result=None if as_json else _print_result,
+        )
+    if has_hooks(registry, name):
+        setup = parse_setup(options or []) if not has_providers else None
+        results += run_hook_checks(
+            registry,
+            name,
+            only=check_ids,
+            executor=str(setup.options.get("executor", "")) if setup else "",
             on_result=None if as_json else _print_result,
         )
     if as_json:
@@ -118,7 +123,13 @@ def new(
     name: Annotated[
         str, typer.Argument(help="Name of the package and its provider, e.g. my-depth.")
     ],
-    kind: Annotated[Kind, typer.Option(help="Kind of the provider.")],
+    kind: Annotated[
+        str,
+        typer.Option(
+            help="Kind of the provider, or hook for a plugin with hooks.",
+            click_type=click.Choice([*KINDS, "hook"]),
+        ),
+    ],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Create the package here.")
     ] = Path(),

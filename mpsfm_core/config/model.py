@@ -108,6 +108,10 @@ class Config(Options):
     multiview: ProviderConfig | None = None
     """Multi-view network that predicts depth for groups of images, needed by ``depth: {use:
     multiview}``."""
+    camera: ProviderConfig | None = None
+    """Camera provider, which estimates the focal lengths of photos without calibration. If
+    ``camera`` is null, a depth provider with ``estimates-focal`` estimates those of photos without
+    EXIF."""
     depth: ProviderConfig
     normals: ProviderConfig
     """Provider of normals; With ``use: same-network``, the depth network also predicts the
@@ -196,6 +200,7 @@ PROVIDER_BLOCKS: dict[str, Kind] = {
     "matcher": "matcher",
     "dense_matcher": "matcher",
     "retrieval": "retrieval",
+    "camera": "camera",
     "multiview": "multiview",
     "depth": "depth",
     "normals": "normals",

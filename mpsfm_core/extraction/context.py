@@ -23,7 +23,8 @@ from mpsfm_core.extraction.empty_results import EMPTY_RESULTS
 from mpsfm_core.extraction.events import ExtractionEvents
 from mpsfm_core.extraction.parallel import run_stage
 from mpsfm_core.inputs.images import ImageSet
-from mpsfm_core.providers import Kind, validation
+from mpsfm_core.providers import Kind
+from mpsfm_core.providers.kinds.mask import run_mask
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 
@@ -226,5 +227,5 @@ class ExtractionContext:
             provider,
             np.ndarray,
             self._unmasked_inputs(index, provider),
-            lambda instance: validation.run_mask(provider.spec, instance, self.images.view(index)),
+            lambda instance: run_mask(provider.spec, instance, self.images.view(index)),
         )

@@ -12,7 +12,7 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.geometry import sample_nearest
-from mpsfm_core.providers import validation
+from mpsfm_core.providers.kinds.features import run_features
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.support.lru_cache import LruCache
 
@@ -70,7 +70,7 @@ class FeatureTable:
 
     def _load(self, index: int) -> Features:
         def compute(instance: Any) -> Features:
-            return validation.run_features(self._provider.spec, instance, self._context.view(index))
+            return run_features(self._provider.spec, instance, self._context.view(index))
 
         inputs = self._context.view_inputs(index, self._provider)
         features = self._context.result(self._provider, Features, inputs, compute, [index])

@@ -99,6 +99,8 @@ class SourceImage:
     """Mask file of the original image, None if the image has no mask."""
     pixels: UInt8 | None = None
     """Pixels (H, W, 3) uint8 RGB of an image in memory, None for an image file."""
+    predicted_log_std: float | None = None
+    """Std of the log focal length that a camera provider predicted, None without prediction."""
 
     def original_pixels(self, xy: Float64) -> Float64:
         """Map pixels (n, 2) of the undistorted view to pixels of the upright original image."""
@@ -128,8 +130,8 @@ class SourceImage:
 
     @property
     def focal_log_std(self) -> float:
-        """Prior standard deviation of the log focal length, given its source."""
-        return FOCAL_LOG_STD[self.focal_source]
+        """Prior standard deviation of the log focal length, predicted or given its source."""
+        return self.predicted_log_std or FOCAL_LOG_STD[self.focal_source]
 
     @property
     def original_size(self) -> tuple[int, int]:
@@ -193,21 +195,30 @@ class ImageSet:
         """
         return self._views.get(index, lambda: self._load(self.images[index]))
 
-    def with_focals(self, focals: Mapping[int, float]) -> ImageSet:
-        """Return a copy of the images with predicted instead of default focal lengths.
+    def with_focals(
+        self, focals: Mapping[int, float], log_stds: Mapping[int, float] | None = None
+    ) -> ImageSet:
+        """Return a copy of the images with predicted instead of guessed focal lengths.
 
         Args:
-            focals: focal lengths by camera id, in pixels of the original image. Predicted focal
+            focals: Focal lengths by camera id, in pixels of the original image. Predicted focal
                 lengths are still refined in bundle adjustment.
+            log_stds: Standard deviations of the log focal lengths by camera id, by default that of
+                :data:`FOCAL_LOG_STD`.
         """
 
         def changed(image: SourceImage) -> SourceImage:
             number = image.camera.camera_id
-            if image.focal_source != "default" or number not in focals:
+            if image.focal_known or number not in focals:
                 return image
             camera = _simple_camera(image.original_size, focals[number], number)
-            pinhole = _view_camera(camera, self._options)
-            return replace(image, camera=camera, pinhole=pinhole, focal_source="provider")
+            return replace(
+                image,
+                camera=camera,
+                pinhole=_view_camera(camera, self._options),
+                focal_source="provider",
+                predicted_log_std=(log_stds or {}).get(number),
+            )
 
         images = [changed(image) for image in self.images]
         return ImageSet(images, self._options, self.left_out)

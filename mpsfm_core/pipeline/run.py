@@ -104,6 +104,7 @@ def reconstruct(
     features: Provider | None = None,
     matcher: Provider | None = None,
     retrieval: Provider | None = None,
+    camera: Provider | None = None,
     multiview: Provider | None = None,
     depth: Provider | None = None,
     normals: Provider | None = None,
@@ -128,7 +129,7 @@ def reconstruct(
         config: Name of a shipped configuration, a YAML file, or a loaded configuration.
         intrinsics: Camera intrinsics as ``intrinsics.yaml``, a COLMAP model or ``transforms.json``.
             Without ``intrinsics``, focal lengths are taken from ``poses``, else from EXIF, else
-            estimated by the depth provider, else set to a default.
+            estimated by the camera or depth provider, else set to a default.
         image_list: Text file with one image name per line, by default all images of the folder.
         poses: COLMAP model or ``transforms.json`` with poses of some or all images;
             ``mapping.known_poses`` chooses whether known poses are fixed or refined.
@@ -138,6 +139,7 @@ def reconstruct(
         matcher: Sparse or dense matcher, which replaces all configured matchers. The default
             matcher for a feature provider of the caller is ``mutual-nearest``.
         retrieval: Provider of global image descriptors, which select image pairs.
+        camera: Provider of focal lengths, which are combined with those of EXIF.
         multiview: Multi-view network, used by ``depth="multiview"``.
         depth: Provider of depth priors.
         normals: Provider of normal priors.
@@ -176,6 +178,7 @@ def reconstruct(
         features=features,
         matcher=matcher,
         retrieval=retrieval,
+        camera=camera,
         multiview=multiview,
         depth=depth,
         normals=normals,

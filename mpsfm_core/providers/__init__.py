@@ -3,44 +3,38 @@
 The registry of installed plugins is :class:`mpsfm_core.providers.registry.Registry`.
 """
 
+from mpsfm_core.providers.kinds import CAPABILITIES, KINDS, PROVIDER_KINDS
+from mpsfm_core.providers.kinds.depth import DepthProvider, FocalEstimator, JointProvider
+from mpsfm_core.providers.kinds.features import FeatureProvider
+from mpsfm_core.providers.kinds.mask import MaskProvider
+from mpsfm_core.providers.kinds.matcher import Matcher, require_features
+from mpsfm_core.providers.kinds.multiview import MultiViewProvider
+from mpsfm_core.providers.kinds.normals import NormalsProvider
+from mpsfm_core.providers.kinds.retrieval import RetrievalProvider
 from mpsfm_core.providers.protocols import (
     API_VERSION,
-    CAPABILITIES,
-    CAPABILITY_METHODS,
     ENTRY_POINT_GROUP,
-    KINDS,
-    PROTOCOLS,
     Capability,
-    DepthProvider,
     Executor,
     ExportFormat,
-    FeatureProvider,
-    FocalEstimator,
     Hooks,
-    JointProvider,
     Kind,
-    MaskProvider,
-    Matcher,
     ModelExport,
-    MultiViewProvider,
-    NormalsProvider,
     ProviderContext,
     ProviderSpec,
-    RetrievalProvider,
     WeightsFile,
     hookimpl,
     hookspec,
-    require_features,
     weights_from_option,
 )
+from mpsfm_core.providers.provider_kind import ProviderKind
 
 __all__ = [
     "API_VERSION",
     "CAPABILITIES",
-    "CAPABILITY_METHODS",
     "ENTRY_POINT_GROUP",
     "KINDS",
-    "PROTOCOLS",
+    "PROVIDER_KINDS",
     "Capability",
     "DepthProvider",
     "Executor",
@@ -56,6 +50,7 @@ __all__ = [
     "MultiViewProvider",
     "NormalsProvider",
     "ProviderContext",
+    "ProviderKind",
     "ProviderSpec",
     "RetrievalProvider",
     "WeightsFile",

@@ -4,18 +4,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.data.options import Options
-from mpsfm_core.providers.protocols import (
-    CAPABILITY_METHODS,
-    PROTOCOLS,
-    Capability,
-    Kind,
-    ProviderContext,
-    ProviderSpec,
-)
+from mpsfm_core.providers.kinds import PROVIDER_KINDS, required_methods
+from mpsfm_core.providers.protocols import Kind, ProviderContext, ProviderSpec
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,25 +41,25 @@ def spec_of_instance(kind: Kind, provider: Any) -> ProviderSpec:
     Raises:
         ProviderError: The provider object is a class, or lacks the method that the kind requires.
     """
-    methods = [name for name in vars(PROTOCOLS[kind]) if not name.startswith("_")]
     if isinstance(provider, type):
         raise ProviderError(f"{kind}: {provider.__name__} is a class; pass {provider.__name__}()")
-    for method in methods:
+    for method in required_methods(kind):
         if not callable(getattr(provider, method, None)):
             raise ProviderError(
                 f"{kind}: {type(provider).__name__} has no method {method}(); pass the name of a "
                 f"provider, a configuration block, or an object with this method"
             )
-    capabilities = set(getattr(provider, "capabilities", ("sparse",) if kind == "matcher" else ()))
-    for capability, method in CAPABILITY_METHODS.items():
-        if kind == "depth" and callable(getattr(provider, method, None)):
+    description = PROVIDER_KINDS[kind]
+    capabilities = set(getattr(provider, "capabilities", description.default_capabilities))
+    for capability, method in description.capability_methods.items():
+        if callable(getattr(provider, method, None)):
             capabilities.add(capability)
     words = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "-", type(provider).__name__).lower()
     return ProviderSpec(
         kind=kind,
         name=re.sub(r"[^a-z0-9]+", "-", words).strip("-") or kind,
         factory=ProviderInstance(provider),
-        capabilities=frozenset(cast("set[Capability]", capabilities)),
+        capabilities=frozenset(capabilities),
         calibration=getattr(provider, "calibration", None),
         tags=tuple(getattr(provider, "tags", ())),
         summary="object of the calling program",

@@ -1,4 +1,6 @@
-"""Interface between MP-SfM and its plugins, which provide networks and other algorithms.
+"""Specification of a provider and hooks of a plugin, the interface between MP-SfM and plugins.
+
+The protocol of each provider kind is in :mod:`mpsfm_core.providers.kinds`.
 
 A *provider* predicts depth, normals, features, matches or another quantity from images. A plugin is
 an installed Python package with an entry point in the group ``mpsfm.plugins``. The plugin's entry
@@ -14,7 +16,8 @@ plugin module implements the hook :func:`Hooks.mpsfm_providers`::
 MP-SfM calls the provider's factory as ``factory(options, context)`` when the provider is first
 used. A wrapper is a provider that modifies the output of another provider ``inner``, and its
 factory is called as ``factory(inner, options, context)``. The factory returns an object with the
-method that the protocol of the provider's kind requires, such as :meth:`DepthProvider.predict`.
+method that the protocol of the provider's kind requires, such as
+``DepthProvider.predict``.
 
 All providers follow the same conventions. A :class:`~mpsfm_core.data.View` is an undistorted image
 with ``image`` (H, W, 3) uint8 RGB and a pinhole ``camera`` with intrinsics in pixels. Pixel
@@ -34,24 +37,13 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args, runtime_checkable
+from typing import Any, Protocol
 
 import pluggy
 from pydantic import BaseModel
 
-from mpsfm_core.data import (
-    Bool,
-    DepthPrior,
-    Features,
-    Float32,
-    MultiViewPrior,
-    NormalPrior,
-    PairMatches,
-    SceneState,
-    View,
-)
+from mpsfm_core.data import SceneState
 from mpsfm_core.data.decisions import Reason
-from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.data.options import Options
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
@@ -61,42 +53,13 @@ API_VERSION = 1
 ENTRY_POINT_GROUP = "mpsfm.plugins"
 """Group of the Python entry points that name plugin modules."""
 
-Kind = Literal[
-    "depth", "normals", "multiview", "features", "matcher", "retrieval", "mask", "wrapper"
-]
-KINDS: tuple[Kind, ...] = get_args(Kind)
+Kind = str
+"""Name of a provider kind, such as ``depth``. The package :mod:`mpsfm_core.providers.kinds` defines
+the kinds."""
 
-Capability = Literal[
-    # The depth is in meters.
-    "metric",
-    # The depth or normals have a variance that the network predicts.
-    "variance",
-    # The depth provider has the method predict_joint().
-    "joint-normals",
-    # The normals provider requires the depth prior of the image.
-    "needs-depth",
-    # The matcher requires features and returns matches of features.
-    "sparse",
-    # The matcher needs no features and returns matches of pixel positions.
-    "dense",
-    # The matcher also predicts the depth of both images.
-    "pair-depth",
-    # The wrapper modifies the output of depth providers.
-    "wraps-depth",
-    # The wrapper modifies the output of normals providers.
-    "wraps-normals",
-    # The output of the provider depends on the focal length.
-    "intrinsics-aware",
-    # The depth provider has the method estimate_focal().
-    "estimates-focal",
-    # The multi-view provider predicts relative camera poses.
-    "proposes-poses",
-    # The multi-view provider predicts camera intrinsics.
-    "proposes-intrinsics",
-    # The provider reads its output from files, so the run does not cache the output.
-    "uncached",
-]
-CAPABILITIES: tuple[Capability, ...] = get_args(Capability)
+Capability = str
+"""Name of a capability that a provider declares. The description of the provider's kind lists the
+capabilities, see :class:`~mpsfm_core.providers.provider_kind.ProviderKind`."""
 
 
 @dataclass(frozen=True)
@@ -119,182 +82,6 @@ class ProviderContext:
     """Number of CPU threads that the provider may use."""
     seed: int = 0
     """Seed of the provider's random numbers."""
-
-
-@runtime_checkable
-class DepthProvider(Protocol):
-    """Provider that predicts the depth of a single undistorted image."""
-
-    def predict(self, view: View) -> DepthPrior:
-        """Predict the z-depth map of an undistorted image.
-
-        Args:
-            view: Undistorted image with its camera.
-
-        Returns:
-            Depth (h, w) float32 along the optical axis, in meters if ``metric`` is true, else in an
-            arbitrary unit. Optional depth variance (h, w) float32 in the squared unit of depth.
-            Validity (h, w) bool of the depth values. The depth map covers the image and may have
-            any resolution.
-        """
-        ...
-
-
-@runtime_checkable
-class JointProvider(DepthProvider, Protocol):
-    """Depth provider that also predicts normals in one pass (capability ``joint-normals``)."""
-
-    def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
-        """Predict the depth and normals of an image in one network pass.
-
-        Args:
-            view: Undistorted image with its camera.
-
-        Returns:
-            Depth prior as in :meth:`predict`, and normal prior as in
-            :meth:`NormalsProvider.predict`.
-        """
-        ...
-
-
-@runtime_checkable
-class FocalEstimator(DepthProvider, Protocol):
-    """Depth provider that also estimates the focal length (capability ``estimates-focal``)."""
-
-    def estimate_focal(self, view: View) -> float | None:
-        """Estimate the focal length of an image from its pixels.
-
-        Args:
-            view: Undistorted image. The focal length estimate must not depend on ``view.camera``.
-
-        Returns:
-            Focal length in pixels of the image, or None if the provider cannot estimate it.
-        """
-        ...
-
-
-@runtime_checkable
-class NormalsProvider(Protocol):
-    """Provider that predicts the surface normals of a single undistorted image."""
-
-    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
-        """Predict the surface normals of an undistorted image.
-
-        Args:
-            view: Undistorted image with its camera.
-            depth: Depth prior of the image with variance if the provider has the capability
-                ``needs-depth``, else None.
-
-        Returns:
-            Unit normals (h, w, 3) float32 in the camera frame that face the camera. Optional
-            variance (h, w) float32 of the normal's angle in rad^2. Validity (h, w) bool of the
-            normals. The normal map covers the image and may have any resolution.
-        """
-        ...
-
-
-@runtime_checkable
-class MultiViewProvider(Protocol):
-    """Provider that predicts the depth of several images jointly."""
-
-    def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
-        """Predict the depth of several images in one common unit.
-
-        Args:
-            views: One or more undistorted images of one scene, of any sizes.
-
-        Returns:
-            One depth prior per image, in the order of ``views`` and in one common unit. Providers
-            with the capability ``proposes-poses`` also return camera poses ``cam_from_group`` (n,
-            3, 4) float64, with translations in the unit of depth. Providers with the capability
-            ``proposes-intrinsics`` also return intrinsics fx, fy, cx, cy (n, 4) float64 in pixels
-            of each image.
-        """
-        ...
-
-
-@runtime_checkable
-class FeatureProvider(Protocol):
-    """Provider that detects and describes sparse local features."""
-
-    def extract(self, view: View) -> Features:
-        """Detect and describe the local features of an undistorted image.
-
-        Args:
-            view: Undistorted image with its camera.
-
-        Returns:
-            Keypoints (n, 2) float64 in pixels of ``view``, not of a resized image. Descriptors (n,
-            d) float32 with the same dimension d for every image. Optional detection scores (n,)
-            float32 and optional keypoint scales (n,) float32 in pixels. The standard deviation
-            ``std_px`` of keypoint positions in pixels.
-        """
-        ...
-
-
-@runtime_checkable
-class Matcher(Protocol):
-    """Provider that matches two images, either by their features or by their pixels."""
-
-    def match(
-        self,
-        view_a: View,
-        view_b: View,
-        features_a: Features | None = None,
-        features_b: Features | None = None,
-    ) -> PairMatches:
-        """Match two undistorted images.
-
-        Args:
-            view_a: First undistorted image.
-            view_b: Second undistorted image, which may have another size.
-            features_a: Features of the first image if the matcher has the capability ``sparse``,
-                else None. An image may have no features or many thousands.
-            features_b: Features of the second image if the matcher has the capability ``sparse``,
-                else None.
-
-        Returns:
-            Sparse matches are index pairs (m, 2) int64 of features in the first and second image.
-            Dense matches are corresponding points (m, 2) float64 in pixels of each image. Sparse
-            and dense matches have scores (m,) float32 in [0, 1], where 1 is best. Matchers with the
-            capability ``pair-depth`` also return one depth prior per image.
-        """
-        ...
-
-
-@runtime_checkable
-class RetrievalProvider(Protocol):
-    """Provider of global image descriptors for image retrieval."""
-
-    def describe(self, view: View) -> Float32:
-        """Compute the global descriptor of an undistorted image.
-
-        Args:
-            view: Undistorted image with its camera.
-
-        Returns:
-            Global descriptor (d,) float32 with the same dimension d for every image, normally of
-            unit length. The dot product of two global descriptors is the similarity of their
-            images.
-        """
-        ...
-
-
-@runtime_checkable
-class MaskProvider(Protocol):
-    """Provider of masks, which mark the pixels that the reconstruction may use."""
-
-    def mask(self, view: View) -> Bool:
-        """Compute the mask of the pixels in an image that the reconstruction may use.
-
-        Args:
-            view: Undistorted image with its camera.
-
-        Returns:
-            Mask (H, W) bool in the size of the image, True where the reconstruction may use a
-            pixel.
-        """
-        ...
 
 
 class Executor(Protocol):
@@ -322,47 +109,6 @@ class Executor(Protocol):
     def close(self) -> None:
         """Release the workers of the executor."""
         ...
-
-
-PROTOCOLS: dict[Kind, type] = {
-    "depth": DepthProvider,
-    "normals": NormalsProvider,
-    "multiview": MultiViewProvider,
-    "features": FeatureProvider,
-    "matcher": Matcher,
-    "retrieval": RetrievalProvider,
-    "mask": MaskProvider,
-}
-"""Protocol class of each provider kind. A wrapper provider is not listed, because it implements the
-protocol of the provider that it wraps."""
-
-
-CAPABILITY_METHODS: dict[Capability, str] = {
-    "joint-normals": "predict_joint",
-    "estimates-focal": "estimate_focal",
-}
-"""Additional method that a provider must have, by the capability that requires the method."""
-
-
-def require_features(
-    purpose: str, features_a: Features | None, features_b: Features | None
-) -> tuple[Features, Features]:
-    """Return the features of both images, or raise ProviderError if features are missing.
-
-    Args:
-        purpose: Beginning of the error message, such as "mutual-nearest matches features".
-        features_a: Features of the first image, or None.
-        features_b: Features of the second image, or None.
-
-    Returns:
-        Features of the first and of the second image.
-
-    Raises:
-        ProviderError: The features of the first or second image are None.
-    """
-    if features_a is None or features_b is None:
-        raise ProviderError(f"{purpose}: choose a features provider")
-    return features_a, features_b
 
 
 @dataclass(frozen=True)
@@ -445,7 +191,8 @@ class ProviderSpec:
     :class:`~mpsfm_core.data.options.Options` or its name ``"package.module:Class"``. None declares
     that the provider has no options."""
     capabilities: frozenset[Capability] = frozenset()
-    """Capabilities of the provider, from :data:`CAPABILITIES`. If the provider's output lacks a
+    """Capabilities of the provider, from
+    :data:`mpsfm_core.providers.kinds.CAPABILITIES`. If the provider's output lacks a
     declared capability, an error is raised."""
     summary: str = ""
     """One-line description of the provider in the output of ``mpsfm plugins list``."""

@@ -15,21 +15,13 @@ from dataclasses import dataclass, replace
 from importlib import metadata
 from itertools import count
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 import pluggy
 
 from mpsfm_core.data.errors import InputError, MpsfmError, ProviderError, did_you_mean
 from mpsfm_core.data.options import Options, SettingPath, parse_settings
-from mpsfm_core.providers import (
-    CAPABILITY_METHODS,
-    KINDS,
-    PROTOCOLS,
-    Kind,
-    ProviderContext,
-    ProviderSpec,
-    WeightsFile,
-)
+from mpsfm_core.providers import KINDS, Kind, ProviderContext, ProviderSpec, WeightsFile
 from mpsfm_core.providers.builtin import plugin as builtin
 from mpsfm_core.providers.discovery import (
     LoadedPlugin,
@@ -42,6 +34,7 @@ from mpsfm_core.providers.discovery import (
 from mpsfm_core.providers.environments.environment import all_environments
 from mpsfm_core.providers.environments.remote_provider import EnvironmentHooks, remote_providers
 from mpsfm_core.providers.first_party import requirement_for
+from mpsfm_core.providers.kinds import required_methods
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.source_hash import hash_requirement, hash_source
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
@@ -72,7 +65,7 @@ Calibration = DepthCalibration | NormalCalibration
 class ProviderStatus:
     """Status of one provider or plugin, as in one line of ``mpsfm plugins list``."""
 
-    kind: Kind | Literal["plugin"]
+    kind: Kind
     """Kind of the provider, or ``"plugin"`` for a plugin without usable providers."""
     name: str
     """Name of the provider, or of the plugin's entry point."""
@@ -391,7 +384,7 @@ class Registry:
             wrap: Configurations of the wrapper providers, innermost first.
 
         Returns:
-            Provider object with the methods of the protocol ``PROTOCOLS[kind]``.
+            Provider object with the methods of the protocol of its kind.
 
         Raises:
             ProviderError: The provider cannot be imported or constructed, or the provider object
@@ -400,15 +393,23 @@ class Registry:
         """
         entry = self._entry(kind, name)
         provider = self._construct(entry, (), options, context)
-        extra = [m for c, m in CAPABILITY_METHODS.items() if c in entry.spec.capabilities]
-        _require_methods(entry, provider, [*_methods(kind), *extra])
+        _require_methods(entry, provider, required_methods(kind, entry.spec.capabilities))
         for wrapper in wrap:
             outer = self._entry("wrapper", wrapper.use)
             if f"wraps-{kind}" not in outer.spec.capabilities:
                 raise ProviderError(f"{outer.label} does not wrap {kind} providers")
             provider = self._construct(outer, (provider,), wrapper.options, context)
-            _require_methods(outer, provider, _methods(kind))
+            _require_methods(outer, provider, required_methods(kind))
         return provider
+
+    def hook_modules(self) -> dict[tuple[str, str], object]:
+        """Return the registered plugin modules by pip package and name of the entry point."""
+        modules = {}
+        for label, module in self._manager.list_name_plugin():
+            distribution, separator, name = label.partition(": ")
+            if separator and module is not None:
+                modules[distribution, name] = module
+        return modules
 
     @property
     def hook(self) -> pluggy.HookRelay:
@@ -607,10 +608,6 @@ def _load_reference(entry: _Entry, reference: str) -> Any:
         what = f"cannot be imported from {reference!r}: {type(error).__name__}: {error}"
         raise ProviderError(_sentence(entry.label, what, entry.spec.install_hint)) from error
     return target
-
-
-def _methods(kind: Kind) -> list[str]:
-    return [name for name in vars(PROTOCOLS[kind]) if not name.startswith("_")]
 
 
 def _require_methods(entry: _Entry, provider: object, names: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ from __future__ import annotations
 from mpsfm_core.testing.contract import CheckResult, run_checks
 from mpsfm_core.testing.contract_case import ContractCase, ContractSetup
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
-from mpsfm_core.testing.pytest_tests import contract_tests
+from mpsfm_core.testing.pytest_tests import contract_tests, hook_tests
 
 __all__ = [
     "CheckFailed",
@@ -24,5 +24,6 @@ __all__ = [
     "ContractCase",
     "ContractSetup",
     "contract_tests",
+    "hook_tests",
     "run_checks",
 ]

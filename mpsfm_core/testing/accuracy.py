@@ -61,6 +61,9 @@ def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str
     Raises:
         CheckFailed: the error exceeds the tolerance of the provider's kind.
     """
+    compare = case.description.compare
+    if compare is not None and case.truth_source != "none":
+        return compare(case, example, answer)
     unknown = case.truth_source == "none" or case.kind in ("features", "retrieval")
     if unknown or (case.kind == "matcher" and case.truth_source == "painted"):
         return "valid output; accuracy not measured without ground truth"

@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import tempfile
 import time
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 
 from mpsfm_core.data.errors import InputError, MpsfmError, ProviderError, did_you_mean
-from mpsfm_core.providers import Kind, ProviderSpec
+from mpsfm_core.providers import KINDS, PROVIDER_KINDS, Kind, ProviderSpec
 from mpsfm_core.providers.registry import ProviderStatus, Registry
 from mpsfm_core.support.yaml_text import parse_yaml
-from mpsfm_core.testing.checks import depth as checks_depth
-from mpsfm_core.testing.checks import features as checks_features
-from mpsfm_core.testing.checks import mask as checks_mask
-from mpsfm_core.testing.checks import matcher as checks_matcher
-from mpsfm_core.testing.checks import multiview as checks_multiview
-from mpsfm_core.testing.checks import normals as checks_normals
-from mpsfm_core.testing.checks import retrieval as checks_retrieval
-from mpsfm_core.testing.checks import wrapper as checks_wrapper
 from mpsfm_core.testing.checks.common import (
     COMMON,
     STANDALONE,
@@ -39,19 +31,13 @@ A check that fails or does not apply raises ``CheckFailed`` or ``CheckSkipped``.
 Status = Literal["pass", "fail", "skip", "unmeasured", "xfail"]
 SetupSource = ContractSetup | Callable[[Path], ContractSetup] | None
 
-CHECKS_BY_KIND: Mapping[Kind, tuple[Check, ...]] = MappingProxyType(
-    {
-        "depth": checks_depth.CHECKS,
-        "normals": checks_normals.CHECKS,
-        "multiview": checks_multiview.CHECKS,
-        "features": checks_features.CHECKS,
-        "matcher": checks_matcher.CHECKS,
-        "retrieval": checks_retrieval.CHECKS,
-        "mask": checks_mask.CHECKS,
-        "wrapper": checks_wrapper.CHECKS,
-    }
-)
-"""Contract checks of each provider kind, in addition to the checks for every kind."""
+
+def checks_of_kind(kind: Kind) -> tuple[Check, ...]:
+    """Return the contract checks of a provider kind, in addition to those for every kind."""
+    module, _, name = PROVIDER_KINDS[kind].checks.partition(":")
+    checks: tuple[Check, ...] = getattr(importlib.import_module(module), name)
+    return checks
+
 
 REQUIRED: tuple[Check, ...] = (check_specification, check_construction, check_output_rules)
 """Contract checks without which all later checks are meaningless and therefore skipped."""
@@ -187,14 +173,13 @@ class Contract:
             for name in setup.expected_failures:
                 if name not in known:
                     raise ProviderError(f"expected failure {name!r}{did_you_mean(name, known)}")
-            behaves_as = next((kind for kind in CHECKS_BY_KIND if kind == around), None)
             self._cases[around] = ContractCase(
                 self._registry,
                 self.spec,
                 setup,
                 self._folder,
                 name=self._name,
-                behaves_as=behaves_as,
+                behaves_as=around or None,
                 device=self._device,
             )
         return self._cases[around]
@@ -337,8 +322,7 @@ def schedule_checks(spec: ProviderSpec) -> list[CheckTask]:
     wrapped = [kind for kind in ("depth", "normals") if f"wraps-{kind}" in spec.capabilities]
     tasks = []
     for around in (wrapped or ["depth"]) if spec.kind == "wrapper" else [""]:
-        special = [*CHECKS_BY_KIND[spec.kind]]
-        special += next((checks for kind, checks in CHECKS_BY_KIND.items() if kind == around), ())
+        special = [*checks_of_kind(spec.kind), *(checks_of_kind(around) if around else ())]
         checks = [*STANDALONE, check_output_rules, *special, *COMMON]
         tasks += [CheckTask(check_id(check), around) for check in checks]
     return tasks
@@ -346,7 +330,7 @@ def schedule_checks(spec: ProviderSpec) -> list[CheckTask]:
 
 def list_checks() -> list[Check]:
     """Return the contract checks of all provider kinds, first those for every kind."""
-    special = dict.fromkeys(check for checks in CHECKS_BY_KIND.values() for check in checks)
+    special = dict.fromkeys(check for kind in KINDS for check in checks_of_kind(kind))
     return [*STANDALONE, check_output_rules, *COMMON, *special]
 
 
@@ -361,7 +345,10 @@ def parse_check_ids(ids: Collection[str]) -> set[str]:
     Raises:
         InputError: an id is not the id of a contract check.
     """
+    from mpsfm_core.testing.hook_checks import HOOK_CHECKS, hook_check_id
+
     known = [check_id(check) for check in list_checks()]
+    known += [hook_check_id(check) for check in HOOK_CHECKS]
     for name in ids:
         if name not in known:
             raise InputError(f"no check {name!r}{did_you_mean(name, known)}")

@@ -6,7 +6,6 @@ import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal
 from weakref import WeakKeyDictionary, WeakSet
 
@@ -15,7 +14,18 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import DepthPrior, Features, MultiViewPrior, View
 from mpsfm_core.data.errors import ProviderError
-from mpsfm_core.providers import Capability, Kind, ProviderContext, ProviderSpec, validation
+from mpsfm_core.providers import (
+    PROVIDER_KINDS,
+    Capability,
+    Kind,
+    ProviderContext,
+    ProviderKind,
+    ProviderSpec,
+)
+from mpsfm_core.providers.kinds.features import run_features
+from mpsfm_core.providers.kinds.matcher import run_matcher
+from mpsfm_core.providers.kinds.multiview import run_multiview
+from mpsfm_core.providers.kinds.normals import run_normals
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
@@ -31,15 +41,6 @@ from mpsfm_core.testing.process_state import read_process_settings
 TruthSource = Literal["painted", "prepared", "image", "none"]
 """Source from which a provider under test can derive the ground truth, see
 :class:`ContractSetup`."""
-
-_RUN: Mapping[Kind, Callable[..., Any]] = MappingProxyType(
-    {
-        "depth": validation.run_depth,
-        "features": validation.run_features,
-        "retrieval": validation.run_retrieval,
-        "mask": validation.run_mask,
-    }
-)
 
 AUXILIARY_RELATIVE_STD = 0.02
 """Relative std of the exact depth prior that a normals provider with ``needs-depth`` receives."""
@@ -138,12 +139,25 @@ class ContractCase:
         """Source from which the provider under test can derive the ground truth."""
         if self._ground_truth is not None:
             return "prepared"
-        from_image = self.kind in ("features", "matcher", "retrieval")
-        return self.setup.truth_source or ("image" if from_image else "none")
+        return self.setup.truth_source or ("image" if self.description.sees_truth else "none")
 
     def declares(self, capability: Capability) -> bool:
         """Return whether the specification of the provider lists a capability."""
         return capability in self.spec.capabilities
+
+    @property
+    def description(self) -> ProviderKind:
+        """Description of the provider kind of the output."""
+        return PROVIDER_KINDS[self.kind]
+
+    def require_capability(self, capability: Capability) -> None:
+        """Skip the check unless the specification of the provider lists a capability.
+
+        Raises:
+            CheckSkipped: the provider does not declare the capability.
+        """
+        if not self.declares(capability):
+            raise CheckSkipped(f"the provider does not declare {capability!r}")
 
     def require_truth(self, *sources: TruthSource) -> None:
         """Skip the check unless the ground truth comes from one of the given sources.
@@ -166,14 +180,15 @@ class ContractCase:
         if self._example is None:
             is_painted = self.truth_source == "painted" or self._ground_truth is not None
             appearance: Appearance = "painted" if is_painted else "textured"
-            outdoor = self.kind in ("depth", "normals", "multiview", "mask")
+            scene = self.description.example_scene
             # Providers can see the holes of a mask in painted views only.
-            has_holes = outdoor and (self.kind != "mask" or self.truth_source != "image")
-            self._example = (
-                outdoor_example(appearance, holes=has_holes)
-                if outdoor
-                else indoor_example(appearance)
-            )
+            has_holes = self.kind != "mask" or self.truth_source != "image"
+            if scene == "indoor":
+                self._example = indoor_example(appearance)
+            elif scene == "outdoor":
+                self._example = outdoor_example(appearance, holes=has_holes)
+            else:
+                self._example = outdoor_example(appearance).with_common_camera()
         return self._example
 
     def create_provider(self, **inner_options: Any) -> Any:
@@ -226,13 +241,14 @@ class ContractCase:
         auxiliary = self.make_auxiliary_input(view, example) if auxiliary is None else auxiliary
         if self.kind == "matcher":
             views = (view, example.partner.view)
-            return validation.run_matcher(self._validated_spec, provider, views, auxiliary)
+            return run_matcher(self._validated_spec, provider, views, auxiliary)
         if self.kind == "multiview":
             views = (view, example.partner.view)
-            return validation.run_multiview(self._validated_spec, provider, views)
+            return run_multiview(self._validated_spec, provider, views)
         if self.kind == "normals":
-            return validation.run_normals(self._validated_spec, provider, view, auxiliary)
-        run: Callable[[ProviderSpec, Any, View], Any] = _RUN[self.kind]
+            return run_normals(self._validated_spec, provider, view, auxiliary)
+        run = self.description.run
+        assert run is not None
         return run(self._validated_spec, provider, view)
 
     def make_auxiliary_input(self, view: View, example: Example) -> Any:
@@ -250,13 +266,13 @@ class ContractCase:
         self.prepare(a, b)
         views = (a.view, b.view)
         features = self.extract_features(*views)
-        return validation.run_matcher(self._validated_spec, self.provider, views, features)
+        return run_matcher(self._validated_spec, self.provider, views, features)
 
     def run_on_group(self, *examples: Example) -> MultiViewPrior:
         """Run a multi-view provider on several synthetic views and validate the output."""
         self.prepare(*examples)
         views = [example.view for example in examples]
-        return validation.run_multiview(self._validated_spec, self.provider, views)
+        return run_multiview(self._validated_spec, self.provider, views)
 
     def prepare(self, *examples: Example) -> None:
         """Prepare the ground truth of each synthetic view once."""
@@ -330,7 +346,7 @@ class ContractCase:
             if self._detector is None:
                 options = load_setup(spec, self._folder).options
                 self._detector = self._create(self.registry, "features", spec.name, options)
-            self._features[view] = validation.run_features(spec, self._detector, view)
+            self._features[view] = run_features(spec, self._detector, view)
         return self._features[view]
 
     def _choose_detector(self) -> ProviderSpec:

@@ -54,6 +54,30 @@ def contract_tests(
     return tests
 
 
+def hook_tests(name: str, *, registry: Registry | None = None) -> Callable[..., None]:
+    """Create a parametrized pytest function with one test per contract check of hooks.
+
+    Args:
+        name: Name of the plugin's entry point or distribution.
+        registry: Registry of plugins, by default all installed plugins.
+
+    Returns:
+        Parametrized pytest function to assign in a test module.
+    """
+    import pytest
+
+    from mpsfm_core.testing.hook_checks import HOOK_CHECKS, hook_check_id, run_hook_checks
+
+    @pytest.mark.parametrize("id", [hook_check_id(check) for check in HOOK_CHECKS])
+    def test_hooks(id: str) -> None:
+        results = run_hook_checks(registry or Registry.discover(), name, only={id})
+        if not results:
+            pytest.skip("the plugin does not implement the hook")
+        report(results[0])
+
+    return test_hooks
+
+
 def report(result: CheckResult) -> None:
     """End the current pytest test with the status of a contract check."""
     import pytest

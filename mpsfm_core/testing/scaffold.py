@@ -9,20 +9,21 @@ from pathlib import Path
 from string import Template
 
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.providers import Kind
+from mpsfm_core.providers import PROVIDER_KINDS, Kind
 from mpsfm_core.support.files import write_file
 
 _TEMPLATES = Path(__file__).parent / "templates"
+_COMMON_FILES = ("pyproject.toml", "README.md", "tests/test_contract.py")
 _NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
-_KINDS_WITH_OPENCV = ("features", "retrieval")
 
 
 def write_plugin(name: str, kind: Kind, folder: Path) -> list[Path]:
-    """Write a new plugin package with one provider that passes the contract checks.
+    """Write a new plugin package whose provider or hooks pass the contract checks.
 
     Args:
         name: Name of the Python package, the distribution and the provider.
-        kind: Kind of the provider, such as ``depth``.
+        kind: Kind of the provider, such as ``depth``, or ``hook`` for a plugin with hooks and
+            without providers.
         folder: Parent folder of the plugin package.
 
     Returns:
@@ -39,28 +40,37 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> list[Path]:
     target = folder / name
     if target.exists():
         raise InputError(f"{target} exists already")
+    description = PROVIDER_KINDS.get(kind)
+    packages = ("mpsfm-core>=0.1",)
+    if description is not None:
+        packages += ("numpy>=1.26", *description.template_requirements)
     placeholders = {
         "name": name,
         "module": module,
         "Class": "".join(part.capitalize() for part in name.split("-")),
         "kind": kind,
-        "dependencies": '"mpsfm-core>=0.1", "numpy>=1.26"'
-        + (', "opencv-python-headless>=4.8"' if kind in _KINDS_WITH_OPENCV else ""),
+        "dependencies": ", ".join(f'"{package}"' for package in packages),
     }
-    placeholders["usage"] = _fill_template(_TEMPLATES / kind / "usage.yaml", placeholders).strip()
-    has_contract = (_TEMPLATES / kind / "contract.py").exists()
+    templates = _read_templates(kind)
+    usage = templates.pop("usage.yaml", "")
+    placeholders["usage"] = Template(usage).substitute(placeholders).strip()
     row = f"| `{module}/contract.py` | how the contract is checked without weights |\n"
-    placeholders["contract_row"] = row if has_contract else ""
-    sources = {Path("pyproject.toml"), Path("README.md"), Path("tests/test_contract.py")}
-    files = {target / path: _TEMPLATES / "common" / path for path in sources}
-    files |= {target / module / p.name: p for p in (_TEMPLATES / kind).glob("*.py")}
-    texts = {path: _fill_template(source, placeholders) for path, source in files.items()}
+    placeholders["contract_row"] = row if "contract.py" in templates else ""
+    sources = {}
+    for path in _COMMON_FILES:
+        common = (_TEMPLATES / "common" / path).read_text(encoding="utf-8")
+        sources[target / path] = templates.pop(Path(path).name, common)
+    sources |= {target / module / name: text for name, text in templates.items()}
+    texts = {path: Template(text).substitute(placeholders) for path, text in sources.items()}
     texts[target / module / "__init__.py"] = ""
     for path, text in texts.items():
         write_file(path, text)
     return sorted(texts)
 
 
-def _fill_template(template: Path, placeholders: dict[str, str]) -> str:
-    """Substitute the placeholders in the text of a template file."""
-    return Template(template.read_text(encoding="utf-8")).substitute(placeholders)
+def _read_templates(kind: Kind) -> dict[str, str]:
+    """Return the texts of the template files of a provider kind or of hooks by file name."""
+    if kind in PROVIDER_KINDS and PROVIDER_KINDS[kind].template:
+        return dict(PROVIDER_KINDS[kind].template)
+    files = (_TEMPLATES / kind).glob("*.*")
+    return {file.name: file.read_text(encoding="utf-8") for file in files}

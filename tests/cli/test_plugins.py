@@ -190,18 +190,18 @@ class TestEndings:
         assert code == 0 and text.strip()
 
 
-def test_plugins_check_plugin_without_providers_lists_hooks(
+def test_plugins_check_plugin_without_providers_checks_hooks(
     install_plugin: Callable[..., str],
 ) -> None:
     source = """
         from mpsfm_core import hookimpl
         @hookimpl
-        def mpsfm_notice(text):
-            pass
+        def mpsfm_exports():
+            return {}
     """
     module = install_plugin("mpsfm-hooks", source)
     entries = f"[mpsfm.plugins]\nlistener = {module}\n"
     install_plugin("mpsfm-hooks", source, version="2.0", entry_points=entries)
     code, out, _ = mpsfm("plugins", "check", "listener")
     assert code == 0
-    assert "listener (mpsfm-hooks 2.0) loads; all its hooks are known: notice" in out
+    assert "pass  plugin/listener: hook-exports" in out

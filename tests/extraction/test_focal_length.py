@@ -1,12 +1,19 @@
-"""Tests of focal length estimation by the depth provider."""
+"""Tests of focal length estimation by the camera provider and the depth provider."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
 import pytest
 
 from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
-from mpsfm_core.inputs.images import load_images
+from mpsfm_core.extraction.runner import extract
+from mpsfm_core.inputs.images import ImageSet, load_images
+from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.providers import ProviderSpec
+from mpsfm_core.providers.kinds.camera import CameraPrior
 from mpsfm_core.providers.provider_config import ProviderConfig
 
 ESTIMATES = {"view0.png": 150.0, "view1.png": 130.0, "view2.png": 100.0, "view3.png": None}
@@ -65,3 +72,68 @@ def test_failed_focal_estimate_leaves_default(estimated, monkeypatch) -> None:
     monkeypatch.setattr(f"{__name__}.ESTIMATES", dict.fromkeys(ESTIMATES))
     images, asked = estimated()
     assert len(asked) == 4 and images[0].focal_source == "default"
+
+
+@pytest.fixture
+def calibrated(world):
+    """Return images whose focal lengths a camera provider estimates, given focal length and std."""
+
+    def run(estimates, exif_px=None):
+        class Calibrates:
+            def __init__(self, options, context) -> None: ...
+
+            def calibrate(self, view):
+                estimate = estimates[view.name]
+                return None if estimate is None else CameraPrior(*estimate)
+
+        world.registry.add(ProviderSpec("camera", "calibrates", Calibrates), version="1")
+        images = load_images(world.root / "images")
+        if exif_px is not None:
+            changed = [with_exif(image, exif_px) for image in images]
+            images = ImageSet(changed, InputOptions())
+        config = world.config(camera=ProviderConfig(use="calibrates"))
+        return estimate_focal_lengths(images, config, world.registry)
+
+    return run
+
+
+def with_exif(image, focal_px):
+    camera = pycolmap.Camera(image.camera.todict())
+    camera.params = [focal_px, *camera.params[1:]]
+    return replace(image, camera=camera, focal_source="exif")
+
+
+def test_camera_provider_gives_focal_length_and_std_of_image_without_exif(calibrated) -> None:
+    images = calibrated(dict.fromkeys(ESTIMATES, (140.0, 7.0)))
+    assert {image.pinhole.fx for image in images} == {140.0}
+    assert images[0].focal_log_std == pytest.approx(0.05)
+    assert images[0].focal_source == "provider" and not images[0].focal_known
+
+
+def test_scatter_of_camera_estimates_raises_std(calibrated) -> None:
+    values = {"view0.png": (100.0, 1.0), "view1.png": (140.0, 1.0), "view2.png": (196.0, 1.0)}
+    images = calibrated({**values, "view3.png": None})
+    assert images[0].pinhole.fx == pytest.approx(140.0)
+    assert images[0].focal_log_std == pytest.approx(1.4826 * np.log(1.4))
+
+
+def test_camera_estimate_is_combined_with_exif_by_std(calibrated) -> None:
+    images = calibrated(dict.fromkeys(ESTIMATES, (140.0, 14.0)), exif_px=140.0 * 1.1)
+    assert images[0].pinhole.fx == pytest.approx(140.0 * 1.1**0.5)
+    assert images[0].focal_log_std == pytest.approx(0.1 / 2**0.5)
+
+
+def test_camera_estimate_that_contradicts_exif_has_larger_std(calibrated) -> None:
+    images = calibrated(dict.fromkeys(ESTIMATES, (140.0, 14.0)), exif_px=280.0)
+    assert images[0].focal_log_std == pytest.approx(np.log(2) / 2, rel=1e-3)
+
+
+def test_failed_camera_estimate_leaves_default(calibrated) -> None:
+    assert calibrated(dict.fromkeys(ESTIMATES))[0].focal_source == "default"
+
+
+def test_mapping_problem_gets_std_of_camera_estimate(calibrated, world) -> None:
+    images = calibrated(dict.fromkeys(ESTIMATES, (150.0, 3.0)))
+    problem = extract(images, world.config(), world.registry).problem
+    assert {image.focal_prior_px for image in problem.images} == {150.0}
+    assert {image.focal_log_std for image in problem.images} == {0.02}

@@ -27,16 +27,12 @@ from mpsfm_core.data.errors import (
     ProviderRunError,
     WeightsError,
 )
-from mpsfm_core.providers.validation import (
-    run_depth,
-    run_features,
-    run_focal,
-    run_joint,
-    run_mask,
-    run_matcher,
-    run_normals,
-    run_retrieval,
-)
+from mpsfm_core.providers.kinds.depth import run_depth, run_focal, run_joint
+from mpsfm_core.providers.kinds.features import run_features
+from mpsfm_core.providers.kinds.mask import run_mask
+from mpsfm_core.providers.kinds.matcher import run_matcher
+from mpsfm_core.providers.kinds.normals import run_normals
+from mpsfm_core.providers.kinds.retrieval import run_retrieval
 
 VIEW = View("a.jpg", np.zeros((4, 6, 3), np.uint8), PinholeCamera(6, 4, 5.0, 5.0, 3.0, 2.0))
 OTHER = View("b.jpg", np.zeros((8, 8, 3), np.uint8), PinholeCamera(8, 8, 5.0, 5.0, 4.0, 4.0))

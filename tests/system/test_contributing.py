@@ -11,8 +11,8 @@ import pytest
 
 from mpsfm_core.data import PinholeCamera, View
 from mpsfm_core.providers import ProviderContext
+from mpsfm_core.providers.kinds.depth import run_depth
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.providers.validation import run_depth
 
 GUIDE = Path(__file__).resolve().parents[2] / "CONTRIBUTING.md"
 

@@ -37,7 +37,7 @@ from mpsfm_core.extraction.matching.keypoint_adjustment import (
 from mpsfm_core.extraction.matching.verification import CALIBRATED, TwoViewGeometry, verify_matches
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.geometry import sample_nearest
-from mpsfm_core.providers import validation
+from mpsfm_core.providers.kinds.matcher import run_matcher
 from mpsfm_core.providers.source_hash import hash_module
 
 
@@ -116,7 +116,7 @@ class PairMatcher:
         def compute(instance: Any) -> PairMatches:
             views = context.view(pair[0]), context.view(pair[1])
             features = None if table is None else (table[pair[0]], table[pair[1]])
-            return validation.run_matcher(provider.spec, instance, views, features)
+            return run_matcher(provider.spec, instance, views, features)
 
         inputs: list[object] = [context.view_inputs(index, provider) for index in pair]
         if table is not None and provider.can("sparse"):

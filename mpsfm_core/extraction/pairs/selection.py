@@ -19,7 +19,7 @@ from mpsfm_core.extraction.features import FeatureSource
 from mpsfm_core.extraction.pairs import pairing as pairs
 from mpsfm_core.extraction.pairs import similarity as pair_similarity
 from mpsfm_core.extraction.pairs.pairing import Pair
-from mpsfm_core.providers import validation
+from mpsfm_core.providers.kinds.retrieval import run_retrieval
 from mpsfm_core.providers.source_hash import hash_module
 
 
@@ -172,7 +172,7 @@ class PairSelection:
             provider,
             np.ndarray,
             context.view_inputs(index, provider),
-            lambda instance: validation.run_retrieval(provider.spec, instance, context.view(index)),
+            lambda instance: run_retrieval(provider.spec, instance, context.view(index)),
         )
 
     def _descriptors(self) -> list[Any]:

@@ -11,7 +11,7 @@ from mpsfm_core.data import DepthPrior, Float64, Int64, MultiViewPrior, Pose
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.empty_results import EMPTY_RESULTS
 from mpsfm_core.extraction.pairs.pairing import Pair
-from mpsfm_core.providers import validation
+from mpsfm_core.providers.kinds.multiview import run_multiview
 
 Group = tuple[int, ...]
 """Image indices of a group that the multi-view network processes together."""
@@ -86,7 +86,7 @@ class GroupPriors:
 
         def compute(instance: Any) -> MultiViewPrior:
             views = [context.view(index) for index in group]
-            return validation.run_multiview(provider.spec, instance, views)
+            return run_multiview(provider.spec, instance, views)
 
         inputs = [context.view_inputs(index, provider) for index in group]
         return context.result(provider, MultiViewPrior, inputs, compute, group)

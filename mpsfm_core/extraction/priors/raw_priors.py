@@ -9,7 +9,8 @@ from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.empty_results import JointPrior
-from mpsfm_core.providers import validation
+from mpsfm_core.providers.kinds.depth import run_depth, run_joint
+from mpsfm_core.providers.kinds.normals import run_normals
 
 
 class RawPriors:
@@ -33,15 +34,13 @@ class RawPriors:
         if self.normals is None:
 
             def compute_both(instance: Any) -> JointPrior:
-                return JointPrior(
-                    *validation.run_joint(provider.spec, instance, context.view(index))
-                )
+                return JointPrior(*run_joint(provider.spec, instance, context.view(index)))
 
             both = context.result(provider, JointPrior, ["joint", *inputs], compute_both, [index])
             return both.depth, both.normals
 
         def compute(instance: Any) -> DepthPrior:
-            return validation.run_depth(provider.spec, instance, context.view(index))
+            return run_depth(provider.spec, instance, context.view(index))
 
         return context.result(provider, DepthPrior, inputs, compute, [index]), None
 
@@ -59,7 +58,7 @@ class RawPriors:
             inputs.append(digest(depth))
 
         def compute(instance: Any) -> NormalPrior:
-            return validation.run_normals(provider.spec, instance, context.view(index), depth)
+            return run_normals(provider.spec, instance, context.view(index), depth)
 
         return context.result(provider, NormalPrior, inputs, compute, [index])
 

@@ -22,7 +22,7 @@ from pydantic import BaseModel
 from mpsfm_core import data
 from mpsfm_core.data import UInt8
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.providers import WeightsFile
+from mpsfm_core.providers import PROVIDER_KINDS, WeightsFile
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 _ALIGNMENT = 64
@@ -40,6 +40,7 @@ _TYPES: Mapping[str, type] = MappingProxyType(
             data.DenseMatches,
             data.PairDepth,
             data.PairMatches,
+            *(cls for kind in PROVIDER_KINDS.values() for cls in kind.data_types),
             WeightsFile,
             DepthCalibration,
             NormalCalibration,

@@ -4,26 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict
 
-from mpsfm_core.data import (
-    Bool,
-    DepthPrior,
-    Features,
-    Float32,
-    MultiViewPrior,
-    NormalPrior,
-    PairMatches,
-    View,
-)
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.data.options import Options
-from mpsfm_core.providers import Kind, ProviderContext, ProviderSpec, WeightsFile, hookimpl
+from mpsfm_core.providers import (
+    PROVIDER_KINDS,
+    Kind,
+    ProviderContext,
+    ProviderSpec,
+    WeightsFile,
+    hookimpl,
+)
 from mpsfm_core.providers.environments.environment import Environment
 from mpsfm_core.providers.environments.worker_process import Worker, WorkerLost
+from mpsfm_core.providers.kinds import required_methods
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 _CONSTRUCTION_TIMEOUT_S = 1800.0
@@ -91,9 +90,8 @@ def _options(
 class RemoteProvider:
     """Client that forwards calls to a provider in a worker process.
 
-    The client has the methods of all provider kinds, but only those of the provider's own kind
-    work. If the worker crashes, hangs or runs out of memory, the current call fails and the next
-    call starts another worker.
+    The client has the methods of the provider's kind. If the worker crashes, hangs or runs out of
+    memory, the current call fails and the next call starts another worker.
     """
 
     def __init__(
@@ -105,51 +103,14 @@ class RemoteProvider:
         self._worker: Worker | None = None
         self._running()
 
-    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
-        """Predict depth or normals in the worker process."""
-        given = (view,) if self._location.kind == "depth" else (view, depth)
-        return self._call("predict", *given)
-
-    def predict_joint(self, view: View) -> tuple[DepthPrior, NormalPrior]:
-        """Predict depth and normals in one network pass in the worker process."""
-        depth, normals = self._call("predict_joint", view)
-        return depth, normals
-
-    def estimate_focal(self, view: View) -> float | None:
-        """Estimate the focal length of an image in pixels in the worker process."""
-        focal: float | None = self._call("estimate_focal", view)
-        return focal
-
-    def predict_group(self, views: Sequence[View]) -> MultiViewPrior:
-        """Predict the depth of several images jointly in the worker process."""
-        group: MultiViewPrior = self._call("predict_group", tuple(views))
-        return group
-
-    def extract(self, view: View) -> Features:
-        """Extract local features of an image in the worker process."""
-        features: Features = self._call("extract", view)
-        return features
-
-    def match(
-        self,
-        view_a: View,
-        view_b: View,
-        features_a: Features | None = None,
-        features_b: Features | None = None,
-    ) -> PairMatches:
-        """Match two images in the worker process."""
-        matches: PairMatches = self._call("match", view_a, view_b, features_a, features_b)
-        return matches
-
-    def describe(self, view: View) -> Float32:
-        """Compute the global descriptor of an image in the worker process."""
-        descriptor: Float32 = self._call("describe", view)
-        return descriptor
-
-    def mask(self, view: View) -> Bool:
-        """Compute the mask of an image in the worker process."""
-        mask: Bool = self._call("mask", view)
-        return mask
+    def __getattr__(self, method: str) -> Any:
+        """Return a function that calls a method of the provider in the worker process."""
+        if method.startswith("_"):
+            raise AttributeError(method)
+        kind = PROVIDER_KINDS[self._location.kind]
+        if method not in required_methods(kind.name, frozenset(kind.capabilities)):
+            raise AttributeError(f"the {kind.name} provider has no method {method}()")
+        return partial(self._call, method)
 
     def _call(self, method: str, *arguments: Any) -> Any:
         request = {"do": "call", "method": method, "arguments": list(arguments)}

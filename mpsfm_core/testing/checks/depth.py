@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, NormalPrior
-from mpsfm_core.providers import validation
+from mpsfm_core.providers.kinds.depth import run_focal, run_joint
 from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.accuracy import DEPTH_TOLERANCE, NORMALS_TOLERANCE_DEG, require_small_shift
 from mpsfm_core.testing.checks.maps import (
@@ -259,7 +259,7 @@ def check_depth_joint(case: ContractCase) -> str:
     if not case.declares("joint-normals"):
         raise CheckSkipped("the provider does not declare 'joint-normals'")
     case.prepare(case.example)
-    depth, normals = validation.run_joint(case.spec, case.provider, case.example.view)
+    depth, normals = run_joint(case.spec, case.provider, case.example.view)
     changed = describe_difference(_run(case), depth)
     if changed:
         raise CheckFailed(f"predict_joint and predict return different depth: {changed}")
@@ -279,7 +279,7 @@ def check_depth_focal(case: ContractCase) -> str:
     found = []
     for example in examples:
         case.prepare(example)
-        focal = validation.run_focal(case.spec, case.provider, example.view)
+        focal = run_focal(case.spec, case.provider, example.view)
         if focal is None:
             raise CheckSkipped("the provider estimates no focal length with these options")
         found.append(focal)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mpsfm_core.data import DenseMatches, DepthPrior, Features, Float64, Int64, PinholeCamera, View
-from mpsfm_core.providers import validation
+from mpsfm_core.providers.kinds.matcher import run_matcher
 from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.accuracy import (
     DEPTH_TOLERANCE,
@@ -149,7 +149,7 @@ def check_matcher_no_features(case: ContractCase) -> None:
     some = case.extract_features(a.view, b.view)
     none = _take_first(some[0], 0), _take_first(some[1], 0)
     for given in ((some[0], none[1]), (none[0], some[1]), none):
-        found = validation.run_matcher(case.spec, case.provider, (a.view, b.view), given)
+        found = run_matcher(case.spec, case.provider, (a.view, b.view), given)
         if found.sparse is not None and len(found.sparse):
             raise CheckFailed(
                 f"the matcher returns {len(found.sparse)} matches for a view without features"
@@ -164,7 +164,7 @@ def check_matcher_few_features(case: ContractCase) -> None:
     some = case.extract_features(a.view, b.view)
     for count_a, count_b in ((1, 1), (2, 1), (1, len(some[1]))):
         given = _take_first(some[0], count_a), _take_first(some[1], count_b)
-        validation.run_matcher(case.spec, case.provider, (a.view, b.view), given)
+        run_matcher(case.spec, case.provider, (a.view, b.view), given)
 
 
 def check_matcher_many_features(case: ContractCase) -> str:
@@ -190,7 +190,7 @@ def check_matcher_many_features(case: ContractCase) -> str:
     if not (len(given[0]) and len(given[1])):
         raise CheckSkipped("the detector finds no features to repeat")
     features = given[0], given[1]
-    answer = validation.run_matcher(case.spec, case.provider, views, features)
+    answer = run_matcher(case.spec, case.provider, views, features)
     rows = np.empty((0, 2), np.int64) if answer.sparse is None else answer.sparse.indices
     text = f"{len(rows)} matches of {len(given[0])} and {len(given[1])} features"
     if is_known:
@@ -329,7 +329,7 @@ def _match_rotated(case: ContractCase) -> DenseMatches:
     """Match the example view with a copy that is rotated by 180 degrees."""
     view = case.example.view
     rotated = replace(view, name="rotated.png", image=np.ascontiguousarray(view.image[::-1, ::-1]))
-    answer = validation.run_matcher(case.spec, case.provider, (view, rotated), None)
+    answer = run_matcher(case.spec, case.provider, (view, rotated), None)
     assert answer.dense is not None  # The validator guarantees that the field is present.
     return answer.dense
 
@@ -341,7 +341,7 @@ def _match_with_noise(case: ContractCase, a: Example, b: Example, amplitude: int
     image = np.clip(b.view.image + noise, 0, 255).astype(np.uint8)
     views = a.view, replace(b.view, name=f"noise-{amplitude}.png", image=image)
     features = case.extract_features(*views)
-    answer = validation.run_matcher(case.spec, case.provider, views, features)
+    answer = run_matcher(case.spec, case.provider, views, features)
     return point_matches(answer, features)
 
 

@@ -21,8 +21,8 @@ from mpsfm_core.providers.environments.environment import (
     find_environment,
 )
 from mpsfm_core.providers.environments.worker_process import WorkerLost
+from mpsfm_core.providers.kinds.depth import run_depth
 from mpsfm_core.providers.provider_config import ProviderConfig
-from mpsfm_core.providers.validation import run_depth
 from mpsfm_core.testing.contract import run_checks
 
 

@@ -1,0 +1,423 @@
+"""Contract checks of plugin hooks, which run each hook of a plugin as a reconstruction does."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import pickle
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import closing, redirect_stdout
+from dataclasses import dataclass, field
+from pathlib import Path
+from pkgutil import resolve_name
+from typing import Any
+
+from mpsfm_core.data.decisions import ImageReason
+from mpsfm_core.data.errors import InputError, MpsfmError, did_you_mean
+from mpsfm_core.pipeline.stages import Stages
+from mpsfm_core.providers import PROVIDER_KINDS, ExportFormat, ModelExport
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
+from mpsfm_core.providers.validation import validate_filtered_pairs
+from mpsfm_core.testing.contract import CheckResult, Status
+from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+
+MAX_EVENT_S = 1.0
+"""Time limit in seconds for a hook that receives an event. A reconstruction of 1 000 images reports
+several thousand events, and waits for each hook."""
+MAX_FILTER_S = 10.0
+"""Time limit in seconds to filter 5 000 image pairs."""
+_PAIRS = [
+    ("a.jpg", "b.jpg"),
+    ("a.jpg", "left/a.jpg"),
+    ("left/a.jpg", "right/a.jpg"),
+    ("b.jpg", "right/München 1.JPG"),
+]
+"""Candidate pairs with equal file names in different folders, a space and an upper-case suffix."""
+_KINDS_WITH_CALIBRATION = {
+    "depth": DepthCalibration,
+    "multiview": DepthCalibration,
+    "normals": NormalCalibration,
+}
+
+
+@dataclass
+class HookCase:
+    """Hooks of the plugin under test, the argument of every contract check of hooks."""
+
+    registry: Registry
+    """Registry of all installed providers."""
+    name: str
+    """Name of the plugin's entry point."""
+    hooks: Registry
+    """Registry with the plugin under test only."""
+    executor: str = ""
+    """Value of ``runtime.executor`` that selects the executor of the plugin."""
+    executor_options: Mapping[str, Any] = field(default_factory=dict)
+    """Value of ``runtime.executor_options``."""
+
+    def call(self, hook: str, **arguments: Any) -> Any:
+        """Call a hook of the plugin, which has to print nothing on standard output.
+
+        Raises:
+            CheckSkipped: the plugin does not implement the hook.
+            CheckFailed: the hook raises an exception or prints on standard output.
+        """
+        caller = getattr(self.hooks.hook, hook)
+        if not caller.get_hookimpls():
+            raise CheckSkipped(f"the plugin does not implement {hook}")
+        printed = io.StringIO()
+        try:
+            with redirect_stdout(printed):
+                answer = caller(**arguments)
+        except Exception as error:
+            raise CheckFailed(f"{hook} raises {type(error).__name__}: {error}") from error
+        if printed.getvalue():
+            raise CheckFailed(f"{hook} prints {printed.getvalue()[:60]!r} on standard output")
+        is_list = isinstance(answer, list) and not caller.spec.opts["firstresult"]
+        return (answer[0] if answer else None) if is_list else answer
+
+
+def check_hook_filter_pairs(case: HookCase) -> str:
+    """Require that a pair filter returns a subset of its candidate pairs of image names.
+
+    Images in different folders may have equal file names. The filter receives each pair once, in
+    any order, and 5 000 pairs in the largest call.
+    """
+    before = pickle.dumps(_PAIRS)
+    kept = _filter(case, _PAIRS)
+    if pickle.dumps(_PAIRS) != before:
+        raise CheckFailed("mpsfm_filter_pairs modifies its argument")
+    if kept is None:
+        _filter(case, [])
+        return "the filter returns None, which keeps all pairs"
+    if len({frozenset(pair) for pair in kept}) < len(kept):
+        raise CheckFailed("mpsfm_filter_pairs returns a pair twice")
+    candidates = {frozenset(pair) for pair in _PAIRS}
+    foreign = [pair for pair in kept if frozenset(pair) not in candidates]
+    if foreign:
+        raise CheckFailed(f"mpsfm_filter_pairs returns {foreign[0]!r}, which is no candidate")
+    turned = _filter(case, [(b, a) for a, b in reversed(_PAIRS)])
+    if {frozenset(pair) for pair in turned or ()} != {frozenset(pair) for pair in kept}:
+        raise CheckFailed("mpsfm_filter_pairs depends on the order of pairs or of their images")
+    _filter(case, [])
+    _filter(case, _PAIRS[:1])
+    started = time.perf_counter()
+    _filter(case, [(f"{number}.jpg", f"{number + 1}.jpg") for number in range(5000)])
+    seconds = time.perf_counter() - started
+    if seconds > MAX_FILTER_S:
+        raise CheckFailed(f"mpsfm_filter_pairs takes {seconds:.0f} s for 5 000 pairs")
+    return f"keeps {len(kept)} of {len(_PAIRS)} pairs; {seconds:.2f} s for 5 000 pairs"
+
+
+def check_hook_events(case: HookCase) -> str:
+    """Require that the event hooks accept all events of a small reconstruction.
+
+    The reconstruction has four images, of which one is rejected. Each call of an event hook has to
+    take less than 1 s, because the reconstruction waits for the hook.
+    """
+    hooks = _CountedHooks(case)
+    if not any(name in EVENT_HOOKS for name in hooks.names):
+        raise CheckSkipped("the plugin implements no event hook")
+    run_small_reconstruction(Stages(hooks))
+    if hooks.slowest[1] > MAX_EVENT_S:
+        raise CheckFailed(f"{hooks.slowest[0]} takes {hooks.slowest[1]:.1f} s for one event")
+    return ", ".join(f"{count} {name}" for name, count in sorted(hooks.calls.items()))
+
+
+def check_hook_viewers(case: HookCase) -> str:
+    """Require that each viewer shows the scenes of a small reconstruction and an empty scene."""
+    viewers = case.call("mpsfm_viewers")
+    if not isinstance(viewers, Mapping) or not viewers:
+        raise CheckFailed(f"mpsfm_viewers returns {viewers!r}, not viewer classes by name")
+    texts = []
+    for name, reference in viewers.items():
+        with tempfile.TemporaryDirectory(prefix="mpsfm-viewer-") as folder:
+            try:
+                viewer = resolve_name(reference)(Path(folder), lambda _: None)
+                registry = Registry()
+                if _has_hooks(viewer):
+                    registry.register(viewer, name=name)
+                viewed = HookCase(case.registry, name, registry)
+                scenes = run_small_reconstruction(Stages(_CountedHooks(viewed)))
+                for scene in scenes:
+                    viewer.show(scene)
+                text = viewer.finish()
+            except CheckFailed:
+                raise
+            except Exception as error:
+                what = f"{type(error).__name__}: {error}"
+                raise CheckFailed(f"viewer {name!r} ({reference}) raises {what}") from error
+        if not isinstance(text, str):
+            raise CheckFailed(f"finish() of viewer {name!r} returns no text, but {text!r}")
+        texts.append(f"{name} shows {len(scenes)} scenes")
+    return ", ".join(texts)
+
+
+def check_hook_executor(case: HookCase) -> str:
+    """Require that an executor runs each work item once in other processes and raises errors.
+
+    The hook has to return None for the name of another executor. The name of the executor is the
+    name of the plugin without ``mpsfm-``, or ``executor`` in the arguments of
+    :func:`run_hook_checks`.
+    """
+    from mpsfm_core.testing import executor_contract
+
+    if case.call("mpsfm_executor", name="another-executor", options={}) is not None:
+        raise CheckFailed("mpsfm_executor returns an executor for the name 'another-executor'")
+    name = case.executor or case.name.removeprefix("mpsfm-")
+    executor = case.call("mpsfm_executor", name=name, options=dict(case.executor_options))
+    if executor is None:
+        raise CheckFailed(f"cannot tell: mpsfm_executor returns None for the name {name!r}")
+    with closing(executor), tempfile.TemporaryDirectory(prefix="mpsfm-executor-") as folder:
+        try:
+            executor_contract.check_items(executor, Path(folder) / "items")
+            executor_contract.check_errors(executor)
+        except AssertionError as error:
+            raise CheckFailed(f"executor {name!r}: {error or 'a work item is lost'}") from error
+    return f"executor {name!r} runs 40 items in other processes"
+
+
+def check_hook_calibration(case: HookCase) -> str:
+    """Require None or an uncertainty model of the kind for each provider of the plugin.
+
+    The hook has to return None for the providers of other plugins.
+    """
+    for kind in _KINDS_WITH_CALIBRATION:
+        options = {"kind": kind, "provider": "provider-of-another-plugin", "options": None}
+        if case.call("mpsfm_calibration", **options) is not None:
+            raise CheckFailed(f"mpsfm_calibration returns a model for a foreign {kind} provider")
+    models = 0
+    for status in case.hooks.status():
+        if status.kind not in PROVIDER_KINDS or not status.available:
+            continue
+        defaults = case.hooks.default_options(status.kind, status.name)
+        try:
+            values = {key: value for key, value in defaults.items() if value is not None}
+            options = case.hooks.validate_options(status.kind, status.name, values)
+        except MpsfmError:  # A required option has no default.
+            continue
+        model = case.call(
+            "mpsfm_calibration", kind=status.kind, provider=status.name, options=options
+        )
+        expected = _KINDS_WITH_CALIBRATION.get(status.kind, (DepthCalibration, NormalCalibration))
+        if model is not None and not isinstance(model, expected):
+            raise CheckFailed(
+                f"mpsfm_calibration returns a {type(model).__name__} for the {status.kind} "
+                f"provider {status.name!r}"
+            )
+        models += model is not None
+    return f"{models} uncertainty models"
+
+
+def check_hook_exports(case: HookCase) -> str:
+    """Require that each recipe for an ONNX export names an existing module of the plugin."""
+    exports = case.call("mpsfm_exports")
+    if not isinstance(exports, Mapping):
+        raise CheckFailed(f"mpsfm_exports returns {exports!r}, not recipes by name")
+    for name, recipe in exports.items():
+        if not isinstance(recipe, ModelExport):
+            raise CheckFailed(f"mpsfm_exports: {name!r} is a {type(recipe).__name__}")
+        if importlib.util.find_spec(recipe.script) is None:
+            raise CheckFailed(f"mpsfm_exports: {name!r} names no module {recipe.script!r}")
+    return f"{len(exports)} exports"
+
+
+def check_hook_export_formats(case: HookCase) -> str:
+    """Require that each export format names an existing function and the files that it writes."""
+    formats = case.call("mpsfm_export_formats")
+    if not isinstance(formats, Sequence) or isinstance(formats, str):
+        raise CheckFailed(f"mpsfm_export_formats returns {formats!r}, not a list of formats")
+    for entry in formats:
+        if not isinstance(entry, ExportFormat):
+            raise CheckFailed(f"mpsfm_export_formats lists a {type(entry).__name__}")
+        try:
+            write = resolve_name(entry.write) if isinstance(entry.write, str) else entry.write
+        except (ImportError, AttributeError) as error:
+            raise CheckFailed(f"export format {entry.name!r}: {error}") from error
+        if not callable(write) or not entry.entries:
+            raise CheckFailed(f"export format {entry.name!r} writes no file")
+    return ", ".join(entry.name for entry in formats)
+
+
+HOOK_CHECKS: tuple[Callable[[HookCase], str], ...] = (
+    check_hook_filter_pairs,
+    check_hook_events,
+    check_hook_viewers,
+    check_hook_executor,
+    check_hook_calibration,
+    check_hook_exports,
+    check_hook_export_formats,
+)
+"""Contract checks of plugin hooks, in the order to run them."""
+
+
+def hook_check_id(check: Callable[[HookCase], str]) -> str:
+    """Return the id of a contract check of hooks, such as ``hook-events``."""
+    return check.__name__.removeprefix("check_").replace("_", "-")
+
+
+EVENT_HOOKS = (
+    "mpsfm_notice",
+    "mpsfm_stage_started",
+    "mpsfm_stage_progress",
+    "mpsfm_stage_finished",
+    "mpsfm_image_registered",
+    "mpsfm_image_rejected",
+    "mpsfm_scene_changed",
+)
+"""Hooks that receive the events of a reconstruction."""
+
+
+def run_hook_checks(
+    registry: Registry,
+    name: str,
+    *,
+    only: Collection[str] | None = None,
+    executor: str = "",
+    executor_options: Mapping[str, Any] | None = None,
+    on_result: Callable[[CheckResult], None] | None = None,
+) -> list[CheckResult]:
+    """Run the contract checks of the hooks that a plugin implements.
+
+    Args:
+        registry: Registry with the plugin.
+        name: Name of the plugin's entry point or distribution.
+        only: Ids of the contract checks to run, or None to run all.
+        executor: Name of the plugin's executor, by default the name of the plugin.
+        executor_options: Options of the executor.
+        on_result: Function that is called with the result of each check.
+
+    Returns:
+        Results of the checks whose hooks the plugin implements.
+
+    Raises:
+        InputError: no plugin with hooks has the name.
+    """
+    results = []
+    for plugin, module in find_hook_modules(registry, name).items():
+        hooks = Registry()
+        hooks.register(module, name=plugin)
+        case = HookCase(registry, plugin, hooks, executor, executor_options or {})
+        for check in HOOK_CHECKS:
+            id = hook_check_id(check)
+            if only is not None and id not in only:
+                continue
+            started = time.perf_counter()
+            status: Status = "pass"
+            try:
+                message = check(case)
+            except CheckSkipped:
+                continue
+            except (CheckFailed, MpsfmError) as error:
+                status, message = "fail", str(error)
+            seconds = time.perf_counter() - started
+            results.append(CheckResult(f"plugin/{plugin}", "", id, status, message, seconds))
+            if on_result:
+                on_result(results[-1])
+    return results
+
+
+def find_hook_modules(registry: Registry, name: str) -> dict[str, object]:
+    """Find the modules of the plugins that an entry point or distribution name denotes.
+
+    Returns:
+        Module of each plugin with hooks, apart from ``mpsfm_providers``, by entry-point name.
+
+    Raises:
+        InputError: no plugin with hooks has the name.
+    """
+    modules = registry.hook_modules()
+    found = {
+        plugin: module
+        for (distribution, plugin), module in modules.items()
+        if name in (distribution, plugin) and _has_hooks(module)
+    }
+    if not found:
+        known = {part for key in modules for part in key}
+        raise InputError(f"no plugin with hooks {name!r}{did_you_mean(name, known)}")
+    return found
+
+
+def has_hooks(registry: Registry, name: str) -> bool:
+    """Return whether an entry point or distribution has a plugin with hooks."""
+    modules = registry.hook_modules().items()
+    return any(name in key and _has_hooks(module) for key, module in modules)
+
+
+def run_small_reconstruction(stages: Stages) -> list[Any]:
+    """Reconstruct four synthetic images, and report the events of a run.
+
+    Args:
+        stages: Receiver of the events.
+
+    Returns:
+        An empty scene, and the scene after each change.
+    """
+    from mpsfm_core.data import PinholeCamera, SceneState
+    from mpsfm_core.mapping import mapper
+    from mpsfm_core.mapping.options import MapperOptions
+    from mpsfm_core.testing.synthetic.problems import make_mapping_problem
+    from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+
+    camera = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
+    problem = make_mapping_problem(
+        room_scene(), camera, arc_poses(3, 10.0), points_per_view=80, map_width=40
+    )
+    scenes = [SceneState((), problem.images[0].keypoints[:0, [0, 0, 0]])]
+    changed = stages.scene_changed
+
+    def record(scene: Callable[[], SceneState]) -> None:
+        scenes.append(scene())
+        changed(scene)
+
+    stages.scene_changed = record  # type: ignore[method-assign]
+    stages.notice("reconstruction of a small synthetic scene")
+    changed(lambda: scenes[0])
+    with stages.stage("mapping"), stages.step("mapping", None):
+        mapper.reconstruct(problem, MapperOptions(), stages)
+        stages.stage_progress("mapping", 3, 4)
+        stages.image_rejected("right/München 1.JPG", ImageReason.NO_VERIFIED_MATCHES.because())
+    return scenes
+
+
+class _CountedHooks(Registry):
+    """Registry of one plugin, which raises exceptions of hooks and measures their time."""
+
+    def __init__(self, case: HookCase) -> None:
+        super().__init__()
+        self._case = case
+        self.calls: Counter[str] = Counter()
+        self.slowest = ("", 0.0)
+        relay = case.hooks.hook
+        self.names = {name for name in EVENT_HOOKS if getattr(relay, name).get_hookimpls()}
+
+    def call_hook(self, name: str, /, **arguments: Any) -> list[Any]:
+        """Call a hook of the plugin under test."""
+        if name not in self.names:
+            return []
+        started = time.perf_counter()
+        answer = self._case.call(name, **arguments)
+        seconds = time.perf_counter() - started
+        self.calls[name] += 1
+        self.slowest = max(self.slowest, (name, seconds), key=lambda entry: entry[1])
+        return [answer]
+
+
+def _filter(case: HookCase, pairs: list[tuple[str, str]]) -> list[tuple[str, str]] | None:
+    answer = case.call("mpsfm_filter_pairs", pairs=pairs)
+    try:
+        return None if answer is None else validate_filtered_pairs(answer, pairs)
+    except (TypeError, ValueError) as error:
+        raise CheckFailed(f"mpsfm_filter_pairs: {error}") from error
+
+
+def _has_hooks(module: object) -> bool:
+    """Return whether a plugin module or viewer implements a hook other than mpsfm_providers."""
+    names = (name for name in dir(module) if name.startswith("mpsfm_"))
+    return any(
+        name != "mpsfm_providers" and hasattr(getattr(module, name), "mpsfm_impl") for name in names
+    )
