@@ -14,10 +14,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import click
 import typer
 
-from mpsfm_core.data.errors import ProviderError
+from mpsfm_core.data.errors import ProviderError, did_you_mean
 from mpsfm_core.providers import KINDS
 from mpsfm_core.providers.discovery import subprocess_environment
 
@@ -118,6 +117,14 @@ def check(
         raise typer.Exit(1)
 
 
+def _parse_kind(text: str) -> str:
+    """Return the name of a provider kind, or ``hook``, after checking it."""
+    known = (*KINDS, "hook")
+    if text not in known:
+        raise typer.BadParameter(f"no kind {text!r}{did_you_mean(text, known)}")
+    return text
+
+
 @app.command()
 def new(
     name: Annotated[
@@ -126,8 +133,9 @@ def new(
     kind: Annotated[
         str,
         typer.Option(
-            help="Kind of the provider, or hook for a plugin with hooks.",
-            click_type=click.Choice([*KINDS, "hook"]),
+            help=f"Kind of the provider: {', '.join(KINDS)}; or hook, for a plugin with hooks.",
+            parser=_parse_kind,
+            metavar="KIND",
         ),
     ],
     output: Annotated[

@@ -1,4 +1,4 @@
-"""Checks of the keypoints of all images of a run for errors of the features provider."""
+"""Checks of a whole run for errors of the features provider and the matcher."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from mpsfm_core.data import Bool, Float32
 from mpsfm_core.data.mapping_problem import MappingImage
 
 _MIN_IMAGES = 3
@@ -15,6 +16,11 @@ _MAX_EXTENT = 0.8
 _MAX_MARGIN = 0.1
 """Maximum left and upper margin of the keypoints, relative to image size, that causes a warning.
 An object in the image center has a larger margin, and therefore causes no warning."""
+_MIN_PAIRS = 3
+_MIN_MATCHES = 30
+"""Minimum number of inliers and of outliers of a pair whose scores are compared."""
+_CHANCE_AUC = 0.5
+"""Probability that an inlier has a higher score than an outlier if scores mean nothing."""
 
 
 def find_partial_coverage(images: Sequence[MappingImage], provider: str) -> str:
@@ -45,3 +51,39 @@ def find_partial_coverage(images: Sequence[MappingImage], provider: str) -> str:
         f"{last[0]:.0%} x {last[1]:.0%} of all {len(extents)} images: keypoints may be in pixels "
         f"of a reduced image; test the provider with 'mpsfm plugins check {provider}'"
     )
+
+
+def find_meaningless_scores(pairs: Sequence[tuple[Float32, Bool]], provider: str) -> str:
+    """Describe scores of matches that are not higher for inliers than for outliers.
+
+    Best scores select matches of a keypoint and points of dense matches, so inverted scores select
+    outliers. The criterion is the median over pairs of the area under the ROC curve. Equal scores
+    of all matches cause no warning.
+
+    Args:
+        pairs: Scores (m,) float32 of the matches of each verified pair, and mask (m,) bool of the
+            inliers.
+        provider: Name of the matcher, for the text.
+
+    Returns:
+        Warning for the user, or an empty text.
+    """
+    areas = [
+        _roc_area(scores[inlier], scores[~inlier])
+        for scores, inlier in pairs
+        if min(inlier.sum(), (~inlier).sum()) >= _MIN_MATCHES and np.ptp(scores) > 0
+    ]
+    if len(areas) < _MIN_PAIRS or np.median(areas) > _CHANCE_AUC:
+        return ""
+    return (
+        f"the scores of the matcher {provider!r} are not higher for inliers than for outliers in "
+        f"{len(areas)} image pairs: scores may be inverted or random; test the matcher with "
+        f"'mpsfm plugins check {provider}'"
+    )
+
+
+def _roc_area(inliers: Float32, outliers: Float32) -> float:
+    """Return the probability that an inlier has a higher score than an outlier."""
+    ordered = np.sort(outliers)
+    lower = np.searchsorted(ordered, inliers, "left") + np.searchsorted(ordered, inliers, "right")
+    return float(lower.mean() / 2 / len(ordered))

@@ -37,6 +37,7 @@ from mpsfm_core.extraction.matching.pair_matching import (
     assemble_matches,
     merge_matches,
 )
+from mpsfm_core.extraction.output_checks import find_meaningless_scores, find_partial_coverage
 from mpsfm_core.extraction.pairs.duplicates import find_duplicates, restrict_matches
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.extraction.pairs.selection import PairSelection
@@ -59,6 +60,8 @@ class Extraction:
     """Input of the mapper, with the images in the order of the image set."""
     report: ExtractionReport
     """Outcomes of image pairs, statistics of images and usage of providers for ``summary.json``."""
+    warnings: tuple[str, ...] = ()
+    """Warnings about providers whose output is wrong for all images or pairs."""
 
 
 def extract(
@@ -168,7 +171,28 @@ def _extract(context: ExtractionContext, imported: ImportedMatches | None) -> Ex
         graph = verify_imported(context, imported)
     priors = predict_priors(context, graph)
     problem = assemble_problem(context.images, graph, priors)
-    return Extraction(problem, describe(context, problem, graph))
+    warnings = () if imported is not None else _find_wrong_providers(context.config, graph, problem)
+    return Extraction(problem, describe(context, problem, graph), warnings)
+
+
+def _find_wrong_providers(
+    config: Config, graph: MatchGraph, problem: MappingProblem
+) -> tuple[str, ...]:
+    """Return warnings about a features provider or matcher that is wrong for all images."""
+    warnings = []
+    if config.features is not None:
+        warnings.append(find_partial_coverage(problem.images, config.features.use))
+    pairs = []
+    for matches, geometry in zip(graph.candidates, graph.geometries, strict=True):
+        if not geometry.dropped:
+            scores = np.concatenate([matches.sparse.scores, matches.points.scores])
+            inlier = np.zeros(len(scores), np.bool_)
+            inlier[geometry.inliers] = True
+            pairs.append((scores, inlier))
+    matcher = config.matcher or config.dense_matcher
+    if matcher is not None:
+        warnings.append(find_meaningless_scores(pairs, matcher.use))
+    return tuple(warning for warning in warnings if warning)
 
 
 def feature_table(context: ExtractionContext) -> FeatureTable | None:

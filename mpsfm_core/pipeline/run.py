@@ -23,7 +23,6 @@ from mpsfm_core.data.result_layout import IMAGES, SUMMARY
 from mpsfm_core.dense.densify import densify
 from mpsfm_core.extraction.active_provider import thread_count, worker_count
 from mpsfm_core.extraction.cache import cache_folder
-from mpsfm_core.extraction.output_checks import find_partial_coverage
 from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
 from mpsfm_core.extraction.runner import Extraction, extend_matches, extract
 from mpsfm_core.inputs.image_search import check_output_folder, find_images
@@ -370,15 +369,9 @@ class _Run:
             images = estimate_focal_lengths(images, self._config, self._registry, self._stages)
             config = self._config.fast_pass_config() or self._config
             extraction = extract(images, config, self._registry, self._stages, self._imported)
-            self._warn_of_partial_coverage(extraction, config)
-        return images, extraction
-
-    def _warn_of_partial_coverage(self, extraction: Extraction, config: Config) -> None:
-        """Warn if the keypoints of all images cover only the upper left part."""
-        if config.features is not None:
-            warning = find_partial_coverage(extraction.problem.images, config.features.use)
-            if warning:
+            for warning in extraction.warnings:
                 self._stages.warn(warning)
+        return images, extraction
 
     def _start_compilation(self) -> None:
         """Compile the numba kernels in parallel to extraction, if a core is free."""

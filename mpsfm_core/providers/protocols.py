@@ -1,4 +1,4 @@
-"""Specification of a provider and hooks of a plugin, the interface between MP-SfM and plugins.
+"""Interface between MP-SfM and plugins: specifications of providers, and hooks.
 
 The protocol of each provider kind is in :mod:`mpsfm_core.providers.kinds`.
 

@@ -1,4 +1,4 @@
-"""Rules that the values of providers have to satisfy, and errors that name provider and image.
+"""Rules for the values of providers, and errors that name provider and image.
 
 Each module of :mod:`mpsfm_core.providers.kinds` has functions ``run_*``, which call a provider and
 validate its return value. Any exception of a provider becomes an

@@ -345,17 +345,17 @@ def parse_check_ids(ids: Collection[str]) -> set[str]:
     Raises:
         InputError: an id is not the id of a contract check.
     """
-    from mpsfm_core.testing.hook_checks import HOOK_CHECKS, hook_check_id
+    from mpsfm_core.testing.hook_checks import HOOK_CHECKS
 
     known = [check_id(check) for check in list_checks()]
-    known += [hook_check_id(check) for check in HOOK_CHECKS]
+    known += [check_id(check) for check in HOOK_CHECKS]
     for name in ids:
         if name not in known:
             raise InputError(f"no check {name!r}{did_you_mean(name, known)}")
     return set(ids)
 
 
-def check_id(check: Check) -> str:
+def check_id(check: Callable[..., str | None]) -> str:
     """Return the id of a contract check, such as ``depth-is-z`` for ``check_depth_is_z``."""
     return check.__name__.removeprefix("check_").replace("_", "-")
 

@@ -22,7 +22,7 @@ from mpsfm_core.providers import PROVIDER_KINDS, ExportFormat, ModelExport
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from mpsfm_core.providers.validation import validate_filtered_pairs
-from mpsfm_core.testing.contract import CheckResult, Status
+from mpsfm_core.testing.contract import CheckResult, Status, check_id
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 MAX_EVENT_S = 1.0
@@ -120,7 +120,7 @@ def check_hook_events(case: HookCase) -> str:
     take less than 1 s, because the reconstruction waits for the hook.
     """
     hooks = _CountedHooks(case)
-    if not any(name in EVENT_HOOKS for name in hooks.names):
+    if not hooks.event_hooks:
         raise CheckSkipped("the plugin implements no event hook")
     run_small_reconstruction(Stages(hooks))
     if hooks.slowest[1] > MAX_EVENT_S:
@@ -187,8 +187,8 @@ def check_hook_calibration(case: HookCase) -> str:
     The hook has to return None for the providers of other plugins.
     """
     for kind in _KINDS_WITH_CALIBRATION:
-        options = {"kind": kind, "provider": "provider-of-another-plugin", "options": None}
-        if case.call("mpsfm_calibration", **options) is not None:
+        foreign = {"kind": kind, "provider": "provider-of-another-plugin", "options": None}
+        if case.call("mpsfm_calibration", **foreign) is not None:
             raise CheckFailed(f"mpsfm_calibration returns a model for a foreign {kind} provider")
     models = 0
     for status in case.hooks.status():
@@ -254,12 +254,6 @@ HOOK_CHECKS: tuple[Callable[[HookCase], str], ...] = (
 )
 """Contract checks of plugin hooks, in the order to run them."""
 
-
-def hook_check_id(check: Callable[[HookCase], str]) -> str:
-    """Return the id of a contract check of hooks, such as ``hook-events``."""
-    return check.__name__.removeprefix("check_").replace("_", "-")
-
-
 EVENT_HOOKS = (
     "mpsfm_notice",
     "mpsfm_stage_started",
@@ -303,7 +297,7 @@ def run_hook_checks(
         hooks.register(module, name=plugin)
         case = HookCase(registry, plugin, hooks, executor, executor_options or {})
         for check in HOOK_CHECKS:
-            id = hook_check_id(check)
+            id = check_id(check)
             if only is not None and id not in only:
                 continue
             started = time.perf_counter()
@@ -393,11 +387,11 @@ class _CountedHooks(Registry):
         self.calls: Counter[str] = Counter()
         self.slowest = ("", 0.0)
         relay = case.hooks.hook
-        self.names = {name for name in EVENT_HOOKS if getattr(relay, name).get_hookimpls()}
+        self.event_hooks = {name for name in EVENT_HOOKS if getattr(relay, name).get_hookimpls()}
 
     def call_hook(self, name: str, /, **arguments: Any) -> list[Any]:
         """Call a hook of the plugin under test."""
-        if name not in self.names:
+        if name not in self.event_hooks:
             return []
         started = time.perf_counter()
         answer = self._case.call(name, **arguments)

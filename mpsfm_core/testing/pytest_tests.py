@@ -11,6 +11,7 @@ from mpsfm_core.testing.contract import (
     CheckTask,
     Contract,
     SetupSource,
+    check_id,
     schedule_checks,
 )
 
@@ -66,9 +67,9 @@ def hook_tests(name: str, *, registry: Registry | None = None) -> Callable[..., 
     """
     import pytest
 
-    from mpsfm_core.testing.hook_checks import HOOK_CHECKS, hook_check_id, run_hook_checks
+    from mpsfm_core.testing.hook_checks import HOOK_CHECKS, run_hook_checks
 
-    @pytest.mark.parametrize("id", [hook_check_id(check) for check in HOOK_CHECKS])
+    @pytest.mark.parametrize("id", [check_id(check) for check in HOOK_CHECKS])
     def test_hooks(id: str) -> None:
         results = run_hook_checks(registry or Registry.discover(), name, only={id})
         if not results:

@@ -41,7 +41,7 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> list[Path]:
     if target.exists():
         raise InputError(f"{target} exists already")
     description = PROVIDER_KINDS.get(kind)
-    packages = ("mpsfm-core>=0.1",)
+    packages: tuple[str, ...] = ("mpsfm-core>=0.1",)
     if description is not None:
         packages += ("numpy>=1.26", *description.template_requirements)
     placeholders = {
@@ -57,9 +57,9 @@ def write_plugin(name: str, kind: Kind, folder: Path) -> list[Path]:
     row = f"| `{module}/contract.py` | how the contract is checked without weights |\n"
     placeholders["contract_row"] = row if "contract.py" in templates else ""
     sources = {}
-    for path in _COMMON_FILES:
-        common = (_TEMPLATES / "common" / path).read_text(encoding="utf-8")
-        sources[target / path] = templates.pop(Path(path).name, common)
+    for file_name in _COMMON_FILES:
+        common = (_TEMPLATES / "common" / file_name).read_text(encoding="utf-8")
+        sources[target / file_name] = templates.pop(Path(file_name).name, common)
     sources |= {target / module / name: text for name, text in templates.items()}
     texts = {path: Template(text).substitute(placeholders) for path, text in sources.items()}
     texts[target / module / "__init__.py"] = ""

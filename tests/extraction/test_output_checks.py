@@ -7,7 +7,7 @@ import pytest
 
 from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera
 from mpsfm_core.data.mapping_problem import MappingImage
-from mpsfm_core.extraction.output_checks import find_partial_coverage
+from mpsfm_core.extraction.output_checks import find_meaningless_scores, find_partial_coverage
 
 CAMERA = PinholeCamera(2000, 1500, 1600.0, 1600.0, 1000.0, 750.0)
 
@@ -47,3 +47,33 @@ def test_find_partial_coverage_of_usual_images_is_silent(
     low: tuple[float, float], high: tuple[float, float], count: int
 ) -> None:
     assert find_partial_coverage(images_with_keypoints(low, high, count), "sift") == ""
+
+
+def scored_pairs(shift: float, count: int = 4) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Return scores of 80 inliers and 40 outliers, where inliers have scores higher by a shift."""
+    rng = np.random.default_rng(0)
+    inlier = np.arange(120) < 80
+    return [
+        (rng.uniform(0.2, 0.8, 120).astype(np.float32) + np.float32(shift) * inlier, inlier)
+        for _ in range(count)
+    ]
+
+
+def test_find_meaningless_scores_of_inverted_scores_names_matcher() -> None:
+    warning = find_meaningless_scores(scored_pairs(-0.2), "my-matcher")
+    assert "the scores of the matcher 'my-matcher' are not higher for inliers" in warning
+    assert "in 4 image pairs" in warning and "mpsfm plugins check my-matcher" in warning
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        scored_pairs(0.1),
+        scored_pairs(-0.2, count=2),
+        [(np.ones_like(scores), inlier) for scores, inlier in scored_pairs(0.0)],
+        [(scores[:100], inlier[:100]) for scores, inlier in scored_pairs(-0.2)],
+    ],
+    ids=["good", "two pairs", "constant", "few outliers"],
+)
+def test_find_meaningless_scores_of_usual_scores_is_silent(pairs: list) -> None:
+    assert find_meaningless_scores(pairs, "nearest") == ""

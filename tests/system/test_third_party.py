@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 
 from mpsfm_core.testing.contract import check_id, list_checks
+from mpsfm_core.testing.hook_checks import HOOK_CHECKS
 
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLE = ROOT / "examples" / "third-party-depth"
@@ -35,10 +36,11 @@ def test_tutorial_contains_files_of_example() -> None:
 def test_every_contract_check_is_documented() -> None:
     document = (ROOT / "docs" / "contract.md").read_text(encoding="utf-8")
     shown = dict(re.findall(r"^\| `([a-z-]+)` \| (.*) \|$", document, re.MULTILINE))
-    for check in list_checks():
+    checks = [*list_checks(), *HOOK_CHECKS]
+    for check in checks:
         text = " ".join((inspect.getdoc(check) or "").replace("``", "`").split())
         assert shown[check_id(check)] == text, f"docs/contract.md: | `{check_id(check)}` | {text} |"
-    assert f"by {len(list_checks())} small functions" in document
+    assert f"by {len(checks)} small functions" in document
 
 
 @pytest.fixture(scope="module")

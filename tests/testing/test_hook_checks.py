@@ -66,8 +66,8 @@ def test_hooks_of_template_pass(template: Registry) -> None:
         (lambda pairs: list(pairs) if pairs[0] else [], "raises IndexError"),
         (lambda pairs: [*pairs, *pairs], "returns a pair twice"),
         (lambda pairs: pairs.sort(reverse=True), "modifies its argument"),
-        (lambda pairs: print("filtered") or pairs, "prints 'filtered"),
-        (lambda pairs: {a: b for a, b in pairs}, "must return pairs of image names, got 'a.jpg'"),
+        (lambda pairs: sys.stdout.write("filtered") and pairs, "prints 'filtered"),
+        (lambda pairs: dict(pairs), "must return pairs of image names, got 'left/a.jpg'"),
     ],
 )
 def test_check_names_fault_of_pair_filter(filter_pairs: Any, message: str) -> None:
@@ -106,7 +106,7 @@ def no_mapper(monkeypatch: pytest.MonkeyPatch) -> None:
         ({"mpsfm_image_rejected": rejected}, "mpsfm_image_rejected raises UnicodeEncodeError"),
         ({"mpsfm_scene_changed": changed}, "mpsfm_scene_changed raises IndexError"),
         (
-            {"mpsfm_notice": lambda text: print(text)},
+            {"mpsfm_notice": lambda text: sys.stdout.write(text)},
             "mpsfm_notice prints 'reconstruction of a small synthetic scene",
         ),
     ],
