@@ -82,12 +82,12 @@ def check(
         parse_setup,
         run_checks,
     )
-    from mpsfm_core.testing.hook_checks import has_hooks, run_hook_checks
+    from mpsfm_core.testing.hook_checks import HOOK_CHECKS, has_hooks, run_hook_checks
 
     registry = Registry.discover(probe=True)
     plugin = find_plugin(registry, name)
     has_providers = plugin is None or not plugin.available
-    check_ids = None if only is None else parse_check_ids(only)
+    check_ids = None if only is None else parse_check_ids(only, HOOK_CHECKS)
     results: list[CheckResult] = []
     for kind, provider in find_providers(registry, name) if has_providers else ():
         results += run_checks(

@@ -339,16 +339,20 @@ def find_check(id: str) -> Check:
     return next(check for check in list_checks() if check_id(check) == id)
 
 
-def parse_check_ids(ids: Collection[str]) -> set[str]:
+def parse_check_ids(
+    ids: Collection[str], hook_checks: Sequence[Callable[..., str | None]] = ()
+) -> set[str]:
     """Return check ids as a set after verifying that each one is the id of a contract check.
+
+    Args:
+        ids: Ids of contract checks.
+        hook_checks: Contract checks of hooks, whose ids are also allowed.
 
     Raises:
         InputError: an id is not the id of a contract check.
     """
-    from mpsfm_core.testing.hook_checks import HOOK_CHECKS
-
     known = [check_id(check) for check in list_checks()]
-    known += [check_id(check) for check in HOOK_CHECKS]
+    known += [check_id(check) for check in hook_checks]
     for name in ids:
         if name not in known:
             raise InputError(f"no check {name!r}{did_you_mean(name, known)}")
