@@ -183,13 +183,15 @@ def change_version(path: Path, version: int | None) -> None:
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_of_an_earlier_version_is_read(name: str, golden: Path) -> None:
+def test_file_of_earlier_version_is_read(name: str, golden: Path) -> None:
     found = FILES[name].read(golden)
     assert found == EXPECTED.get(name, found)
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_without_a_version_is_of_the_first(name: str, golden: Path, tmp_path: Path) -> None:
+def test_file_without_version_is_read_as_version_one(
+    name: str, golden: Path, tmp_path: Path
+) -> None:
     older = Path(shutil.copytree(golden, tmp_path / "older"))
     path = older / FILES[name].path
     change_version(path, None)
@@ -199,7 +201,7 @@ def test_a_file_without_a_version_is_of_the_first(name: str, golden: Path, tmp_p
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_file_of_a_later_version_is_refused_or_made_anew(name: str, golden: Path) -> None:
+def test_file_of_later_version_is_refused_or_replaced(name: str, golden: Path) -> None:
     change_version(golden / FILES[name].path, 999)
     if FILES[name].anew is not None:
         assert FILES[name].read(golden) == FILES[name].anew
@@ -210,7 +212,7 @@ def test_a_file_of_a_later_version_is_refused_or_made_anew(name: str, golden: Pa
     assert Path(FILES[name].path).name in str(caught.value)
 
 
-def test_the_configuration_comes_back_as_it_was_written(golden: Path) -> None:
+def test_configuration_of_golden_file_is_unchanged(golden: Path) -> None:
     said = yaml.safe_load((golden / "config.yaml").read_text())
     assert said.pop(VERSION) == 1
     said.pop("description")
@@ -223,14 +225,14 @@ CLASSES = {
 }
 
 
-def test_entries_of_the_cache_are_read_as_they_were_written(golden: Path) -> None:
+def test_cache_entries_of_golden_files_are_unchanged(golden: Path) -> None:
     """If this test fails, increase :data:`mpsfm_core.extraction.cache.FORMAT`."""
     written = json.loads((golden / "digests.json").read_text())
     cache = Cache(golden / "cache")
     assert {kind: digest(cache.load(kind, KEY, cls)) for kind, cls in CLASSES.items()} == written
 
 
-def test_a_checkpoint_is_read_as_it_was_written(golden: Path) -> None:
+def test_checkpoint_of_golden_file_is_unchanged(golden: Path) -> None:
     header, frozen = read_checkpoint(golden / "cache" / "mapping" / "checkpoint.npz")
     assert header["version"] in VERSIONS and header["registered"] == 2
     state = unflatten_state(frozen)
@@ -238,7 +240,7 @@ def test_a_checkpoint_is_read_as_it_was_written(golden: Path) -> None:
     assert state["poses"][0]["support"] == 0.5 and state["seen"] == {"a": [1, 2], "b": None}
 
 
-def test_files_of_this_version_are_kept() -> None:
+def test_golden_files_of_current_version_exist() -> None:
     assert core_version() in VERSIONS, "python -m tests.golden.make writes them"
 
 
@@ -264,14 +266,16 @@ def test_the_documentation_lists_every_format() -> None:
 
 
 @pytest.mark.parametrize("version", [0, -3, "two", None, [1], float("nan"), float("inf")])
-def test_what_is_no_version_is_refused(version: object) -> None:
+def test_check_version_of_invalid_version_raises(version: object) -> None:
     with pytest.raises(InputError, match=r"x\.json: its format_version is .*, not a number"):
         check_version({VERSION: version}, 1, Path("x.json"))
 
 
 @pytest.mark.parametrize("name", ["../old.txt", "/etc/passwd", "..", "", "a/b", 1])
 @pytest.mark.parametrize("key", ["entries", "new"])
-def test_an_exchange_touches_nothing_outside(key: str, name: object, tmp_path: Path) -> None:
+def test_exchange_with_paths_outside_the_folder_raises(
+    key: str, name: object, tmp_path: Path
+) -> None:
     """Test a manipulated result folder that refers to files outside the folder."""
     output = tmp_path / "out"
     scratch = output / ".mpsfm-x"
@@ -285,7 +289,7 @@ def test_an_exchange_touches_nothing_outside(key: str, name: object, tmp_path: P
     assert (tmp_path / "old.txt").is_file()
 
 
-def test_an_exchange_follows_no_link(tmp_path: Path) -> None:
+def test_exchange_of_linked_folder_raises(tmp_path: Path) -> None:
     output, photos = tmp_path / "out", tmp_path / "photos"
     (output / ".mpsfm-x").mkdir(parents=True)
     photos.mkdir()

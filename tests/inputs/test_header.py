@@ -36,7 +36,7 @@ def test_equivalent_is_by_diagonal() -> None:
     assert header(f35=26).focal_px(3000, 4000) == pytest.approx(expected)
 
 
-def test_focal_plane_resolution() -> None:
+def test_focal_px_from_focal_plane_resolution() -> None:
     """The sensor of a Canon 5D has 35.8 mm for 4368 pixels, with the resolution per inch."""
     resolution = 4368 / 35.8 * 25.4
     found = header(mm=50, resolution=resolution, unit=2).focal_px(4368, 2912)
@@ -45,7 +45,7 @@ def test_focal_plane_resolution() -> None:
     assert metric == pytest.approx(found)
 
 
-def test_resized_photo() -> None:
+def test_focal_px_of_resized_photo_is_scaled() -> None:
     """The focal plane resolution is that of the sensor; the photo has a quarter of the pixels."""
     tags = {"mm": 50, "resolution": 4368 / 35.8, "unit": 4, "x": 4368, "y": 2912}
     assert header(**tags).focal_px(1092, 728) == pytest.approx(50 / 35.8 * 1092)
@@ -68,19 +68,19 @@ def test_focal_px_with_implausible_plane_resolution_is_none() -> None:
 
 
 @pytest.mark.parametrize("tags", [{}, {"mm": 50}, {"f35": 0}, {"mm": 50, "resolution": 0}])
-def test_not_enough(tags: dict[str, float]) -> None:
+def test_focal_px_of_incomplete_tags_is_none(tags: dict[str, float]) -> None:
     assert header(**tags).focal_px(4000, 3000) is None
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".webp"])
-def test_read_from_files(suffix, write_image) -> None:
+def test_read_header_of_every_format_finds_focal_length(suffix, write_image) -> None:
     tags = {FOCAL_MM: 4.25, FOCAL_35MM: 26, PIXELS_X: 80, PIXELS_Y: 60}
     found = read_header(write_image(f"a{suffix}", tags=tags).read_bytes())
     assert {tag: found.tags[tag] for tag in tags} == pytest.approx(tags)
     assert found.focal_px(80, 60) == pytest.approx(26 / math.hypot(36, 24) * 100)
 
 
-def test_any_truncation_is_survived(write_image) -> None:
+def test_read_header_of_truncated_file_does_not_raise(write_image) -> None:
     data = write_image("a.jpg", tags={FOCAL_MM: 4.25, FOCAL_35MM: 26}).read_bytes()
     for length in range(200):
         read_header(data[:length])

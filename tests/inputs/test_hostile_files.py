@@ -119,7 +119,7 @@ def good_database(path: Path) -> None:
     ],
     ids=lambda damage: getattr(damage, "__name__", ""),
 )
-def test_databases(photos: Path, tmp_path: Path, damage: Damage) -> None:
+def test_damaged_database_raises(photos: Path, tmp_path: Path, damage: Damage) -> None:
     path = tmp_path / "matches.db"
     good_database(path)
     images = load_images(photos)
@@ -128,7 +128,7 @@ def test_databases(photos: Path, tmp_path: Path, damage: Damage) -> None:
     refused(lambda: matches_from_database(path, images), path)
 
 
-def test_a_database_that_is_not_there(photos: Path, tmp_path: Path) -> None:
+def test_missing_database_raises(photos: Path, tmp_path: Path) -> None:
     path = tmp_path / "matches.db"
     refused(lambda: read_intrinsics(path), path)
     assert not path.exists()
@@ -173,7 +173,7 @@ def replaced(name: str, value: object) -> Damage:
         ("matches.h5", features(lambda f: f.clear())),
     ],
 )
-def test_hloc_files(photos: Path, tmp_path: Path, file: str, damage: Damage) -> None:
+def test_damaged_hloc_files_raise(photos: Path, tmp_path: Path, file: str, damage: Damage) -> None:
     xy = np.random.default_rng(0).uniform(5, 40, (30, 2))
     with h5py.File(tmp_path / "feats.h5", "w") as written:
         for name in NAMES:
@@ -216,7 +216,7 @@ FRAME = {
     ],
     ids=range(14),
 )
-def test_transforms(tmp_path: Path, content: str) -> None:
+def test_damaged_transforms_raise(tmp_path: Path, content: str) -> None:
     path = tmp_path / "transforms.json"
     path.write_text(content)
     refused(lambda: read_transforms(path), path)
@@ -224,7 +224,7 @@ def test_transforms(tmp_path: Path, content: str) -> None:
 
 @pytest.mark.parametrize("damage", [emptied, text_instead, noise_instead, noise_inside])
 @pytest.mark.parametrize("name", ["v.avi", "v.mp4"])
-def test_videos(tmp_path: Path, name: str, damage: Damage) -> None:
+def test_damaged_videos_raise(tmp_path: Path, name: str, damage: Damage) -> None:
     path = tmp_path / name
     codec = cv2.VideoWriter_fourcc(*("MJPG" if name == "v.avi" else "mp4v"))
     writer = cv2.VideoWriter(str(path), codec, 10, (64, 48))
@@ -236,14 +236,14 @@ def test_videos(tmp_path: Path, name: str, damage: Damage) -> None:
 
 
 @pytest.mark.parametrize("damage", [emptied, text_instead, cut, noise_inside])
-def test_masks(photos: Path, tmp_path: Path, damage: Damage) -> None:
+def test_damaged_mask_raises(photos: Path, tmp_path: Path, damage: Damage) -> None:
     mask = tmp_path / "0.png.png"
     cv2.imwrite(str(mask), np.random.default_rng(0).integers(0, 255, (48, 64)).astype(np.uint8))
     damage(mask)
     refused(lambda: load_images(photos, options=InputOptions(masks=tmp_path)), mask)
 
 
-def test_a_mask_of_another_size(photos: Path, tmp_path: Path) -> None:
+def test_mask_of_another_size_raises(photos: Path, tmp_path: Path) -> None:
     mask = tmp_path / "0.png.png"
     cv2.imwrite(str(mask), np.zeros((10, 10), np.uint8))
     refused(lambda: load_images(photos, options=InputOptions(masks=tmp_path)), mask)
@@ -251,7 +251,7 @@ def test_a_mask_of_another_size(photos: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("suffix", [".heic", ".dng"])
 @pytest.mark.parametrize("damage", [emptied, text_instead, noise_instead])
-def test_photos_of_phones_and_cameras(tmp_path: Path, suffix: str, damage: Damage) -> None:
+def test_damaged_heic_and_raw_photos_raise(tmp_path: Path, suffix: str, damage: Damage) -> None:
     for number in range(2):
         damage(tmp_path / f"{number}{suffix}")
     refused(lambda: load_images(tmp_path), tmp_path / f"0{suffix}")
@@ -286,7 +286,7 @@ def negative(path: Path) -> None:
 @pytest.mark.parametrize(
     "damage", [emptied, text_instead, cut, noise_inside, objects_inside, negative]
 )
-def test_depth_maps_of_results(result: Path, damage: Damage) -> None:
+def test_damaged_depth_map_of_results_raises(result: Path, damage: Damage) -> None:
     (path,) = (result / "depth").rglob("*.npz")
     name = path.relative_to(result / "depth").as_posix().removesuffix(".npz")
     assert ExportSource.read(result).maps(name) is not None
@@ -295,7 +295,7 @@ def test_depth_maps_of_results(result: Path, damage: Damage) -> None:
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"status": "failed"}', "[" * 100_000])
-def test_summaries_of_results(result: Path, content: str) -> None:
+def test_damaged_summary_raises(result: Path, content: str) -> None:
     (result / "summary.json").write_text(content)
     refused(lambda: ExportSource.read(result), result / "summary.json")
 
@@ -316,7 +316,7 @@ def test_summaries_of_results(result: Path, content: str) -> None:
     ],
     ids=range(6),
 )
-def test_clouds(tmp_path: Path, content: bytes) -> None:
+def test_damaged_point_cloud_raises(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "dense.ply"
     path.write_bytes(content)
     refused(lambda: read_ply(path), path)
@@ -341,7 +341,9 @@ def untouched(path: Path) -> None:
 
 @pytest.mark.parametrize("damage", [untouched, emptied, cut, noise_inside])
 @pytest.mark.parametrize("name", GLB_READERS)
-def test_glb_files(tmp_path: Path, name: str, damage: Damage) -> None:
+def test_glb_file_in_place_of_other_formats_raises(
+    tmp_path: Path, name: str, damage: Damage
+) -> None:
     text = b'{"asset": {"version": "2.0"}, "meshes": [{"primitives": [{"attributes": {}}]}]}'
     text += b" " * (-len(text) % 4)
     path = tmp_path / name

@@ -39,7 +39,7 @@ def test_photos_behind_links_are_found(tmp_path: Path) -> None:
     assert len(load_images(tmp_path / "photos")) == 4
 
 
-def test_links_in_a_circle_end(tmp_path: Path) -> None:
+def test_circular_links_are_followed_once(tmp_path: Path) -> None:
     write(tmp_path / "photos", "a.jpg", "deep/b.jpg")
     (tmp_path / "photos" / "deep" / "up").symlink_to(tmp_path / "photos")
     assert find_images(tmp_path / "photos") == ["a.jpg", "deep/b.jpg"]

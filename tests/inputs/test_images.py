@@ -50,7 +50,7 @@ def write_list(tmp_path: Path, *names: str) -> Path:
     return path
 
 
-def test_names_and_natural_order(folder: Path, intrinsics: Path) -> None:
+def test_load_images_sorts_names_naturally(folder: Path, intrinsics: Path) -> None:
     found = load_images(folder, intrinsics)
     assert found.names == ["img2.jpg", "img10.png", "side/a.png"]
     assert [image.focal_source for image in found] == ["intrinsics"] * 3
@@ -58,12 +58,12 @@ def test_names_and_natural_order(folder: Path, intrinsics: Path) -> None:
     assert found[0].pinhole.params.tolist() == [70, 70, 40, 30]
 
 
-def test_list_keeps_its_order(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
+def test_image_list_determines_the_order(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
     chosen = write_list(tmp_path, "side/a.png", "img2.jpg")
     assert load_images(folder, intrinsics, chosen).names == ["side/a.png", "img2.jpg"]
 
 
-def test_bad_lists(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
+def test_invalid_image_lists_raise(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
     message = refused(folder, intrinsics, write_list(tmp_path, "img2.jpg", "img10.pmg"))
     assert "list.txt" in message and "'img10.pmg'" in message and "'img10.png'" in message
     twice = write_list(tmp_path, "img2.jpg", "img10.png", "img2.jpg")
@@ -73,7 +73,7 @@ def test_bad_lists(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
     assert "cannot be read" in refused(folder, intrinsics, tmp_path / "absent.txt")
 
 
-def test_bad_folders(tmp_path: Path, write_image) -> None:
+def test_invalid_image_folders_raise(tmp_path: Path, write_image) -> None:
     assert "does not exist" in refused(tmp_path / "absent")
     (tmp_path / "images").mkdir()
     assert "no images" in refused(tmp_path / "images")
@@ -100,7 +100,9 @@ def test_damaged_photos_are_left_out_with_their_reasons(
 
 @pytest.mark.parametrize("share", [0.3, 0.9])
 @pytest.mark.parametrize("suffix", [".jpg", ".png", ".tif", ".webp", ".bmp", ".jp2"])
-def test_a_cut_photo_is_left_out(tmp_path: Path, write_image, suffix: str, share: float) -> None:
+def test_truncated_photo_is_left_out(
+    tmp_path: Path, write_image, suffix: str, share: float
+) -> None:
     for name in ("a.png", "b.png", "c.png", f"cut{suffix}"):
         write_image(name)
     path = tmp_path / "images" / f"cut{suffix}"
@@ -130,7 +132,7 @@ def test_too_many_pixels_are_refused_before_decoding(
         load_images(tmp_path / "images", options=InputOptions(max_pixels=1024))
 
 
-def test_results_below_the_photos_are_no_input(folder: Path) -> None:
+def test_results_below_the_photo_folder_are_not_read(folder: Path) -> None:
     names = find_images(folder)
     inner = folder / "out" / "undistorted" / "images"
     inner.mkdir(parents=True)
@@ -166,7 +168,7 @@ def test_default_focal_length_warns_once(folder: Path, caplog: pytest.LogCapture
     assert not found[0].focal_known and found[0].focal_source == "default"
 
 
-def test_other_focal_lengths_where_they_were_the_default(folder: Path, intrinsics: Path) -> None:
+def test_replaced_default_focal_lengths_change_the_cameras(folder: Path, intrinsics: Path) -> None:
     options = InputOptions(max_image_size=40)
     found = load_images(folder, options=options).with_focals({1: 70.0, 2: 90.0})
     assert all(image.focal_source == "provider" and not image.focal_known for image in found)
@@ -190,7 +192,7 @@ def partial_model(path: Path, **focals: float) -> Path:
     return path
 
 
-def test_a_model_gives_its_images_their_cameras(folder: Path, tmp_path: Path) -> None:
+def test_model_gives_cameras_to_its_images(folder: Path, tmp_path: Path) -> None:
     model = partial_model(tmp_path / "transforms.json", img2=70.0)
     found = load_images(folder, model=model)
     assert [image.camera.focal_length_x for image in found] == [70.0] * 3
@@ -198,7 +200,9 @@ def test_a_model_gives_its_images_their_cameras(folder: Path, tmp_path: Path) ->
     assert all(image.focal_known for image in found)
 
 
-def test_which_camera_of_a_model_others_have_is_not_guessed(folder: Path, tmp_path: Path) -> None:
+def test_model_with_several_cameras_gives_none_to_other_images(
+    folder: Path, tmp_path: Path
+) -> None:
     model = partial_model(tmp_path / "transforms.json", img2=70.0, img10=75.0)
     found = {image.name: image for image in load_images(folder, model=model)}
     side = found.pop("side/a.png")
@@ -210,7 +214,7 @@ def test_which_camera_of_a_model_others_have_is_not_guessed(folder: Path, tmp_pa
     assert side.camera.camera_id not in {image.camera.camera_id for image in found.values()}
 
 
-def test_given_intrinsics_go_before_those_of_a_model(
+def test_given_intrinsics_override_those_of_a_model(
     folder: Path, intrinsics: Path, tmp_path: Path
 ) -> None:
     model = partial_model(tmp_path / "transforms.json", img2=90.0)
@@ -234,14 +238,14 @@ def test_rotated_photo_is_upright(tmp_path: Path, write_image, photo) -> None:
     assert np.array_equal(found.view(0).image, expected)
 
 
-def test_view_of_a_pinhole_camera(folder: Path, intrinsics: Path, photo) -> None:
+def test_view_of_pinhole_camera_has_unchanged_pixels(folder: Path, intrinsics: Path, photo) -> None:
     view = load_images(folder, intrinsics).view(1)
     assert (view.name, view.mask) == ("img10.png", None)
     assert np.array_equal(view.image, photo)
     assert view.camera.size == (80, 60)
 
 
-def test_reduced_view(folder: Path, intrinsics: Path, photo) -> None:
+def test_view_above_max_image_size_is_reduced(folder: Path, intrinsics: Path, photo) -> None:
     found = load_images(folder, intrinsics, None, InputOptions(max_image_size=40))
     view = found.view(1)
     assert view.camera.size == (40, 30) and view.camera.params.tolist() == [35, 35, 20, 15]
@@ -250,7 +254,9 @@ def test_reduced_view(folder: Path, intrinsics: Path, photo) -> None:
     assert found[1].original_pixels(np.array([[20.0, 15.0]])).tolist() == [[40.0, 30.0]]
 
 
-def test_distorted_view_and_back(folder: Path, tmp_path: Path, photo) -> None:
+def test_pixels_of_undistorted_view_map_back_to_the_photo(
+    folder: Path, tmp_path: Path, photo
+) -> None:
     path = tmp_path / "distorted.yaml"
     path.write_text(DISTORTED)
     found = load_images(folder, path)
@@ -264,7 +270,7 @@ def test_distorted_view_and_back(folder: Path, tmp_path: Path, photo) -> None:
         assert np.abs(here - patch).max() <= 2
 
 
-def test_masks(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
+def test_masks_are_resized_with_their_views(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
     masks = tmp_path / "masks"
     (masks / "side").mkdir(parents=True)
     drawn = np.full((60, 80), 255, np.uint8)
@@ -279,7 +285,7 @@ def test_masks(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
     assert right[:, :30].all() and not right[:, 30:].any()
 
 
-def test_bad_masks(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
+def test_invalid_masks_raise(folder: Path, intrinsics: Path, tmp_path: Path) -> None:
     masks = tmp_path / "masks"
     assert "does not exist" in refused(folder, intrinsics, None, InputOptions(masks=masks))
     masks.mkdir()
@@ -335,14 +341,16 @@ def test_views_are_decoded_once_and_forgotten(
     assert decoded == ["img2.jpg", "img10.png", "side/a.png", "img2.jpg"]
 
 
-def test_file_that_changes_its_size(folder: Path, intrinsics: Path, write_image, photo) -> None:
+def test_photo_that_changes_its_size_raises(
+    folder: Path, intrinsics: Path, write_image, photo
+) -> None:
     found = load_images(folder, intrinsics)
     write_image("img10.png", photo[:30])
     with pytest.raises(InputError, match="changed"):
         found.view(1)
 
 
-def test_shared_scenes(shared_data: Path) -> None:
+def test_images_of_shared_scene_are_loaded(shared_data: Path) -> None:
     kitchen = shared_data / "data" / "kitchen_example"
     found = load_images(kitchen / "images", kitchen / "intrinsics.yaml")
     assert len(found) == 6  # PNG data in files named .JPG

@@ -44,7 +44,7 @@ def test_default_models(tmp_path: Path) -> None:
         ("THIN_PRISM_FISHEYE", [300, 300, 320, 240, 0, 0, 0, 0, 0, 0, 0, 0]),
     ],
 )
-def test_any_model(tmp_path: Path, model: str, params: list[float]) -> None:
+def test_every_colmap_camera_model_is_read(tmp_path: Path, model: str, params: list[float]) -> None:
     camera = read(tmp_path, f"7: {{model: {model}, params: {params}}}").camera("a.jpg", SIZE)
     assert (camera.model_name, camera.params.tolist()) == (model, params)
 
@@ -97,7 +97,7 @@ def test_declared_size_allows_an_odd_principal_point(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_wrong_files(tmp_path: Path, text: str, hint: str) -> None:
+def test_wrong_intrinsics_files_raise(tmp_path: Path, text: str, hint: str) -> None:
     assert hint in refused(tmp_path, text)
 
 
@@ -106,7 +106,7 @@ def test_image_without_camera(tmp_path: Path) -> None:
     assert "no camera for image 'a.jpg'" in message and "did you mean 'a.jpeg'" in message
 
 
-def test_absent_file(tmp_path: Path) -> None:
+def test_missing_intrinsics_file_raises(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_intrinsics(tmp_path / "none.yaml")
 
@@ -143,7 +143,7 @@ def test_colmap_model(tmp_path: Path, model: pycolmap.Reconstruction, form: str)
         found.camera("other.jpg", SIZE)
 
 
-def test_one_camera_alone_is_for_all(tmp_path: Path) -> None:
+def test_single_camera_is_used_for_all_images(tmp_path: Path) -> None:
     path = tmp_path / "cameras.txt"
     path.write_text("# comment\n1 PINHOLE 640 480 500 500 320 240\n")
     assert read_intrinsics(path).camera("any.jpg", SIZE).camera_id == 1
@@ -152,12 +152,12 @@ def test_one_camera_alone_is_for_all(tmp_path: Path) -> None:
         read_intrinsics(path)
 
 
-def test_folder_without_a_model(tmp_path: Path) -> None:
+def test_folder_without_colmap_model_raises(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no COLMAP model"):
         read_intrinsics(tmp_path)
 
 
-def test_shared_scenes(shared_data: Path) -> None:
+def test_intrinsics_of_shared_scenes_equal_their_true_models(shared_data: Path) -> None:
     for folder in sorted((shared_data / "data").iterdir()):
         if (folder / "gt").is_dir():
             given = read_intrinsics(folder / "intrinsics.yaml")

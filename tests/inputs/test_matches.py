@@ -88,7 +88,7 @@ def check(imported, images: ImageSet, seen: list[np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize("verified_only", [False, True])
-def test_a_database_gives_matches_of_the_same_points(
+def test_database_gives_matches_of_the_same_points(
     images: ImageSet, seen, tmp_path: Path, verified_only: bool
 ) -> None:
     path = write_database(tmp_path / "m.db", seen, verified_only=verified_only)
@@ -97,14 +97,14 @@ def test_a_database_gives_matches_of_the_same_points(
     assert path.read_bytes() == before
 
 
-def test_a_database_gives_cameras(seen, tmp_path: Path) -> None:
+def test_database_gives_cameras(seen, tmp_path: Path) -> None:
     intrinsics = read_intrinsics(write_database(tmp_path / "m.db", seen))
     camera = intrinsics.camera("a/1.png", SIZE)
     assert camera.model_name == "SIMPLE_RADIAL"
     assert camera.params.tolist() == [140, 80, 60, 0]
 
 
-def test_what_colmap_itself_writes_is_read(images: ImageSet, tmp_path: Path) -> None:
+def test_database_written_by_colmap_is_read(images: ImageSet, tmp_path: Path) -> None:
     path = tmp_path / "colmap.db"
     with pycolmap.Database.open(str(path)):
         pass
@@ -152,7 +152,7 @@ def test_hloc_files_give_matches_of_the_same_points(
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_pixels_turn_with_their_photo(orientation: int) -> None:
+def test_keypoints_rotate_with_their_photo(orientation: int) -> None:
     stored = np.zeros((4, 6, 3), np.uint8)
     stored[1, 4] = 255
     upright = orient(stored, orientation)
@@ -178,7 +178,7 @@ def test_matches_without_their_keypoints_are_refused(
         matches_from_database(path, images)
 
 
-def test_a_database_of_other_photos_is_refused(images: ImageSet, tmp_path: Path) -> None:
+def test_database_of_other_photos_raises(images: ImageSet, tmp_path: Path) -> None:
     with pycolmap.Database.open(str(tmp_path / "m.db")):
         pass
     with pytest.raises(InputError, match="keypoints of none of the images"):

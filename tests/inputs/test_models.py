@@ -28,7 +28,7 @@ def test_models_are_found_and_read(
         np.testing.assert_allclose(np.column_stack([rotation, translation]), expected, atol=1e-9)
 
 
-def test_a_folder_without_a_model_or_with_a_broken_one_is_wrong_input(tmp_path: Path) -> None:
+def test_folder_without_model_or_with_broken_model_raises(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no COLMAP model"):
         read_poses(tmp_path)
     for name in ("cameras", "images", "points3D", "frames", "rigs"):

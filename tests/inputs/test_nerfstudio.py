@@ -46,7 +46,9 @@ def camera_of(path: Path, frame: dict[str, Any], **shared: Any) -> pycolmap.Came
         ("OPENCV_FISHEYE", [600, 610, 320, 240, 0.1, 0.01, 1e-3, 2e-3], "OPENCV_FISHEYE"),
     ],
 )
-def test_a_model_comes_back(tmp_path: Path, model: str, params: list[float], becomes: str) -> None:
+def test_written_transforms_are_read_as_the_same_model(
+    tmp_path: Path, model: str, params: list[float], becomes: str
+) -> None:
     pycolmap.set_random_seed(1)
     options = pycolmap.SyntheticDatasetOptions()
     options.num_rigs, options.num_cameras_per_rig, options.num_frames_per_rig = 2, 1, 3
@@ -83,7 +85,7 @@ def test_cameras_look_along_minus_z_with_y_up(tmp_path: Path) -> None:
     np.testing.assert_allclose(cam_from_world * np.array([1.0, 2.5, 2.0]), [0, -0.5, 1], atol=1e-12)
 
 
-def test_intrinsics_beside_the_frames_are_for_all(tmp_path: Path) -> None:
+def test_intrinsics_outside_the_frames_are_used_for_all_frames(tmp_path: Path) -> None:
     shared = {key: FRAME[key] for key in FRAME if key not in ("file_path", "transform_matrix")}
     frames = [{k: v for k, v in FRAME.items() if k not in shared} for _ in range(2)]
     frames[1] |= {"file_path": "images/b.png", "fl_x": 80.0}
@@ -92,7 +94,7 @@ def test_intrinsics_beside_the_frames_are_for_all(tmp_path: Path) -> None:
     assert focals == {"images/a.png": 60.0, "images/b.png": 80.0}
 
 
-def test_angle_of_view_and_a_picture_are_enough(tmp_path: Path, write_image, photo) -> None:
+def test_intrinsics_from_angle_of_view_and_image_size(tmp_path: Path, write_image, photo) -> None:
     write_image("r_0.png")
     frame = {"file_path": "./images/r_0", "transform_matrix": FRAME["transform_matrix"]}
     height, width = photo.shape[:2]
@@ -111,7 +113,7 @@ def test_a_third_radial_coefficient_is_kept(tmp_path: Path) -> None:
     assert camera.params.tolist()[4:] == [0.1, 0.02, 1e-3, 2e-3, 0.003, 0, 0, 0]
 
 
-def test_few_digits_are_enough(tmp_path: Path) -> None:
+def test_rotations_with_few_digits_are_accepted(tmp_path: Path) -> None:
     turned = np.eye(4)
     turned[:2, :2] = [[0.8661, -0.5], [0.5, 0.866]]
     (found,) = read_transforms(
@@ -142,13 +144,13 @@ def test_wrong_frames_are_named(tmp_path: Path, change: dict[str, Any], hint: st
 
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", '{"frames": []}', '{"frames": 3}'])
-def test_other_files_are_wrong_input(tmp_path: Path, text: str) -> None:
+def test_file_of_another_format_raises(tmp_path: Path, text: str) -> None:
     (tmp_path / "transforms.json").write_text(text)
     with pytest.raises(InputError, match=r"transforms\.json"):
         read_poses(tmp_path / "transforms.json")
 
 
-def test_a_picture_has_one_frame(tmp_path: Path) -> None:
+def test_two_frames_of_one_image_raise(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="the same file_path"):
         read_transforms(write(tmp_path, FRAME, {**FRAME, "file_path": "./images/a.png"}))
 

@@ -37,14 +37,16 @@ def decode(path: Path) -> UInt8:
 
 
 @pytest.mark.parametrize("orientation", UPRIGHT)
-def test_orientations(orientation: int, photo: UInt8) -> None:
+def test_orient_equals_the_exif_standard(orientation: int, photo: UInt8) -> None:
     assert np.array_equal(orient(photo, orientation), UPRIGHT[orientation](photo))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg", ".webp"])
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize("orientation", [1, 6, 8])
-def test_orientation_in_files(suffix, order, orientation, photo, write_image) -> None:
+def test_orientation_of_every_format_is_applied(
+    suffix, order, orientation, photo, write_image
+) -> None:
     path = write_image(f"a{suffix}", tags={ORIENTATION: orientation}, order=order)
     header = read_header(path.read_bytes())
     assert header.orientation == orientation
@@ -54,7 +56,7 @@ def test_orientation_in_files(suffix, order, orientation, photo, write_image) ->
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_size_without_decoding(suffix, write_image) -> None:
+def test_size_is_read_without_decoding(suffix, write_image) -> None:
     assert read_header(write_image(f"a{suffix}").read_bytes()).size == (80, 60)
 
 
@@ -63,7 +65,7 @@ def test_formats_without_loss(suffix, photo, write_image) -> None:
     assert np.array_equal(decode(write_image(f"a{suffix}")), photo)
 
 
-def test_content_decides_not_the_name(photo, write_image) -> None:
+def test_content_determines_the_format_instead_of_the_name(photo, write_image) -> None:
     path = write_image("a.png")
     assert np.array_equal(decode(path.rename(path.with_suffix(".JPG"))), photo)
 
@@ -74,7 +76,7 @@ def test_sixteen_bit(suffix, photo, write_image) -> None:
     assert np.array_equal(decode(write_image(f"a{suffix}", deep)), photo)
 
 
-def test_float_tiff(photo, write_image) -> None:
+def test_float_tiff_is_converted_to_8_bit(photo, write_image) -> None:
     path = write_image("a.tif", (photo / 255).astype(np.float32))
     assert np.array_equal(decode(path), photo)
 
@@ -88,7 +90,7 @@ def test_grayscale_and_alpha(photo, write_image) -> None:
     assert np.array_equal(decode(path), photo)
 
 
-def test_rotated_tiff_is_turned_once(tmp_path: Path, photo: UInt8) -> None:
+def test_orientation_of_tiff_is_applied_once(tmp_path: Path, photo: UInt8) -> None:
     """The TIFF decoder applies the orientation tag itself, so the image must not be rotated
     again."""
     path = tmp_path / "a.tif"
@@ -117,7 +119,7 @@ def _tiff(image: UInt8, orientation: int) -> bytes:
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"\xff\xd8\xff\xe0"])
-def test_no_image(content: bytes, tmp_path: Path) -> None:
+def test_decode_of_other_file_raises(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     path.write_bytes(content)
     with pytest.raises(InputError, match=r"a\.jpg"):
@@ -125,7 +127,7 @@ def test_no_image(content: bytes, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".png", ".jpg"])
-def test_truncated(suffix, write_image) -> None:
+def test_decode_of_truncated_image_raises(suffix, write_image) -> None:
     path = write_image(f"a{suffix}")
     data = path.read_bytes()
     path.write_bytes(data[: len(data) // 2])
@@ -133,12 +135,12 @@ def test_truncated(suffix, write_image) -> None:
         decode(path)
 
 
-def test_missing_file(tmp_path: Path) -> None:
+def test_read_bytes_of_missing_file_raises(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"nowhere\.jpg cannot be read"):
         read_bytes(tmp_path / "nowhere.jpg")
 
 
-def test_mask(photo, write_image) -> None:
+def test_decode_mask_is_true_at_nonzero_pixels(photo, write_image) -> None:
     drawn = np.zeros(photo.shape[:2], dtype=np.uint8)
     drawn[10:20, 30:50] = 255
     assert np.array_equal(decode_mask(write_image("m.png", drawn), 4800), drawn > 0)

@@ -48,13 +48,13 @@ def test_frames_are_chosen_by_motion_and_not_by_time(turn, tmp_path: Path) -> No
     assert gaps.max() <= 2.5 * np.median(gaps)
 
 
-def test_a_camera_that_waits_gives_no_frames(turn, tmp_path: Path) -> None:
+def test_waiting_camera_gives_no_frames(turn, tmp_path: Path) -> None:
     frames = [*turn[:20], *[turn[20]] * 40, *turn[20:]]
     chosen = choose_frames(write(tmp_path / "v.avi", frames), VideoOptions())
     assert sum(20 < number < 60 for number in chosen) <= 1
 
 
-def test_blurred_frames_are_passed_over(turn, tmp_path: Path) -> None:
+def test_blurred_frames_are_not_selected(turn, tmp_path: Path) -> None:
     blurred = {n for n in range(len(turn)) if n % 3}
     frames = [cv2.blur(f, (13, 1)) if n in blurred else f for n, f in enumerate(turn)]
     chosen = choose_frames(write(tmp_path / "v.avi", frames), VideoOptions())
@@ -62,7 +62,7 @@ def test_blurred_frames_are_passed_over(turn, tmp_path: Path) -> None:
     assert len(blurred & set(chosen)) <= 1  # two thirds of all frames
 
 
-def test_more_frames_than_asked_for_are_thinned_evenly(turn, tmp_path: Path, caplog) -> None:
+def test_frames_above_maximum_are_thinned_evenly(turn, tmp_path: Path, caplog) -> None:
     options = VideoOptions(motion=0.02, max_frames=6)
     chosen = choose_frames(write(tmp_path / "v.avi", turn), options)
     assert len(chosen) == 6
@@ -70,7 +70,7 @@ def test_more_frames_than_asked_for_are_thinned_evenly(turn, tmp_path: Path, cap
     assert "max_frames" in caplog.text
 
 
-def test_frames_are_written_once(turn, tmp_path: Path) -> None:
+def test_extracted_frames_are_reused(turn, tmp_path: Path) -> None:
     video = write(tmp_path / "v.avi", turn)
     assert is_video(video)
     folder = extract_frames(video, tmp_path / "out", VideoOptions())
@@ -86,14 +86,14 @@ def test_frames_are_written_once(turn, tmp_path: Path) -> None:
     assert len(find_images(folder)) < len(names)
 
 
-def test_a_camera_that_stands_still_is_refused(turn, tmp_path: Path) -> None:
+def test_video_of_static_camera_raises(turn, tmp_path: Path) -> None:
     video = write(tmp_path / "v.avi", [turn[0]] * 30)
     with pytest.raises(InputError, match="camera hardly moves"):
         extract_frames(video, tmp_path / "out", VideoOptions())
     assert not (tmp_path / "out").exists()
 
 
-def test_a_video_that_is_cut_off_is_used_as_far_as_it_goes(turn, tmp_path: Path) -> None:
+def test_truncated_video_is_used_until_its_end(turn, tmp_path: Path) -> None:
     video = write(tmp_path / "v.avi", turn)
     data = video.read_bytes()
     video.write_bytes(data[: len(data) // 2])
@@ -101,7 +101,7 @@ def test_a_video_that_is_cut_off_is_used_as_far_as_it_goes(turn, tmp_path: Path)
     assert 3 <= len(chosen) <= 8
 
 
-def test_a_phone_that_is_held_upright_gives_upright_frames(turn, tmp_path: Path) -> None:
+def test_portrait_video_gives_upright_frames(turn, tmp_path: Path) -> None:
     """Phones store frames in sensor orientation, with their rotation in the header of the track."""
     video = tmp_path / "v.mp4"
     writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 30, SIZE)

@@ -12,7 +12,7 @@ from mpsfm_core.mapping.options import MapperOptions
 from tests.mapping.focal_scenes import make_room
 
 
-def test_refine_depth_maps_of_a_reconstruction_equals_the_depth_of_the_mapper() -> None:
+def test_refine_depth_maps_of_reconstruction_equals_mapper_depth() -> None:
     problem, options = make_room(), MapperOptions()
     model = reconstruct(problem, options).reconstructions[0]
     blank = (replace(i, depth=problem.images[i.index].depth) for i in model.images)

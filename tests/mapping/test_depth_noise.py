@@ -66,7 +66,7 @@ def smooth(rng: np.random.Generator, shape: tuple[int, int]) -> Float64:
     return np.asarray(2 * DECLARED * noise / noise.std())
 
 
-def test_errors_of_pixels_are_measured_as_large_as_they_are_and_independent() -> None:
+def test_independent_errors_are_measured_with_size_and_low_correlation() -> None:
     noise = measured(independent)
     # depth is interpolated between pixels, which averages their errors
     assert 1.2 < noise.multiplier < 2.2
@@ -74,14 +74,14 @@ def test_errors_of_pixels_are_measured_as_large_as_they_are_and_independent() ->
     assert noise.design_effect < 2
 
 
-def test_smooth_errors_are_measured_as_large_as_they_are_and_correlated() -> None:
+def test_smooth_errors_are_measured_with_size_and_high_correlation() -> None:
     noise = measured(smooth)
     assert noise.multiplier == pytest.approx(2.0, rel=0.35)
     assert noise.correlation > 0.5
     assert noise.design_effect > 5
 
 
-def test_fewer_independent_errors_than_unknowns_are_fitted_to_say_less() -> None:
+def test_few_independent_errors_give_larger_noise() -> None:
     """Two views have one pair to estimate one pose, but three views have three pairs for two
     poses."""
 
@@ -95,19 +95,19 @@ def test_fewer_independent_errors_than_unknowns_are_fitted_to_say_less() -> None
     assert ratio(independent) == pytest.approx(1.0, rel=0.05)
 
 
-def test_scales_that_are_off_are_no_noise() -> None:
+def test_wrong_scales_are_no_noise() -> None:
     right, wrong = measured(independent), measured(independent, (1.0, 1.05, 0.96))
     assert wrong.multiplier == pytest.approx(right.multiplier, rel=0.15)
     assert wrong.correlation < 0.15
 
 
-def test_too_few_common_points_leave_the_declaration() -> None:
+def test_too_few_common_points_keep_the_declared_std() -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, POSES)
     assert measure_depth_noise(Scene(problem)) == DepthNoise()
 
 
 @pytest.mark.parametrize("views", [2, 3])
-def test_noise_is_measured_where_a_prior_is_off(views: int) -> None:
+def test_local_noise_is_large_at_wrong_depth(views: int) -> None:
     """The prior is 20 % too far in one spot, and its declared std is right everywhere else."""
 
     def spot(_: np.random.Generator, shape: tuple[int, int]) -> Float64:

@@ -31,26 +31,26 @@ def scene_of(noise_px: float, *, tails: bool = False, wrong: float = 0.0) -> Sce
     return scene
 
 
-def test_distances_of_matches_have_the_std_of_the_keypoints() -> None:
+def test_epipolar_errors_have_the_std_of_the_keypoints() -> None:
     residuals = compute_epipolar_residuals(scene_of(0.7))
     assert np.sqrt((residuals**2).mean()) == pytest.approx(1.0, rel=0.05)
     assert (residuals < MAX_RESIDUAL).all()
 
 
 @pytest.mark.parametrize("wrong", [0.0, 0.05])
-def test_clean_keypoints_get_a_loss_near_least_squares(wrong: float) -> None:
+def test_keypoints_without_outliers_get_loss_near_least_squares(wrong: float) -> None:
     scale = measure_loss_scale(scene_of(0.7, wrong=wrong), SCALE)
     assert scale == pytest.approx(EFFICIENT_SCALE, rel=0.1)
 
 
-def test_keypoints_with_tails_keep_their_loss() -> None:
+def test_keypoints_with_heavy_tails_keep_the_loss_scale() -> None:
     scene = scene_of(0.7, tails=True)
     # most keypoints are more accurate than declared, as learned keypoints are
     scene.keypoint_std_px *= 2
     assert measure_loss_scale(scene, SCALE) == SCALE
 
 
-def test_few_matches_tell_nothing() -> None:
+def test_few_matches_keep_the_loss_scale() -> None:
     scene = scene_of(0.7)
     scene.registered[1:] = False
     assert measure_loss_scale(scene, SCALE) == SCALE

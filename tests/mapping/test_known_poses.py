@@ -53,7 +53,7 @@ def test_fixed_poses_stay_and_give_the_world_its_unit() -> None:
         assert depth_ratio(image, poses) == pytest.approx(2.0, rel=0.01)
 
 
-def test_a_partial_model_is_continued() -> None:
+def test_partial_model_is_extended_by_other_images() -> None:
     poses = arc_poses(5, 14.0)
     problem = with_poses(
         make_mapping_problem(room_scene(), CAMERA, poses), {i: poses[i] for i in (0, 1, 2)}
@@ -66,7 +66,7 @@ def test_a_partial_model_is_continued() -> None:
     assert np.allclose(first.translation, poses[0][:, 3], atol=0.02)
 
 
-def test_fixed_poses_hold_the_scale_of_each_prior() -> None:
+def test_fixed_poses_determine_the_scale_of_each_prior() -> None:
     poses = arc_poses(4, 14.0)
     problem = with_poses(make_mapping_problem(room_scene(), CAMERA, poses), dict(enumerate(poses)))
     first, *others = problem.images
@@ -78,7 +78,7 @@ def test_fixed_poses_hold_the_scale_of_each_prior() -> None:
         assert depth_ratio(image, poses) == pytest.approx(1.0, rel=0.01)
 
 
-def test_images_without_a_pose_are_left_out_beside_fixed_ones() -> None:
+def test_images_without_pose_are_left_out_if_poses_are_fixed() -> None:
     poses = arc_poses(4, 14.0)
     problem = make_mapping_problem(room_scene(), CAMERA, poses)
     problem = with_poses(problem, {i: poses[i] for i in (0, 1, 2)})
@@ -97,7 +97,7 @@ def apart() -> tuple[MappingProblem, list[Float64]]:
     return with_poses(problem, {i: poses[i] for i in (0, 2, 4)}), poses
 
 
-def test_poses_of_images_that_share_no_points_cost_no_image(
+def test_known_poses_without_common_points_lose_no_image(
     apart: tuple[MappingProblem, list[Float64]], caplog: pytest.LogCaptureFixture
 ) -> None:
     problem, poses = apart
@@ -112,7 +112,7 @@ def test_poses_of_images_that_share_no_points_cost_no_image(
     assert model.metric is not None and model.metric.trusted, "the world is ours"
 
 
-def test_no_scale_is_made_up_where_fixed_poses_share_no_points(
+def test_fixed_poses_without_common_points_give_no_scale(
     apart: tuple[MappingProblem, list[Float64]], caplog: pytest.LogCaptureFixture
 ) -> None:
     problem, poses = apart

@@ -69,7 +69,7 @@ def test_exact_input_gives_exact_poses_and_depth(
     assert np.median(reconstruction.errors_px) < 0.1
 
 
-def test_the_scale_is_metric(
+def test_reconstruction_has_metric_scale(
     exact: tuple[MappingProblem, list[Float64], MappingResult],
 ) -> None:
     _, poses, result = exact
@@ -83,7 +83,7 @@ def test_the_scale_is_metric(
     assert found == pytest.approx(np.linalg.norm(truth[0] - truth[-1]), rel=0.01)
 
 
-def test_the_result_is_the_same_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_result_is_bitwise_reproducible(monkeypatch: pytest.MonkeyPatch) -> None:
     """Results of repeated runs are identical, with one thread and with two."""
     monkeypatch.setattr(bundle_problem, "RANGE_SIZE", 300)  # several ranges, so several threads
     poses = arc_poses(4, 12.0)
@@ -105,7 +105,7 @@ def test_the_result_is_the_same_bit_for_bit(monkeypatch: pytest.MonkeyPatch) -> 
             assert np.array_equal(a.depth.depth, b.depth.depth)
 
 
-def test_a_chain_of_two_view_links_is_registered_by_lifting() -> None:
+def test_chain_with_two_view_overlap_is_registered_by_lifting() -> None:
     """No three views observe a common point, so COLMAP could not propagate the scale."""
     poses = arc_poses(4, 20.0)
     noise = SyntheticNoise(keypoints_px=0.5, scale=0.03, depth=0.01)
@@ -143,7 +143,7 @@ def test_pure_rotation_is_solved_by_depth() -> None:
     assert np.ptp(centers, axis=0).max() < 0.02
 
 
-def test_separate_groups_become_components_largest_first() -> None:
+def test_unconnected_images_become_components_largest_first() -> None:
     poses = arc_poses(5, 14.0)
     problem = make_mapping_problem(
         room_scene(), CAMERA, poses, links=[(0, 1), (2, 3), (3, 4), (2, 4)]
@@ -161,7 +161,7 @@ def test_unmatched_images_are_reported() -> None:
     assert list(result.report.image_reasons) == ["view_2.png"]
 
 
-def test_reasons_say_what_kept_an_image_out() -> None:
+def test_unregistered_images_have_the_reason() -> None:
     poses = arc_poses(6, 14.0)
     links = [(0, 1), (1, 2), (0, 2), (3, 4)]
     problem = make_mapping_problem(room_scene(), CAMERA, poses, links=links)
@@ -184,7 +184,7 @@ def test_no_pairs_give_no_reconstruction() -> None:
     assert len(result.report.image_reasons) == 2
 
 
-def test_a_guessed_focal_length_is_refined_and_shared() -> None:
+def test_estimated_focal_length_is_refined_and_shared() -> None:
     poses = arc_poses(5, 14.0)
     problem = make_mapping_problem(
         room_scene(), CAMERA, poses, noise=SyntheticNoise(keypoints_px=0.3)

@@ -46,7 +46,7 @@ def with_false_matches(problem: MappingProblem, share: float) -> MappingProblem:
     return MappingProblem(problem.images, tuple(pairs))
 
 
-def test_right_poses_explain_right_matches(problem: MappingProblem) -> None:
+def test_correct_poses_explain_correct_matches(problem: MappingProblem) -> None:
     (model,) = reconstruct(problem).reconstructions
     total = compute_total_score(problem)
     assert total == pytest.approx(sum(pair.scores.sum() for pair in problem.pairs))
@@ -58,11 +58,11 @@ def test_right_poses_explain_right_matches(problem: MappingProblem) -> None:
     assert compute_explained_score(model, doubtful) < 0.6 * total
 
 
-def test_one_run_is_enough_where_matches_are_explained(problem: MappingProblem) -> None:
+def test_explained_matches_need_one_run(problem: MappingProblem) -> None:
     assert reconstruct(problem).report.runs == 1
 
 
-def test_runs_that_come_to_the_same_are_the_last(problem: MappingProblem) -> None:
+def test_agreeing_runs_end_the_search(problem: MappingProblem) -> None:
     doubtful = with_false_matches(problem, 0.35)
     result = reconstruct(doubtful, MapperOptions(max_runs=5))
     assert result.report.runs == 2
@@ -108,7 +108,7 @@ class Scripted:
     ],
     ids=["most", "agreement-with-any", "same", "enough", "enough-in-groups", "none-first", "none"],
 )
-def test_which_run_counts(
+def test_reconstruct_selects_the_run_that_explains_most(
     monkeypatch: pytest.MonkeyPatch,
     problem: MappingProblem,
     script: list[list[float]],
@@ -124,7 +124,7 @@ def test_which_run_counts(
     assert found[:1] == ([] if kept is None else [kept])
 
 
-def test_poses_that_stay_leave_nothing_to_chance(
+def test_deterministic_mapper_needs_one_run(
     monkeypatch: pytest.MonkeyPatch, problem: MappingProblem
 ) -> None:
     monkeypatch.setattr(Scripted, "script", [[0.1], [0.2]])
@@ -133,7 +133,7 @@ def test_poses_that_stay_leave_nothing_to_chance(
     assert reconstruct(problem).report.runs == 1
 
 
-def test_a_tie_goes_to_what_came_out_twice(problem: MappingProblem) -> None:
+def test_select_run_prefers_repeated_result(problem: MappingProblem) -> None:
     """A single run is selected only if it explains clearly more than two runs with the same
     result."""
     (model,) = reconstruct(problem).reconstructions
@@ -148,7 +148,7 @@ def test_a_tie_goes_to_what_came_out_twice(problem: MappingProblem) -> None:
     assert select_run([clearly, one, other], OPTIONS) is clearly
 
 
-def test_of_runs_that_are_alike_that_counts_in_which_depth_agrees(problem: MappingProblem) -> None:
+def test_select_run_of_equal_runs_prefers_agreeing_depth(problem: MappingProblem) -> None:
     """If two runs explain equally many matches, the depth maps must agree in the selected run."""
     (model,) = reconstruct(problem).reconstructions
     *rest, last = model.images

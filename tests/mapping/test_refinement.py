@@ -45,7 +45,7 @@ def push(group: Component, image: int, factor: float) -> None:
 
 
 @pytest.mark.parametrize("metric", [True, False])
-def test_a_metric_prior_has_the_scale_of_the_others_where_nothing_else_tells(metric: bool) -> None:
+def test_metric_prior_without_common_points_takes_scale_of_other_priors(metric: bool) -> None:
     """If a view and its points are enlarged by 20 %, the observations of this view still fit."""
     group = mapped(0.01)
     scene = group.scene
@@ -63,7 +63,7 @@ def test_a_metric_prior_has_the_scale_of_the_others_where_nothing_else_tells(met
     assert scene.maps[2].scale / others == pytest.approx(1.0 if metric else 1.2, rel=0.01)
 
 
-def test_a_wrong_scale_is_found_at_once_and_then_stays() -> None:
+def test_wrong_scale_is_corrected_by_one_adjustment() -> None:
     """Scales and points are adjusted together, because depth is far more precise than keypoints."""
     group = mapped(0.001)
     maps, refiner = group.scene.maps, group.refiner
@@ -77,7 +77,7 @@ def test_a_wrong_scale_is_found_at_once_and_then_stays() -> None:
     assert [depth_map.scale for depth_map in maps] == pytest.approx(found, rel=1e-3)
 
 
-def test_the_unit_of_the_world_stays_where_one_scale_is_unlike_the_others() -> None:
+def test_deviating_scale_does_not_change_the_world_unit() -> None:
     """The prior on scales does not change all scales, which would change the unit of the world."""
     group = mapped(0.01, nearer=1.3)
     maps = group.scene.maps
@@ -89,7 +89,9 @@ def test_the_unit_of_the_world_stays_where_one_scale_is_unlike_the_others() -> N
 
 
 @pytest.mark.parametrize(("bundle_depth", "bends"), [("prior", False), ("refined", True)])
-def test_refined_depth_bends_poses_only_if_it_is_asked_for(bundle_depth: str, bends: bool) -> None:
+def test_refined_depth_changes_poses_only_if_bundle_depth_selects_it(
+    bundle_depth: str, bends: bool
+) -> None:
     group = mapped(0.01)
     scene, refiner = group.scene, group.refiner
     refined = scene.maps[1].refined
@@ -105,7 +107,7 @@ def test_refined_depth_bends_poses_only_if_it_is_asked_for(bundle_depth: str, be
     assert np.array_equal(scene.translations, straight) != bends
 
 
-def test_the_depth_loss_counts_in_what_is_independent_of_errors() -> None:
+def test_loss_factor_depends_on_independent_errors() -> None:
     assert DepthNoise().loss_factor == 1.0
     assert DepthNoise(1.0, 0.0, 1.0).loss_factor == 1.0
     assert DepthNoise(1.3, 1.0, 1.0).loss_factor == 1.0, "cells of one residual tell nothing"

@@ -87,7 +87,7 @@ def with_scales(problem: BundleProblem, std: float, expected: float | None) -> B
     )
 
 
-def test_scales_of_exact_depth_are_found() -> None:
+def test_exact_depth_recovers_scales() -> None:
     """All depth scales except that of the first image are variable."""
     truth = exact(make_problem(6, 200, 4))
     off = np.array([0.0, 0.1, -0.2, 0.3, 0.0, -0.1])
@@ -99,7 +99,7 @@ def test_scales_of_exact_depth_are_found() -> None:
         np.testing.assert_allclose(result.points, truth.points, atol=1e-5)
 
 
-def test_scales_move_beside_fixed_poses() -> None:
+def test_scales_are_refined_with_constant_poses() -> None:
     truth = exact(make_problem(5, 300, 3))
     off = np.array([0.1, 0.2, -0.2, 0.3, -0.1])
     start = replace(
@@ -154,7 +154,7 @@ def test_same_optimum_as_ceres_with_two_cameras(depth: bool, aspect: float) -> N
     assert_same_optimum(start if depth else without_depth(start), refine_focal=aspect == 1)
 
 
-def test_focal_length_per_camera() -> None:
+def test_exact_measurements_recover_focal_length_per_camera() -> None:
     """Each image has another wrong focal length; exact measurements recover all focal lengths."""
     truth = exact(make_problem(6, 200, 5))
     truth = replace(
@@ -291,7 +291,7 @@ def assert_fixed(problem: BundleProblem, result: BundleResult, names: tuple[str,
         np.testing.assert_array_equal(getattr(result, name), getattr(given, name))
 
 
-def test_points_only() -> None:
+def test_adjust_bundle_of_points_only_recovers_points() -> None:
     truth = exact(make_problem(5, 300, 3))
     start = replace(truth, points=perturb(truth, 0, 3.0).points, variable_pose=np.zeros(5, bool))
     result = adjust_bundle(start, TIGHT)
@@ -299,7 +299,7 @@ def test_points_only() -> None:
     np.testing.assert_allclose(result.points, truth.points, atol=1e-6)
 
 
-def test_poses_only() -> None:
+def test_adjust_bundle_of_poses_only_recovers_poses() -> None:
     truth = exact(make_problem(5, 300, 3))
     start = replace(perturb(truth, 0), points=truth.points, variable_point=np.zeros(300, bool))
     result = adjust_bundle(start, TIGHT)
@@ -308,7 +308,7 @@ def test_poses_only() -> None:
     np.testing.assert_allclose(result.translations, truth.translations, atol=1e-6)
 
 
-def test_local() -> None:
+def test_adjust_bundle_of_local_problem_recovers_variable_poses() -> None:
     """Two poses and most points are variable; all other poses and points are constant."""
     truth = exact(make_problem(6, 300, 4))
     variable_pose = np.isin(np.arange(6), [2, 3])
@@ -341,7 +341,7 @@ def test_depth_fixes_the_scale() -> None:
     np.testing.assert_allclose(result.points, expected, atol=1e-5)
 
 
-def test_scale_anchor_holds_one_coordinate_and_costs_nothing() -> None:
+def test_scale_anchor_keeps_one_coordinate_without_cost() -> None:
     start = without_depth(perturb(make_problem(6, 200, 4), 0))
     anchored = adjust_bundle(start, TIGHT)
     free = adjust_bundle(replace(start, scale_anchor=None), TIGHT)
@@ -433,7 +433,7 @@ def one_camera(points: Float64, **changes: object) -> BundleProblem:
     return replace(problem, **changes)
 
 
-def test_lifted_points_go_to_their_depth() -> None:
+def test_single_view_points_move_to_their_depth() -> None:
     start = one_camera(
         np.array([[0.1, 0.2, 3.0], [-0.3, 0.1, 2.5]]),
         obs_log_depth=np.log([2.0, 4.0]),
@@ -443,7 +443,7 @@ def test_lifted_points_go_to_their_depth() -> None:
     np.testing.assert_allclose(result.points, [[0, 0, 2], [0, 0, 4]], atol=1e-6)
 
 
-def test_points_seen_once_without_depth_move_sideways_only() -> None:
+def test_single_view_points_without_depth_keep_their_depth() -> None:
     start = one_camera(np.array([[0.1, 0.2, 3.0], [-0.3, 0.1, 2.5]]))
     result = adjust_bundle(start, TIGHT)
     assert result.final_cost < 1e-12
@@ -452,7 +452,7 @@ def test_points_seen_once_without_depth_move_sideways_only() -> None:
 
 
 @pytest.mark.parametrize("factor", [1e-3, 0.2, 5.0, 1e3])
-def test_depth_that_is_far_off_does_not_throw_points_behind_the_camera(factor: float) -> None:
+def test_wrong_initial_depth_keeps_points_before_the_camera(factor: float) -> None:
     start = one_camera(
         np.array([[0.0, 0.0, 2.0 * factor]]),
         obs_log_depth=np.log([2.0]),
@@ -463,7 +463,7 @@ def test_depth_that_is_far_off_does_not_throw_points_behind_the_camera(factor: f
     np.testing.assert_allclose(result.points, [[0, 0, 2]], atol=1e-6)
 
 
-def test_points_behind_the_camera_count_nothing_and_stay() -> None:
+def test_points_behind_the_camera_are_ignored() -> None:
     start = one_camera(
         np.array([[0.1, 0.0, -2.0], [0.1, 0.0, 2.0], [0.0, 0.0, 0.0]]),
         obs_log_depth=np.log([2.0, 2.0, 2.0]),
@@ -474,7 +474,7 @@ def test_points_behind_the_camera_count_nothing_and_stay() -> None:
     np.testing.assert_allclose(result.points[1], [0, 0, 2], atol=1e-6)
 
 
-def test_nothing_is_gained_by_leaving_the_view() -> None:
+def test_points_do_not_move_behind_the_camera() -> None:
     """No point in front of both cameras fits the measurements; the best point is behind a
     camera."""
     start = BundleProblem(
@@ -493,7 +493,7 @@ def test_nothing_is_gained_by_leaving_the_view() -> None:
     assert 0 < result.final_cost < result.initial_cost
 
 
-def test_survives_gross_errors() -> None:
+def test_large_perturbation_reaches_the_same_cost() -> None:
     truth = make_problem(8, 400, 4)
     start = perturb(truth, 0, amount=10.0)
     result = adjust_bundle(start, soft_l1(max_iterations=200))
@@ -502,7 +502,7 @@ def test_survives_gross_errors() -> None:
 
 
 @pytest.mark.parametrize("points", [0, 3])
-def test_without_observations(points: int) -> None:
+def test_problem_without_observations_is_unchanged(points: int) -> None:
     start = one_camera(np.ones((points, 3)))
     none = np.zeros(0, dtype=np.int64)
     start = replace(
@@ -555,7 +555,7 @@ def test_iteration_limit_is_reported() -> None:
         ("scale_anchor", 7),
     ],
 )
-def test_wrong_input_is_named(field: str, value: object) -> None:
+def test_wrong_input_raises_with_its_name(field: str, value: object) -> None:
     problem = make_problem(5, 40, 3)
     with pytest.raises(DataError) as caught:
         adjust_bundle(replace(problem, **{field: value}))
@@ -618,7 +618,7 @@ def degenerate_problems(draw: st.DrawFn) -> BundleProblem:
     depth_loss=st.sampled_from(Loss),
     dense=st.booleans(),
 )
-def test_degenerate_geometry(
+def test_degenerate_geometry_gives_finite_result(
     problem: BundleProblem, reprojection_loss: Loss, depth_loss: Loss, dense: bool
 ) -> None:
     """Degenerate problems cause no exception, warning, infinite value or cost increase."""

@@ -104,7 +104,9 @@ def numeric_jacobian(p: PreparedBundle) -> Float64:
 
 @pytest.mark.parametrize("depth_loss", Loss)
 @pytest.mark.parametrize("reprojection_loss", Loss)
-def test_gradient_of_every_loss(reprojection_loss: Loss, depth_loss: Loss) -> None:
+def test_gradient_of_every_loss_equals_finite_differences(
+    reprojection_loss: Loss, depth_loss: Loss
+) -> None:
     options = soft_l1(reprojection_loss=reprojection_loss, depth_loss=depth_loss)
     p = prepare_bundle(small_problem(), options)
     layout = p.bundle.layout
@@ -135,7 +137,7 @@ def test_gradient_of_every_loss(reprojection_loss: Loss, depth_loss: Loss) -> No
 
 
 @pytest.mark.parametrize("kind", ["reprojection", "depth"])
-def test_one_residual_at_random_poses(kind: str) -> None:
+def test_derivatives_of_one_residual_equal_finite_differences(kind: str) -> None:
     """Gradient and Gauss-Newton matrix of the camera point, to 1e-6."""
     rng = np.random.default_rng(0)
     for _ in range(50):

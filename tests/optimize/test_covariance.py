@@ -23,7 +23,7 @@ from tests.optimize.bundle_reference import (
 
 
 @pytest.mark.parametrize("depth", [True, False])
-def test_equals_dense_inverse(depth: bool) -> None:
+def test_point_covariance_equals_dense_inverse(depth: bool) -> None:
     problem = make_problem(5, 40, 3.5)
     problem = problem if depth else replace(problem, obs_log_depth=None)
     count = len(problem.points)
@@ -36,7 +36,7 @@ def test_equals_dense_inverse(depth: bool) -> None:
     np.testing.assert_array_equal(actual, actual.transpose(0, 2, 1))
 
 
-def test_equals_colmap() -> None:
+def test_point_covariance_equals_colmap() -> None:
     problem = replace(make_problem(8, 300, 4), obs_log_depth=None)
     rec = to_pycolmap(problem)
     options = pycolmap.BACovarianceOptions(params=pycolmap.BACovarianceOptionsParams.POINTS)
@@ -48,7 +48,7 @@ def test_equals_colmap() -> None:
     )
 
 
-def test_depth_lowers_the_variance() -> None:
+def test_depth_decreases_the_variance() -> None:
     problem = make_problem(5, 40, 3)
     with_depth = np.trace(compute_point_covariances(problem, soft_l1()), axis1=1, axis2=2)
     without = np.trace(
@@ -57,7 +57,7 @@ def test_depth_lowers_the_variance() -> None:
     assert (with_depth < without).all()
 
 
-def test_predicts_the_scatter_of_triangulated_depth() -> None:
+def test_covariance_equals_scatter_of_triangulated_depth() -> None:
     """With 1 px noise in two exact cameras, triangulated points have the predicted covariance."""
     rng = np.random.default_rng(0)
     turns = np.stack([rotation(np.array([0, 0.1, 0])), rotation(np.array([0.1, -0.2, 0.3]))])

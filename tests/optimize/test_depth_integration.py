@@ -95,7 +95,7 @@ def test_gradient_of_every_residual_by_finite_differences(part, seed):
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_quadratic_majorizes_the_energy(seed):
+def test_quadratic_model_majorizes_the_energy(seed):
     shape = (8, 9)
     depth, normals, anchors = random_problem(shape, seed, masked=0.1)
     terms = DepthIntegrator(depth, normals, camera_of(shape))._terms(anchors, 1.0)
@@ -110,7 +110,7 @@ def test_the_quadratic_majorizes_the_energy(seed):
         assert energy <= quadratic * (1 + 1e-5)
 
 
-def test_the_pull_of_the_prior_never_fades():
+def test_gradient_of_prior_increases_with_distance():
     depth, normals, _ = random_problem((3, 4), 0)
     terms = only("prior", DepthIntegrator(depth, normals, camera_of((3, 4)))._terms(NO_ANCHORS, 1))
     pulls = [
@@ -121,7 +121,7 @@ def test_the_pull_of_the_prior_never_fades():
     assert (pulls[2] > pulls[1]).all()
 
 
-def test_reaches_the_energy_of_the_reference():
+def test_refine_reaches_the_energy_of_the_reference():
     camera = PinholeCamera(64, 43, 58.0, 58.0, 32.0, 21.5)
     scene, pose = room_scene(), arc_poses(1, 0)[0]
     depth, normals = rendered(scene, pose, camera)
@@ -137,7 +137,7 @@ def test_reaches_the_energy_of_the_reference():
     assert refined.converged
 
 
-def test_a_plane_is_recovered_from_its_normals_and_three_points():
+def test_plane_is_recovered_from_normals_and_three_points():
     scene = AnalyticScene((Plane((0, 4, 0), (0.3, -1.0, 0.2)),))
     depth, normals = rendered(scene, look_at((0, 0, 0), (0, 1, 0)))
     tilt = np.linspace(-0.2, 0.2, CAMERA.width)
@@ -155,7 +155,7 @@ def test_a_plane_is_recovered_from_its_normals_and_three_points():
     np.testing.assert_allclose(refined.depth, depth, rtol=5e-3)
 
 
-def test_depth_edges_survive_and_noise_goes():
+def test_refine_keeps_depth_edges_and_removes_noise():
     camera = PinholeCamera(96, 64, 88.0, 88.0, 48.0, 32.0)
     depth, normals = rendered(room_scene(), arc_poses(1, 0)[0], camera)
     rng = np.random.default_rng(0)
@@ -172,7 +172,7 @@ def test_depth_edges_survive_and_noise_goes():
     assert np.median(jump / np.abs(np.diff(np.log(depth), axis=1))[edge]) > 0.9
 
 
-def test_wrong_points_are_resisted():
+def test_wrong_points_hardly_change_depth():
     depth, normals = rendered(room_scene(), arc_poses(1, 0)[0])
     integrator = DepthIntegrator(depth_prior(depth), normal_prior(normals), CAMERA)
     good = exact_anchors(depth, 40)
@@ -225,7 +225,7 @@ def test_holes_are_integrated_and_unreachable_pixels_are_marked():
     assert (variance > whole.variance(whole.refine()))[hole].all()
 
 
-def test_the_scale_shifts_the_log_depth():
+def test_scale_of_prior_shifts_the_log_depth():
     depth, normals, anchors = random_problem((12, 15), 3)
     integrator = DepthIntegrator(depth, normals, camera_of((12, 15)))
     one = integrator.refine(anchors)
@@ -238,7 +238,7 @@ def test_the_scale_shifts_the_log_depth():
     assert again.scale == 2.5
 
 
-def test_work_that_would_change_little_is_skipped():
+def test_refine_of_nearly_unchanged_points_is_skipped():
     depth, normals = rendered(room_scene(), arc_poses(1, 0)[0])
     rough = depth * np.exp(np.random.default_rng(0).normal(0, 0.03, depth.shape))
     integrator = DepthIntegrator(depth_prior(rough), normal_prior(normals), CAMERA)
@@ -264,7 +264,7 @@ def test_work_that_would_change_little_is_skipped():
     assert not drifting.skipped
 
 
-def test_a_warm_start_is_cheaper_and_as_good():
+def test_warm_start_is_faster_and_equally_accurate():
     depth, normals = rendered(room_scene(), arc_poses(1, 0)[0])
     rough = depth * np.exp(np.random.default_rng(0).normal(0, 0.03, depth.shape))
     integrator = DepthIntegrator(depth_prior(rough), normal_prior(normals), CAMERA)
@@ -277,7 +277,7 @@ def test_a_warm_start_is_cheaper_and_as_good():
     assert warm.energy < 1.05 * cold.energy
 
 
-def test_large_maps_profit_from_a_coarse_start(monkeypatch):
+def test_coarse_start_accelerates_large_maps(monkeypatch):
     camera = PinholeCamera(640, 480, 560.0, 560.0, 320.0, 240.0)
     depth, normals = rendered(room_scene(), arc_poses(1, 0.0)[0], camera)
     rng = np.random.default_rng(0)
@@ -310,7 +310,7 @@ def test_variance_is_the_diagonal_of_the_inverse_hessian():
     assert (integrator.variance(refined) >= 0.999 * expected).all()
 
 
-def test_results_do_not_depend_on_threads():
+def test_result_does_not_depend_on_threads():
     depth, normals, anchors = random_problem((40, 50), 5)
     integrator = DepthIntegrator(depth, normals, camera_of((40, 50)))
     alone = integrator.refine(anchors).log_depth
@@ -319,7 +319,7 @@ def test_results_do_not_depend_on_threads():
             np.testing.assert_array_equal(refined.log_depth, alone)
 
 
-def test_grids_and_variances_are_checked():
+def test_wrong_grids_and_variances_raise():
     depth, normals, _ = random_problem((6, 7), 0)
     with pytest.raises(DataError, match="one grid"):
         DepthIntegrator(depth, normals, camera_of((7, 6)))
@@ -328,7 +328,7 @@ def test_grids_and_variances_are_checked():
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_wild_normals_continue_depth_to_nowhere_far(seed):
+def test_random_normals_give_bounded_depth(seed):
     """Normals that face away or are perpendicular to the ray could change depth by any factor."""
     shape = (1, 6)
     known = np.arange(6).reshape(shape) == 0
@@ -370,7 +370,7 @@ def degenerate_problems(draw):
 
 @settings(max_examples=150)
 @given(problem=degenerate_problems(), scale=st.sampled_from([1.0, 1e-3, 40.0]))
-def test_degenerate_input_never_fails_and_energy_never_rises(problem, scale):
+def test_degenerate_input_never_increases_the_energy(problem, scale):
     depth, normals, anchors = problem
     integrator = DepthIntegrator(depth, normals, camera_of(depth.shape))
     first = integrator.refine(NO_ANCHORS, scale=scale)

@@ -11,7 +11,7 @@ from tests.optimize.integration_reference import grid_operator
 
 @settings(max_examples=40)
 @given(height=st.integers(1, 22), width=st.integers(1, 22), seed=st.integers(0, 10**6))
-def test_equals_the_dense_inverse(height, width, seed):
+def test_selected_inverse_equals_dense_inverse(height, width, seed):
     rng = np.random.default_rng(seed)
     planes = (10 ** rng.uniform(-6, 4, (3, height, width))).astype(np.float32)
     planes[2] = np.maximum(planes[2], 1e-2)
@@ -21,7 +21,7 @@ def test_equals_the_dense_inverse(height, width, seed):
 
 
 @pytest.mark.parametrize("shape", [(1, 50), (50, 1), (7, 6), (13, 14), (31, 45)])
-def test_odd_shapes(shape):
+def test_selected_inverse_of_odd_shapes_equals_dense_inverse(shape):
     ones = np.ones(shape, np.float32)
     dense = np.linalg.inv(grid_operator(ones, ones, 0.1 * ones).toarray())
     expected = np.diag(dense).reshape(shape)

@@ -11,14 +11,14 @@ SCALE = 1.5
 
 
 @pytest.mark.parametrize("loss", Loss)
-def test_kernels_and_arrays_agree(loss: Loss) -> None:
+def test_losses_of_kernels_equal_those_of_arrays(loss: Loss) -> None:
     values, weights = LOSSES[loss](S, SCALE)
     scalar = np.array([evaluate_loss(int(loss), s, SCALE) for s in S])
     np.testing.assert_allclose(scalar, np.column_stack([values, weights]), rtol=1e-14)
 
 
 @pytest.mark.parametrize("loss", Loss)
-def test_weight_is_the_derivative(loss: Loss) -> None:
+def test_weight_equals_derivative_of_loss(loss: Loss) -> None:
     s = S[S > 0]
     step = 1e-6 * s
     slope = (LOSSES[loss](s + step, SCALE)[0] - LOSSES[loss](s - step, SCALE)[0]) / (2 * step)
@@ -26,7 +26,7 @@ def test_weight_is_the_derivative(loss: Loss) -> None:
 
 
 @pytest.mark.parametrize("loss", Loss)
-def test_starts_as_least_squares_and_never_exceeds_it(loss: Loss) -> None:
+def test_loss_is_bounded_by_least_squares(loss: Loss) -> None:
     values, weights = LOSSES[loss](S, SCALE)
     assert (values[0], weights[0]) == (0, 1)
     assert (values <= S * (1 + 1e-12)).all()
@@ -36,7 +36,7 @@ def test_starts_as_least_squares_and_never_exceeds_it(loss: Loss) -> None:
 @pytest.mark.parametrize(
     ("loss", "name"), [(Loss.SOFT_L1, "soft_l1"), (Loss.CAUCHY, "cauchy"), (Loss.TRIVIAL, None)]
 )
-def test_agrees_with_ceres(loss: Loss, name: str | None) -> None:
+def test_loss_equals_ceres(loss: Loss, name: str | None) -> None:
     """The loss is the cost of a problem with one residual, because Ceres exposes no loss values."""
 
     class Constant(pyceres.CostFunction):  # type: ignore[misc]

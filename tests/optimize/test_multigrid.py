@@ -69,7 +69,7 @@ def energy_error(planes: Planes, x: np.ndarray, solution: np.ndarray) -> float:
     decades=st.floats(0, 3),
     seed=st.integers(0, 10**6),
 )
-def test_agrees_with_a_direct_solver(height, width, decades, seed):
+def test_solution_equals_direct_solver(height, width, decades, seed):
     planes = random_planes((height, width), seed, decades)
     rhs = np.random.default_rng(seed + 1).normal(size=(height, width))
     solver = Multigrid(height, width)
@@ -80,7 +80,7 @@ def test_agrees_with_a_direct_solver(height, width, decades, seed):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (8, 1), (5, 7), (12, 13)])
-def test_preconditioner_is_symmetric_and_never_overshoots(shape):
+def test_preconditioner_is_symmetric_with_eigenvalues_up_to_one(shape):
     matrix = preconditioner_of(random_planes(shape, 3, 2.0))
     np.testing.assert_allclose(matrix, matrix.T, atol=1e-12 * np.abs(matrix).max())
     assert spectrum(random_planes(shape, 3, 2.0)).min() > 0.05
@@ -88,7 +88,7 @@ def test_preconditioner_is_symmetric_and_never_overshoots(shape):
 
 
 @pytest.mark.parametrize("seed", [1, 26, 33, 38])
-def test_firmly_held_pixels_between_strips_do_not_make_it_overshoot(seed):
+def test_strong_data_terms_between_strips_keep_eigenvalues_up_to_one(seed):
     # Pixels with a strong data term give coarse grids negative masses.
     values = spectrum(heavy_planes((17, 16), seed))
     assert values.min() > 0
@@ -113,7 +113,7 @@ def preconditioner_of(planes: Planes) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shape", [(9, 12), (1, 8), (7, 7)])
-def test_coarse_energy_is_that_of_the_interpolated_map(shape):
+def test_coarse_energy_equals_energy_of_interpolated_map(shape):
     east, south, mass = random_planes(shape, 5, 2.0, cut=0.0)
     solver = Multigrid(*shape)
     solver.update(east, south, 0 * mass)
@@ -154,7 +154,7 @@ def test_few_iterations_suffice_at_any_size():
     assert needed[-1] <= 2 * needed[0]
 
 
-def test_relative_error_tells_the_truth():
+def test_relative_error_is_close_to_the_true_error():
     planes = depth_like_planes(64)
     solver = Multigrid(64, 64)
     solver.update(*planes)
@@ -180,7 +180,7 @@ def test_detached_pixels_stay_zero():
     assert (x[3:6, 3:6] == 0).all()
 
 
-def test_no_work_is_done_for_a_zero_right_hand_side():
+def test_zero_right_hand_side_needs_no_iteration():
     solver = Multigrid(6, 6)
     solver.update(*random_planes((6, 6), 1, 2.0))
     solution = solver.solve(np.zeros((6, 6)), 10, 1e-3)

@@ -80,7 +80,7 @@ def test_distance_and_depth_are_those_of_the_nearest_point_of_the_segment() -> N
     np.testing.assert_allclose(found[1], expected[1], rtol=1e-3)
 
 
-def test_what_is_behind_the_camera_has_neither() -> None:
+def test_points_behind_the_camera_have_no_distance_and_depth() -> None:
     seen = segments(4)
     seen.near[1] = -seen.near[1]
     seen.far[2] = -seen.far[2]
@@ -90,7 +90,7 @@ def test_what_is_behind_the_camera_has_neither() -> None:
 
 @pytest.mark.parametrize("slack", [0.0, 0.02, 0.5])
 @pytest.mark.parametrize("scale", [1.0, 5.0])
-def test_gradient_is_that_of_finite_differences(slack: float, scale: float) -> None:
+def test_gradient_equals_finite_differences(slack: float, scale: float) -> None:
     seen = segments(slack=slack, noise_px=2.0)
     pose = moved(TRUTH, np.array([0.002, -0.003, 0.001, 0.01, -0.02, 0.015]))
     cost, gradient, _ = objective(pose, seen, scale)
@@ -104,7 +104,7 @@ def test_gradient_is_that_of_finite_differences(slack: float, scale: float) -> N
     np.testing.assert_allclose(gradient, np.array(numeric) / (2 * step), rtol=1e-5, atol=1e-6)
 
 
-def test_matrix_is_that_of_the_residuals_finite_differences() -> None:
+def test_matrix_equals_finite_differences_of_residuals() -> None:
     """Segments have length zero, and a large limit gives all weights the same value."""
     limit = 1e5
     seen = segments(slack=0.0, noise_px=1.0, limit=limit)
@@ -123,7 +123,7 @@ def test_matrix_is_that_of_the_residuals_finite_differences() -> None:
     np.testing.assert_allclose(objective(pose, seen)[2], expected, rtol=1e-5)
 
 
-def test_pose_is_found_from_far_off_among_wrong_matches() -> None:
+def test_pose_with_wrong_matches_is_found_from_distant_start() -> None:
     seen = segments(200, slack=0.05)
     rng = np.random.default_rng(1)
     wrong = rng.random(200) < 0.3
@@ -137,7 +137,7 @@ def test_pose_is_found_from_far_off_among_wrong_matches() -> None:
     assert shift < 0.01
 
 
-def test_optimum_of_noisy_points_is_that_of_scipy() -> None:
+def test_optimum_of_noisy_points_equals_scipy() -> None:
     seen = segments(80, slack=0.0, noise_px=1.0)
 
     def residuals(step: Float64) -> Float64:
@@ -153,7 +153,7 @@ def test_optimum_of_noisy_points_is_that_of_scipy() -> None:
     np.testing.assert_allclose(found[1], expected[1], atol=1e-5)
 
 
-def test_points_are_as_good_as_colmap_makes_of_them() -> None:
+def test_pose_from_points_is_as_accurate_as_colmap() -> None:
     """COLMAP minimizes another robust loss of the same errors."""
     seen = segments(200, slack=0.0, noise_px=0.5, seed=3)
     start = moved(TRUTH, np.array([0.01, -0.01, 0.01, 0.05, 0.05, -0.05]))
@@ -170,7 +170,7 @@ def test_points_are_as_good_as_colmap_makes_of_them() -> None:
     assert all(mine < 1.3 * theirs for mine, theirs in zip(errors(found), other, strict=True))
 
 
-def test_a_pose_that_nothing_determines_stays() -> None:
+def test_undetermined_pose_is_unchanged() -> None:
     seen = segments(5)
     far_off = seen._replace(xy=seen.xy + 1e4)
     found = refine_pose(TRUTH, INTRINSICS, far_off, scales=np.ones(3))

@@ -17,7 +17,7 @@ CAMERA = PinholeCamera(37, 26, 30.0, 31.0, 18.2, 13.1)
 
 
 @pytest.mark.parametrize("step", [1, 2, 3, 4])
-def test_thinned_pixels_see_what_they_saw(step: int) -> None:
+def test_subsampled_pixels_keep_their_rays(step: int) -> None:
     xy = pixel_centers(CAMERA.width, CAMERA.height)
     rays = unproject(CAMERA, xy, np.ones(xy.shape[:2]))
     camera = subsample_camera(CAMERA, step)
@@ -33,7 +33,7 @@ def test_thinned_pixels_see_what_they_saw(step: int) -> None:
 
 
 @pytest.mark.parametrize("step", [1, 2, 3])
-def test_a_plane_comes_back_from_its_thinned_form(step: int) -> None:
+def test_interpolated_plane_equals_the_original(step: int) -> None:
     rows, columns = np.mgrid[:26, :37]
     plane = 0.3 * rows - 0.2 * columns + 1.0
     thin = subsample(plane, step)
@@ -42,7 +42,7 @@ def test_a_plane_comes_back_from_its_thinned_form(step: int) -> None:
     np.testing.assert_allclose(back[inside], plane[inside], atol=1e-5)
 
 
-def test_pixels_that_are_not_valid_count_nothing() -> None:
+def test_invalid_pixels_are_ignored() -> None:
     thin = np.full((13, 18), 2.0)
     valid = np.ones(thin.shape, dtype=np.bool_)
     thin[4:7, 5:8], valid[4:7, 5:8] = np.nan, False
@@ -51,7 +51,7 @@ def test_pixels_that_are_not_valid_count_nothing() -> None:
     assert back[11, 13] == 0.0
 
 
-def test_the_step_leaves_about_as_many_columns_as_wanted() -> None:
+def test_step_gives_about_the_requested_columns() -> None:
     assert [compute_subsampling_step(columns, 200) for columns in (50, 200, 387, 640)] == [
         1,
         1,

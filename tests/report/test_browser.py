@@ -71,7 +71,7 @@ SCREEN = 800
 """Height in pixels of the page that is visible without scrolling."""
 
 
-def test_it_renders_and_asks_nobody(opened: Open, finished: Path) -> None:
+def test_report_renders_without_network_requests(opened: Open, finished: Path) -> None:
     browser = opened(finished)
     wait_for(browser, "window.report !== undefined")
     wait_for(browser, f"{COLORED} > 100")
@@ -85,9 +85,7 @@ def test_it_renders_and_asks_nobody(opened: Open, finished: Path) -> None:
     assert foreign == set()
 
 
-def test_what_is_missing_and_what_to_do_is_on_the_first_screen(
-    opened: Open, finished: Path
-) -> None:
+def test_first_screen_shows_unregistered_photos_and_remedies(opened: Open, finished: Path) -> None:
     browser = opened(finished)
     assert wait_for(browser, "document.getElementById('badge').innerText").lower() == "partial"
     assert "1 photo missing: nothing in common with another photo" in browser.execute_script(
@@ -96,7 +94,7 @@ def test_what_is_missing_and_what_to_do_is_on_the_first_screen(
     assert browser.execute_script(f"return {LOWEST_ADVICE}") < SCREEN
 
 
-def test_hostile_names_are_text(opened: Open, finished: Path) -> None:
+def test_hostile_names_are_shown_as_text(opened: Open, finished: Path) -> None:
     browser = opened(finished)
     names = wait_for(
         browser, "[...document.querySelectorAll('#table tbody tr')].map((row) => row.innerText)"
@@ -105,7 +103,7 @@ def test_hostile_names_are_text(opened: Open, finished: Path) -> None:
     assert browser.execute_script("return document.querySelectorAll('b[onload]').length") == 0
 
 
-def test_a_click_on_a_camera_shows_its_photo(opened: Open, finished: Path) -> None:
+def test_click_on_camera_shows_its_photo(opened: Open, finished: Path) -> None:
     browser = opened(finished)
     wait_for(browser, "window.report !== undefined")
     wait_for(browser, f"{COLORED} > 100")
@@ -122,7 +120,7 @@ def test_a_click_on_a_camera_shows_its_photo(opened: Open, finished: Path) -> No
         wait_for(browser, f"{title} === arguments[0]", name)
 
 
-def test_maps_matches_and_table(opened: Open, finished: Path) -> None:
+def test_report_shows_maps_matches_and_table(opened: Open, finished: Path) -> None:
     browser = opened(finished)
     wait_for(browser, "window.report !== undefined")
     browser.execute_script("document.querySelector('#strip button').click()")
@@ -156,7 +154,7 @@ def test_maps_matches_and_table(opened: Open, finished: Path) -> None:
     assert [line for line in browser.get_log("browser") if line["level"] == "SEVERE"] == []
 
 
-def test_a_failed_run_says_what_to_do_on_the_first_screen(opened: Open, failed: Path) -> None:
+def test_first_screen_of_failed_run_shows_remedy(opened: Open, failed: Path) -> None:
     browser = opened(failed)
     assert wait_for(browser, "document.getElementById('badge').innerText").lower() == "failed"
     assert browser.execute_script(f"return {LOWEST_ADVICE}") < SCREEN

@@ -104,12 +104,12 @@ def summary(**changes: Any) -> dict[str, Any]:
     }
 
 
-def test_nothing_is_found_where_nothing_is_wrong() -> None:
+def test_findings_of_good_run_are_empty() -> None:
     assert findings(summary()) == []
     assert judge(summary()).level == "good"
 
 
-def test_the_worst_comes_first() -> None:
+def test_findings_are_sorted_by_severity() -> None:
     said = summary()
     said["images"]["details"]["a"]["focal_length_from"] = "default"
     said["images"]["registered"].remove("c")
@@ -122,7 +122,7 @@ def test_the_worst_comes_first() -> None:
     assert judge(said).level == "doubtful"
 
 
-def test_a_run_that_matched_nothing() -> None:
+def test_findings_of_run_without_matches() -> None:
     few = PairReason.TOO_FEW_MATCHES.because(num_matches=5, min_matches=15)
     dropped = [
         {"images": pair, "matches": 5, "dropped": few.to_json()}
@@ -135,7 +135,7 @@ def test_a_run_that_matched_nothing() -> None:
     assert "too few matches in 3 pairs" in first.text
 
 
-def test_a_photo_that_hangs_on_another_is_told() -> None:
+def test_findings_name_photo_that_depends_on_one_other() -> None:
     said = summary()
     said["pairs"]["all"].pop()
     (found,) = findings(said)
@@ -303,7 +303,7 @@ def test_verdict_doubts_focal_lengths_with_large_std(
     assert doubts(report) == expected
 
 
-def test_images_that_were_left_out_are_a_finding() -> None:
+def test_findings_include_images_that_were_left_out() -> None:
     report = summary()
     report["images"]["left_out"] = {"c": "mask c.png is all black: it excludes every pixel"}
     (finding,) = [item for item in findings(report) if item.images == ("c",)]

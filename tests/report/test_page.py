@@ -23,7 +23,7 @@ def data_of(page: str) -> dict[str, Any]:
     return json.loads(text)
 
 
-def test_a_run_writes_its_report_and_what_it_is_made_from(finished: Path) -> None:
+def test_run_writes_report_and_its_source_files(finished: Path) -> None:
     assert (finished / REPORT).is_file()
     assert (finished / "views" / "1.png.webp").is_file()
     with np.load(finished / "views" / "1.png.npz") as maps:
@@ -33,20 +33,20 @@ def test_a_run_writes_its_report_and_what_it_is_made_from(finished: Path) -> Non
         assert matches["starts"][-1] == len(matches["points_a"]) == len(matches["points_b"]) > 0
 
 
-def test_it_is_made_anew_from_the_folder_alone(finished: Path, tmp_path: Path) -> None:
+def test_report_is_written_again_from_the_folder(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / finished.name)
     again = write_report(tmp_path / finished.name)
     assert again.read_text(encoding="utf-8") == (finished / REPORT).read_text(encoding="utf-8")
 
 
-def test_it_names_no_server(finished: Path) -> None:
+def test_report_loads_nothing_from_servers(finished: Path) -> None:
     page = (finished / REPORT).read_text(encoding="utf-8")
     assert "default-src 'none'" in page
     assert not re.search(r"""(src|href)=["']?(https?:)?//""", page)
     assert "url(http" not in page
 
 
-def test_points_survive_their_thinning(finished: Path) -> None:
+def test_points_of_report_are_those_of_the_model(finished: Path) -> None:
     result = ResultFolder.open(finished)
     points = data_of(render(result))["points"]["sparse"]
     assert points["count"] == result.model.num_points3D()
@@ -56,7 +56,7 @@ def test_points_survive_their_thinning(finished: Path) -> None:
     assert np.abs(xyz - truth).max() < 1e-4 * np.ptp(truth)
 
 
-def test_it_says_who_is_missing_and_what_to_do(finished: Path) -> None:
+def test_report_lists_unregistered_photos_and_remedies(finished: Path) -> None:
     data = data_of((finished / REPORT).read_text(encoding="utf-8"))
     assert data["verdict"]["level"] == "partial"
     (missing,) = [photo for photo in data["photos"] if photo["status"] == "missing"]
@@ -65,7 +65,7 @@ def test_it_says_who_is_missing_and_what_to_do(finished: Path) -> None:
     assert any("noise.png" in finding["images"] for finding in data["findings"])
 
 
-def test_views_can_be_left_out(finished: Path, tmp_path: Path) -> None:
+def test_report_without_views_is_written(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "out")
     shutil.rmtree(tmp_path / "out" / "views")
     (tmp_path / "out" / "dense.ply").unlink()
@@ -74,7 +74,7 @@ def test_views_can_be_left_out(finished: Path, tmp_path: Path) -> None:
     assert all("photo" not in photo["pictures"] for photo in data["photos"])
 
 
-def test_a_failed_run_does_not_show_the_results_before_it(
+def test_report_of_failed_run_shows_no_earlier_results(
     finished: Path, failed: Path, tmp_path: Path
 ) -> None:
     shutil.copytree(finished, tmp_path / "out")
@@ -87,7 +87,7 @@ def test_a_failed_run_does_not_show_the_results_before_it(
 @pytest.mark.parametrize(
     "name", ["summary.json", "dense.ply", "depth/1.png.npz", "views/1.png.npz", "views/1.png.webp"]
 )
-def test_a_damaged_file_is_named(finished: Path, tmp_path: Path, name: str) -> None:
+def test_damaged_result_file_is_named(finished: Path, tmp_path: Path, name: str) -> None:
     shutil.copytree(finished, tmp_path / "out")
     file = tmp_path / "out" / name
     file.write_bytes(file.read_bytes()[:40])
@@ -96,6 +96,6 @@ def test_a_damaged_file_is_named(finished: Path, tmp_path: Path, name: str) -> N
     assert (tmp_path / "out" / REPORT).read_bytes() == (finished / REPORT).read_bytes()
 
 
-def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
+def test_folder_without_results_raises(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"summary\.json"):
         write_report(tmp_path)

@@ -24,7 +24,7 @@ from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 
-def test_a_run_shows_how_it_grows() -> None:
+def test_viewer_of_a_run_gets_growing_scenes() -> None:
     seen: list[SceneState] = []
 
     class Watcher:
@@ -46,7 +46,7 @@ def test_a_run_shows_how_it_grows() -> None:
     assert last.images[0].depth is not None
 
 
-def test_a_depth_map_is_lifted_to_where_it_is() -> None:
+def test_depth_map_is_unprojected_to_world_points() -> None:
     camera = PinholeCamera(40, 30, 35.0, 35.0, 20.0, 15.0)
     depth = np.full((30, 40), 3.0)
     depth[:, :20] = np.nan
@@ -61,7 +61,9 @@ def test_a_depth_map_is_lifted_to_where_it_is() -> None:
     assert len(unproject_depth_map(PosedImage("b", camera, np.eye(3), np.zeros(3)), red).xyz) == 0
 
 
-def test_any_colmap_model_can_be_seen(model: pycolmap.Reconstruction, tmp_path: Path) -> None:
+def test_colmap_model_of_other_program_is_viewed(
+    model: pycolmap.Reconstruction, tmp_path: Path
+) -> None:
     (tmp_path / "sparse" / "0").mkdir(parents=True)
     model.write_text(str(tmp_path / "sparse" / "0"))
     scene, cloud, _ = read_scene(tmp_path)
@@ -72,7 +74,7 @@ def test_any_colmap_model_can_be_seen(model: pycolmap.Reconstruction, tmp_path: 
     np.testing.assert_allclose(own.translation, image.cam_from_world().translation)
 
 
-def test_what_is_no_model_is_said(tmp_path: Path) -> None:
+def test_folder_without_model_raises(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no COLMAP model"):
         read_scene(tmp_path)
     (tmp_path / "images.bin").write_bytes(b"\0\1")
@@ -117,7 +119,7 @@ def test_viewers_come_from_plugins(tmp_path: Path, install_plugin) -> None:
         open_viewer(registry, "broken", tmp_path, pictures_from_photos(tmp_path))
 
 
-def test_a_model_is_shown_by_the_command(
+def test_view_command_shows_a_model(
     model: pycolmap.Reconstruction, tmp_path: Path, install_plugin
 ) -> None:
     install_plugin(
@@ -150,7 +152,7 @@ def test_a_model_is_shown_by_the_command(
     assert (tmp_path / "seen.txt").read_text() == "5 20"
 
 
-def test_a_run_opens_the_viewer_before_anything_else(tmp_path: Path) -> None:
+def test_viewer_opens_before_the_run_starts(tmp_path: Path) -> None:
     arguments = ["reconstruct", str(tmp_path), "-o", str(tmp_path / "out"), "--viewer", "nothing"]
     ended = CliRunner().invoke(build_app(), arguments)
     assert ended.exit_code == 2

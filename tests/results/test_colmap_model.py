@@ -30,7 +30,7 @@ def model(solved) -> pycolmap.Reconstruction:
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_the_model_holds_what_the_reconstruction_holds(solved, model, tmp_path, text) -> None:
+def test_written_model_equals_the_reconstruction(solved, model, tmp_path, text) -> None:
     write_model(tmp_path, model, text=text)
     read = pycolmap.Reconstruction(str(tmp_path))
     assert read.num_reg_images() == 3
@@ -54,7 +54,7 @@ def test_the_model_holds_what_the_reconstruction_holds(solved, model, tmp_path, 
     assert read.compute_mean_reprojection_error() < 1e-6
 
 
-def test_reprojection_errors_are_those_of_the_models_own_camera(solved) -> None:
+def test_reprojection_errors_use_the_camera_of_the_model(solved) -> None:
     xy = []
     for image, keypoints in zip(solved.best.images, keypoints_of(solved), strict=True):
         local = solved.best.points @ image.rotation.T + image.translation
@@ -68,7 +68,7 @@ def test_reprojection_errors_are_those_of_the_models_own_camera(solved) -> None:
     assert [point.error for point in model.points3D.values()] == pytest.approx([5.0] * 40)
 
 
-def test_different_cameras_stay_apart(solved) -> None:
+def test_different_cameras_are_not_merged(solved) -> None:
     cameras = [colmap_from_pinhole(image.camera) for image in solved.best.images]
     cameras[1] = DISTORTED
     colors = np.zeros((len(solved.best.points), 3), np.uint8)
@@ -77,7 +77,7 @@ def test_different_cameras_stay_apart(solved) -> None:
     assert by_name["images/0.png"] == by_name["images/2.png"] != by_name["images/1.png"]
 
 
-def test_points_have_the_colour_of_the_photos(solved, model) -> None:
+def test_points_have_the_color_of_the_photos(solved, model) -> None:
     expected = average_point_colors(solved.best, keypoints_of(solved), solved.views.__getitem__)
     stored = {tuple(point.xyz): point.color for point in model.points3D.values()}
     for xyz, color in zip(solved.best.points[:40], expected[:40], strict=True):

@@ -38,7 +38,7 @@ def assert_covers_every_map(solved, points: np.ndarray) -> None:
         assert (distance < 0.08).mean() > 0.95
 
 
-def test_a_surface_that_several_images_see_is_there_once(solved) -> None:
+def test_surface_seen_by_several_images_is_fused_once(solved) -> None:
     cloud = fuse_depth_maps(solved.best, solved.views.__getitem__)
     total = sum(image.depth.valid.sum() for image in solved.best.images)
     assert 0.3 * total < len(cloud.points) < 0.7 * total
@@ -61,7 +61,7 @@ def test_normals_face_the_camera_that_saw_the_point(solved) -> None:
     assert (towards[length > 0] > 0).mean() > 0.99
 
 
-def test_exact_maps_give_points_on_the_surfaces_in_their_colours(solved) -> None:
+def test_exact_maps_give_colored_points_on_the_surfaces(solved) -> None:
     points, colors, *_ = fuse_depth_maps(solved.best, solved.views.__getitem__)
     assert_covers_every_map(solved, points)
     scene = room_scene()
@@ -91,7 +91,7 @@ def test_uncertain_pixels_are_left_out(solved) -> None:
     assert len(cloud.points) == old.valid[30:].sum()
 
 
-def test_a_network_that_promises_little_gives_a_cloud_too(solved) -> None:
+def test_depth_of_large_std_gives_a_cloud(solved) -> None:
     images = tuple(
         replace(image, depth=replace(old, variance=(0.25 * old.depth) ** 2))
         for image in solved.best.images
@@ -103,7 +103,7 @@ def test_a_network_that_promises_little_gives_a_cloud_too(solved) -> None:
 
 
 @pytest.mark.parametrize(("sure", "left"), [(0.4, 0.4), (0.1, 0.25)])
-def test_where_most_is_unsure_the_surest_quarter_stays(solved, sure: float, left: float) -> None:
+def test_quarter_of_pixels_with_smallest_std_is_kept(solved, sure: float, left: float) -> None:
     old = solved.best.images[1].depth
     spread = np.linspace(0.2, 0.4, old.depth.size).reshape(old.depth.shape)
     spread.ravel()[: int(sure * old.depth.size)] = 0.01
@@ -114,7 +114,7 @@ def test_where_most_is_unsure_the_surest_quarter_stays(solved, sure: float, left
     assert len(cloud.points) == pytest.approx(left * old.valid.sum(), abs=2)
 
 
-def test_a_wall_in_free_space_is_left_out(solved) -> None:
+def test_surface_in_free_space_is_left_out(solved) -> None:
     depth = solved.best.images[1].depth.depth.copy()
     depth[20:40, 30:50] = 1.0  # a wall that other images contradict
     walled = with_depth(solved, 1, depth)
@@ -124,7 +124,7 @@ def test_a_wall_in_free_space_is_left_out(solved) -> None:
     assert ((z > 0.99) & (z < 1.01)).sum() < 0.1 * 400
 
 
-def test_images_that_nothing_confirms_are_left_out(solved) -> None:
+def test_tentative_images_are_left_out(solved) -> None:
     first, second, third = solved.best.images
     guessed = replace(third, confirmed=False, translation=third.translation + 5.0)
     doubtful = replace(solved.best, images=(first, second, guessed))
@@ -135,7 +135,7 @@ def test_images_that_nothing_confirms_are_left_out(solved) -> None:
 
 
 @pytest.mark.parametrize("limit", [1, 500])
-def test_the_size_limit_holds_and_the_choice_is_repeatable(solved, limit: int) -> None:
+def test_size_limit_selects_points_repeatably(solved, limit: int) -> None:
     points, colors, *_ = fuse_depth_maps(solved.best, solved.views.__getitem__, limit, seed=3)
     assert len(points) == len(colors) <= limit
     assert len(points) > 0.8 * limit - 1

@@ -23,7 +23,7 @@ def test_explained_matches_count_common_points_of_a_pair(solved) -> None:
     assert explained == {("images/0.png", "images/1.png"): 10}
 
 
-def test_evidence_of_a_connected_model(solved) -> None:
+def test_evidence_of_connected_model_has_one_part(solved) -> None:
     model = solved.best
     evidence = describe_evidence(model, solved.problem)
     assert [len(part) for part in evidence["parts"]] == [len(model.images)]
@@ -39,7 +39,7 @@ def test_evidence_contains_predicted_pose_errors(solved) -> None:
     assert all(image["pose_error_deg"] == 1.235 for image in evidence["images"].values())
 
 
-def test_image_without_common_points_is_a_part_of_its_own(solved) -> None:
+def test_image_without_common_points_is_a_separate_part(solved) -> None:
     model = solved.best
     *others, last = model.images
     lost = replace(last, point_ids=np.full_like(last.point_ids, -1))

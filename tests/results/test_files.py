@@ -13,7 +13,7 @@ from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.ply import write_ply
 
 
-def test_a_ply_is_read_back_by_pycolmap(tmp_path: Path) -> None:
+def test_written_ply_is_read_by_pycolmap(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(50, 3)).astype(np.float32).astype(np.float64)
     colors = rng.integers(0, 256, (50, 3)).astype(np.uint8)
@@ -24,12 +24,12 @@ def test_a_ply_is_read_back_by_pycolmap(tmp_path: Path) -> None:
     assert found == sorted((tuple(p), tuple(c)) for p, c in zip(points, colors, strict=True))
 
 
-def test_an_empty_ply_has_a_header(tmp_path: Path) -> None:
+def test_empty_ply_has_a_header(tmp_path: Path) -> None:
     write_ply(tmp_path / "a.ply", np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
     assert b"element vertex 0\n" in (tmp_path / "a.ply").read_bytes()
 
 
-def test_a_depth_map_says_enough_to_lift_it_into_the_world(solved, tmp_path: Path) -> None:
+def test_depth_map_file_suffices_to_unproject_it(solved, tmp_path: Path) -> None:
     write_depth_maps(tmp_path, solved.best)
     for image in solved.best.images:
         with np.load(tmp_path / f"{image.name}.npz") as stored:

@@ -81,7 +81,7 @@ def check(found, truth: np.ndarray, up_deg: float, scale: float, off_m: float) -
     np.testing.assert_allclose(laid.points, centers, atol=1e-6)
 
 
-def test_a_street_takes_gravity_from_its_cameras() -> None:
+def test_street_positions_take_gravity_from_cameras() -> None:
     """Positions on a line do not determine the rotation about this line."""
     found = georeference(scrambled(walk(STREET)), positions(STREET, 2.0, altitudes=True))
     assert "cameras" in found[1].up
@@ -89,7 +89,7 @@ def test_a_street_takes_gravity_from_its_cameras() -> None:
     check(found, STREET, up_deg=0.1, scale=0.02, off_m=3.0)
 
 
-def test_a_flight_takes_gravity_from_altitudes() -> None:
+def test_flight_takes_gravity_from_altitudes() -> None:
     model = scrambled(walk(FLIGHT, pitch_deg=-80))
     found = georeference(model, positions(FLIGHT, 1.0, altitudes=True))
     assert found[1].up == "GPS altitudes"
@@ -98,7 +98,7 @@ def test_a_flight_takes_gravity_from_altitudes() -> None:
     assert angle_between_deg(down, np.array([0, 0, -1.0])).max() < 12
 
 
-def test_a_flight_that_looks_down_takes_gravity_from_noisy_altitudes() -> None:
+def test_flight_looking_down_takes_gravity_from_noisy_altitudes() -> None:
     """Two strips with the noise of a GPS tag: camera orientations give a wrong gravity."""
     strips = FLIGHT[:10]
     model = scrambled(walk(strips, pitch_deg=-88, turn=0.0))
@@ -110,7 +110,7 @@ def test_a_flight_that_looks_down_takes_gravity_from_noisy_altitudes() -> None:
     assert angle_between_deg(down, np.array([0, 0, -1.0])).max() < 10
 
 
-def test_wrong_positions_do_not_count() -> None:
+def test_wrong_positions_are_ignored() -> None:
     given = positions(STREET, 1.0, altitudes=False)
     for name in ("3.jpg", "9.jpg", "17.jpg"):
         given[name] = replace(given[name], latitude=given[name].latitude + 0.01)
@@ -127,7 +127,7 @@ def test_wrong_positions_do_not_count() -> None:
         (np.random.default_rng(1).uniform(0, 900, (25, 3)), None, GpsReason.FEW_INLIERS),
     ],
 )
-def test_positions_that_do_not_suffice_change_nothing(centers, noise_m, why: GpsReason) -> None:
+def test_insufficient_positions_change_nothing(centers, noise_m, why: GpsReason) -> None:
     given = positions(centers, noise_m or 1.0, altitudes=False)
     if noise_m is None:  # of other photos
         given = dict(
@@ -137,7 +137,7 @@ def test_positions_that_do_not_suffice_change_nothing(centers, noise_m, why: Gps
     assert isinstance(found, Reason) and found.code is why
 
 
-def test_enu_is_metres_and_unknown_altitudes_stay_unknown() -> None:
+def test_enu_is_in_meters_and_keeps_unknown_altitudes() -> None:
     east = GpsPosition(ORIGIN.latitude, ORIGIN.longitude + 0.001, None)
     north = GpsPosition(ORIGIN.latitude + 0.001, ORIGIN.longitude, 420.0)
     enu = convert_to_enu([east, north], ORIGIN)

@@ -78,7 +78,7 @@ def write(solved, tmp_path: Path, camera: pycolmap.Camera, options: ResultOption
     return tmp_path / "out"
 
 
-def test_the_default_output_is_what_the_contract_says(solved, tmp_path: Path) -> None:
+def test_default_output_has_the_documented_files(solved, tmp_path: Path) -> None:
     output = write(solved, tmp_path, PINHOLE, ResultOptions())
     assert sorted(path.name for path in output.iterdir()) == [
         "dense.ply",
@@ -100,9 +100,7 @@ def test_the_default_output_is_what_the_contract_says(solved, tmp_path: Path) ->
     assert len(list((output / "depth").rglob("*.npz"))) == 3
 
 
-def test_a_distorted_camera_gives_the_original_and_an_undistorted_model(
-    solved, tmp_path: Path
-) -> None:
+def test_distorted_camera_gives_original_and_undistorted_model(solved, tmp_path: Path) -> None:
     output = write(solved, tmp_path, DISTORTED, ResultOptions())
     original = pycolmap.Reconstruction(str(output / "sparse"))
     (camera,) = original.cameras.values()
@@ -149,9 +147,7 @@ def test_photos_that_exif_rotates_get_upright_images(solved, tmp_path: Path, fla
 
 
 @pytest.mark.parametrize("model", ["OPENCV", "FULL_OPENCV"])
-def test_transforms_project_points_where_the_photos_show_them(
-    solved, tmp_path: Path, model: str
-) -> None:
+def test_transforms_project_points_to_their_keypoints(solved, tmp_path: Path, model: str) -> None:
     params = [*DISTORTED.params] + [0.0] * (4 if model == "FULL_OPENCV" else 0)
     camera = pycolmap.Camera(model=model, width=160, height=120, params=params, camera_id=1)
     output = write(solved, tmp_path, camera, ResultOptions(nerfstudio=True))
@@ -179,7 +175,7 @@ def test_transforms_project_points_where_the_photos_show_them(
             np.testing.assert_allclose(xy.ravel(), point.xy, atol=1e-5)
 
 
-def test_a_refined_focal_length_reaches_the_photos_camera(solved, tmp_path: Path) -> None:
+def test_refined_focal_length_is_written_to_the_camera(solved, tmp_path: Path) -> None:
     images = photos_of(solved, tmp_path, PINHOLE, known=False)
     problem, reconstruction = seen_through(solved, images)
     refined = replace(images[0].pinhole, fx=140 * 1.1, fy=141 * 1.1)
@@ -203,7 +199,7 @@ def test_a_refined_focal_length_reaches_the_photos_camera(solved, tmp_path: Path
     assert "refined_focal_length_px" not in details["images/3.png"], "it is not registered"
 
 
-def test_views_show_what_the_mapper_was_given(solved, tmp_path: Path) -> None:
+def test_views_contain_the_input_of_the_mapper(solved, tmp_path: Path) -> None:
     output = write(solved, tmp_path, DISTORTED, ResultOptions())
     given = solved.problem.images[3]  # not registered
     size = given.camera.size
@@ -217,7 +213,7 @@ def test_views_show_what_the_mapper_was_given(solved, tmp_path: Path) -> None:
         np.testing.assert_allclose(maps["relative_std"], std, rtol=1e-3)
 
 
-def test_everything_that_can_be_left_out_is(solved, tmp_path: Path) -> None:
+def test_disabled_results_are_not_written(solved, tmp_path: Path) -> None:
     options = ResultOptions(depth_maps=False, dense_cloud=False, text_model=True, report=False)
     output = write(solved, tmp_path, PINHOLE, options)
     names = sorted(path.name for path in output.iterdir())
@@ -225,7 +221,7 @@ def test_everything_that_can_be_left_out_is(solved, tmp_path: Path) -> None:
     assert pycolmap.Reconstruction(str(output / "sparse_text")).num_points3D() == 40
 
 
-def test_further_components_are_models_of_their_own(solved, tmp_path: Path) -> None:
+def test_further_components_are_separate_models(solved, tmp_path: Path) -> None:
     images = photos_of(solved, tmp_path / "photos", PINHOLE)
     problem, reconstruction = seen_through(solved, images)
     photos = OriginalImages(images, problem)
@@ -242,9 +238,7 @@ def test_further_components_are_models_of_their_own(solved, tmp_path: Path) -> N
     assert (tmp_path / "out" / "components" / "1" / "dense.ply").is_file()
 
 
-def test_images_that_nothing_confirms_are_in_the_model_without_points(
-    solved, tmp_path: Path
-) -> None:
+def test_tentative_images_are_in_the_model_without_points(solved, tmp_path: Path) -> None:
     images = photos_of(solved, tmp_path / "photos", PINHOLE)
     problem, reconstruction = seen_through(solved, images)
     *others, last = reconstruction.images
@@ -260,7 +254,7 @@ def test_images_that_nothing_confirms_are_in_the_model_without_points(
     assert len(frames) == 3
 
 
-def test_the_summary_tells_which_images_nothing_confirms(solved, tmp_path: Path) -> None:
+def test_summary_lists_tentative_images(solved, tmp_path: Path) -> None:
     images = photos_of(solved, tmp_path, PINHOLE)
     problem, reconstruction = seen_through(solved, images)
     first, second, third = reconstruction.images
@@ -285,7 +279,7 @@ def test_the_summary_tells_which_images_nothing_confirms(solved, tmp_path: Path)
     assert described["unregistered"] == {"images/3.png": {"code": "no-pose"}}
 
 
-def test_a_failed_run_leaves_its_summary_and_the_earlier_model(solved, tmp_path: Path) -> None:
+def test_failed_run_writes_summary_and_keeps_earlier_model(solved, tmp_path: Path) -> None:
     output = write(solved, tmp_path, PINHOLE, ResultOptions())
     before = (output / "sparse" / "points3D.bin").read_bytes()
     (output / "report.html").write_text("of the run before")
@@ -297,7 +291,7 @@ def test_a_failed_run_leaves_its_summary_and_the_earlier_model(solved, tmp_path:
     assert (output / "sparse" / "points3D.bin").read_bytes() == before
 
 
-def test_the_summary_tells_who_is_registered_and_why_not(solved, tmp_path: Path) -> None:
+def test_summary_lists_registered_images_and_reasons(solved, tmp_path: Path) -> None:
     images = photos_of(solved, tmp_path, PINHOLE)
     problem, reconstruction = seen_through(solved, images)
     model = ComponentResult.of(reconstruction, OriginalImages(images, problem)).model

@@ -42,7 +42,7 @@ def test_observations_are_sorted_by_point_then_keypoint() -> None:
     np.testing.assert_array_equal(tracks.observations(), expected)
 
 
-def test_observations_of_some_points() -> None:
+def test_observations_of_subset_are_those_of_its_points() -> None:
     tracks = random_tracks()
     points = np.array([7, 85, 3, 20])  # no keypoint observes point 85
     keypoints, rows = tracks.observations_of(points)
@@ -51,7 +51,7 @@ def test_observations_of_some_points() -> None:
     assert len(keypoints) == np.isin(tracks.point_of, points).sum()
 
 
-def test_angles_of_some_points_are_those_of_all() -> None:
+def test_angles_of_subset_equal_those_of_all_points() -> None:
     scene = posed_scene()
     points = np.arange(0, len(scene.tracks.xyz), 3)[::-1]
     angles, lengths = scene.angles_deg_of(points)
@@ -59,7 +59,7 @@ def test_angles_of_some_points_are_those_of_all() -> None:
     np.testing.assert_array_equal(lengths, scene.tracks.lengths()[points])
 
 
-def test_filtering_the_points_of_an_image_leaves_the_others() -> None:
+def test_filter_points_of_image_equals_filtering_all_points() -> None:
     """Moving one camera only affects points that its image observes, so filtering these
     suffices."""
     near, whole = posed_scene(), posed_scene()

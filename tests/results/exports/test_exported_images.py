@@ -103,7 +103,7 @@ def test_names_with_spaces_are_refused_where_the_format_cuts_them(
 
 
 @pytest.mark.parametrize("format_name", ["gsplat", "nerfstudio", "colmap-db"])
-def test_names_with_spaces_survive_other_formats(spaced_model: Path, format_name: str) -> None:
+def test_names_with_spaces_are_kept_by_other_formats(spaced_model: Path, format_name: str) -> None:
     output = spaced_model / "out"
     export(spaced_model, format_name, output)
     names = {"cam 1.jpg", "cam 2.jpg", "cam 3.jpg"}

@@ -37,7 +37,7 @@ def median_error(image, camera, depth, points) -> float:
 
 
 @pytest.mark.parametrize("chosen", FORMATS, ids=lambda chosen: chosen.name)
-def test_a_format_writes_what_it_says_and_leaves_guesses_out(
+def test_every_format_writes_its_files_without_tentative_images(
     result: Path, tmp_path: Path, chosen: ExportFormat
 ) -> None:
     described = export(result, chosen.name, tmp_path / "out")
@@ -50,7 +50,7 @@ def test_a_format_writes_what_it_says_and_leaves_guesses_out(
     assert saved == {key: value for key, value in described.items() if key != "output"}
 
 
-def test_plugins_bring_formats(result: Path, tmp_path: Path, install_plugin) -> None:
+def test_plugins_add_formats(result: Path, tmp_path: Path, install_plugin) -> None:
     install_plugin(
         "mpsfm-count",
         """
@@ -95,7 +95,7 @@ def test_gsplat_reads_the_folder(result: Path, tmp_path: Path, turn: bool) -> No
     assert colors.std(axis=0).min() > 1
 
 
-def test_gaussians_have_place_colour_and_size(result: Path, tmp_path: Path) -> None:
+def test_gaussians_have_position_color_and_size(result: Path, tmp_path: Path) -> None:
     export(result, "gsplat", tmp_path, turn=False)
     data = (tmp_path / "gaussians.ply").read_bytes()
     header, _, body = data.partition(b"end_header\n")
@@ -131,7 +131,7 @@ def test_maps_lift_to_the_surfaces_of_the_exported_world(
         assert (maps["normals_std"][maps["normals_valid"]] > 0).all()
 
 
-def test_nerfstudio_has_a_depth_for_every_frame_and_keeps_our_up(
+def test_nerfstudio_has_depth_of_every_frame_and_keeps_gravity(
     result: Path, tmp_path: Path
 ) -> None:
     export(result, "nerfstudio", tmp_path)
@@ -195,7 +195,7 @@ def test_trimesh_reads_the_glb(result: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(place, turned[[0, 2, 1]] * [1, 1, -1], atol=1e-5)
 
 
-def test_bundler_projects_by_its_own_formula(result: Path, tmp_path: Path) -> None:
+def test_bundler_projection_equals_its_manual(result: Path, tmp_path: Path) -> None:
     """Project by x = f * -P / P.z with P = R X + t (Snavely's manual). Tested by hand in
     MeshLab."""
     export(result, "bundler", tmp_path)
@@ -219,7 +219,7 @@ def test_bundler_projects_by_its_own_formula(result: Path, tmp_path: Path) -> No
     assert next(lines, None) is None
 
 
-def test_nvm_projects_by_its_own_formula(result: Path, tmp_path: Path) -> None:
+def test_nvm_projection_equals_its_documentation(result: Path, tmp_path: Path) -> None:
     """Project by x = f * (R (X - C)) with R from the quaternion (VisualSFM). Tested by hand in
     MeshLab."""
     export(result, "nvm", tmp_path)
@@ -242,7 +242,7 @@ def test_nvm_projects_by_its_own_formula(result: Path, tmp_path: Path) -> None:
             np.testing.assert_allclose(focal * local[:2] / local[2], view[2:], atol=0.5)
 
 
-def test_turned_worlds_have_gravity_down_and_their_middle_at_the_origin(
+def test_aligned_exports_have_gravity_down_and_a_centered_origin(
     result: Path, tmp_path: Path
 ) -> None:
     described = export(result, "gsplat", tmp_path)
@@ -255,7 +255,7 @@ def test_turned_worlds_have_gravity_down_and_their_middle_at_the_origin(
     np.testing.assert_allclose(middle, 0, atol=1e-9)
 
 
-def test_a_turned_world_is_in_metres_as_far_as_they_are_known(result: Path, tmp_path: Path) -> None:
+def test_aligned_export_is_in_meters_if_the_scale_is_known(result: Path, tmp_path: Path) -> None:
     """An uncertain metric scale changes rendered formats only, not the exported COLMAP model."""
     folder = tmp_path / "result"
     shutil.copytree(result, folder)
@@ -280,9 +280,7 @@ def test_a_turned_world_is_in_metres_as_far_as_they_are_known(result: Path, tmp_
         assert np.median(maps["depth_std"] / maps["depth"]) == pytest.approx(0.01, rel=0.01)
 
 
-def test_a_colmap_model_is_exported_with_the_photos_that_are_named(
-    result: Path, tmp_path: Path
-) -> None:
+def test_colmap_model_is_exported_with_given_photos(result: Path, tmp_path: Path) -> None:
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     model_of(result).write_binary(str(folder))
@@ -295,9 +293,7 @@ def test_a_colmap_model_is_exported_with_the_photos_that_are_named(
     assert not (folder / "exports" / "gsplat" / "maps").exists()
 
 
-def test_another_export_replaces_the_last_one_and_nothing_else(
-    result: Path, tmp_path: Path
-) -> None:
+def test_repeated_export_replaces_only_the_earlier_export(result: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "old.png").write_text("")
@@ -306,6 +302,6 @@ def test_another_export_replaces_the_last_one_and_nothing_else(
     assert not (tmp_path / "images" / "old.png").exists()
 
 
-def test_an_unknown_format_is_told_with_the_nearest_one(result: Path) -> None:
+def test_unknown_format_suggests_the_nearest_format(result: Path) -> None:
     with pytest.raises(InputError, match="did you mean 'gsplat'"):
         export(result, "gsplt")
