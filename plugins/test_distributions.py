@@ -53,7 +53,7 @@ def imports_of(module: Path) -> Iterator[str]:
 
 
 @each_plugin
-def test_project(folder: Path) -> None:
+def test_project_metadata_is_complete(folder: Path) -> None:
     project = project_of(folder)
     assert project["name"] == folder.name
     assert project["license"] == "Apache-2.0"
@@ -89,7 +89,7 @@ def test_registration_imports_nothing_heavy(folder: Path) -> None:
 
 
 @each_plugin
-def test_readme(folder: Path) -> None:
+def test_readme_has_the_required_sections(folder: Path) -> None:
     text = (folder / "README.md").read_text(encoding="utf-8")
     assert text.startswith(f"# {folder.name}\n")
     assert f"pip install {folder.name}" in text or f"pip install '{folder.name}" in text
@@ -101,7 +101,7 @@ def test_readme(folder: Path) -> None:
     assert f"[{folder.name}](plugins/{folder.name})" in overview.read_text(encoding="utf-8")
 
 
-def test_the_meta_distribution_names_every_plugin() -> None:
+def test_meta_distribution_names_every_plugin() -> None:
     meta = project_of(PLUGINS[0].parents[1] / "meta")
     extras = meta["optional-dependencies"]
     names = {re.split(r"[<>=]", requirement)[0] for requirement in extras["all"]}

@@ -67,17 +67,17 @@ def part_of(package: str, module: str) -> str:
     return module.removeprefix(f"{package}.").partition(".")[0]
 
 
-def test_the_table_lists_every_package() -> None:
+def test_table_lists_every_package() -> None:
     assert {package for package, _ in modules()} == documented_packages().keys()
 
 
-def test_the_core_has_at_most_18_entries() -> None:
+def test_core_has_at_most_18_entries() -> None:
     entries = {path.name for path in PACKAGE.iterdir() if not path.name.startswith("__")}
     assert len(entries - {"py.typed"}) <= 18
 
 
 @pytest.mark.parametrize("package", documented_packages())
-def test_a_package_imports_only_what_stands_before_it(package: str) -> None:
+def test_packages_import_only_packages_of_earlier_rows(package: str) -> None:
     rows = documented_packages()
     upwards = {
         f"{path.relative_to(ROOT)} imports {imported}"

@@ -259,7 +259,7 @@ def declared() -> dict[str, int]:
     return found
 
 
-def test_the_documentation_lists_every_format() -> None:
+def test_documentation_lists_every_format() -> None:
     text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\|[^|]*\| (\d+) \| `([\w/.]+)` \|", text, re.MULTILINE)
     assert {module: int(number) for number, module in rows} == declared()

@@ -147,7 +147,7 @@ def test_calibrate_corrects_std_5_times_too_small(calibrated: Path, tmp_path: Pa
     assert metrics["before"]["nll_heavy"] > metrics["after"]["nll_heavy"] + 0.5
 
 
-def test_calibrate_normals(tmp_path: Path) -> None:
+def test_calibrate_normals_recovers_the_declared_std(tmp_path: Path) -> None:
     """The README of the scene states an RMS of 0.96 for normal error over declared std."""
     arguments = ["--kind", "normals", "--ground-truth", SCENE / "gt_normals"]
     arguments += ["--set", f"options.directory={SCENE / 'priors' / 'normals'}"]

@@ -94,7 +94,7 @@ def eth3d(source: Path) -> None:
         depth.tofile(folder / Path(name).name)
 
 
-def test_eth3d(tmp_path: Path) -> None:
+def test_eth3d_import_has_true_cameras_poses_and_depth(tmp_path: Path) -> None:
     eth3d(tmp_path / "courtyard")
     scene = import_scene("eth3d", tmp_path / "courtyard", tmp_path / "out")
     check_poses(scene, ["DSC_0286.JPG", "DSC_0287.JPG", "DSC_0288.JPG"])
@@ -132,7 +132,7 @@ def test_eth3d_depth_of_the_wrong_size(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("folder", ["images", "images_2"])
-def test_smerf(tmp_path: Path, folder: str) -> None:
+def test_smerf_import_has_true_cameras_and_poses(tmp_path: Path, folder: str) -> None:
     source = tmp_path / "berlin"
     names = ["DSC00010.JPG", "DSC00011.JPG", "DSC00012.JPG"]
     fisheye = pycolmap.Camera(
@@ -198,7 +198,7 @@ def realestate_lines() -> list[str]:
 
 
 @pytest.mark.parametrize("inside", [True, False])
-def test_realestate10k(tmp_path: Path, inside: bool) -> None:
+def test_realestate10k_import_has_true_cameras_and_poses(tmp_path: Path, inside: bool) -> None:
     source = tmp_path / "0a3b5fb184936a83"
     for stamp in (50050000, 50083000):  # The third frame has no image file.
         photo(source / f"{stamp}.png", (64, 36))
@@ -223,7 +223,7 @@ def seven_scenes(source: Path) -> None:
         np.savetxt(f"{base}.pose.txt", pose)
 
 
-def test_seven_scenes(tmp_path: Path) -> None:
+def test_seven_scenes_import_has_true_poses_and_depth(tmp_path: Path) -> None:
     seven_scenes(tmp_path / "chess")
     scene = import_scene("7-scenes", tmp_path / "chess", tmp_path / "out")
     names = ["seq-01/frame-000000.png", "seq-01/frame-000001.png", "seq-02/frame-000000.png"]
@@ -249,7 +249,7 @@ def matrix(fx: float, fy: float, cx: float, cy: float) -> np.ndarray:
     return np.array([[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
 
 
-def test_scannet(tmp_path: Path) -> None:
+def test_scannet_import_has_true_cameras_poses_and_depth(tmp_path: Path) -> None:
     source = tmp_path / "scene0000_00"
     scannet(source)
     np.savetxt(source / "pose" / "11.txt", np.full((4, 4), -np.inf))

@@ -220,7 +220,7 @@ def test_many_mutated_files_are_rejected(registry: Registry) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("table", TABLES)
-def test_further_files(table: str) -> None:
+def test_readers_of_mutated_other_files_have_no_fault(table: str) -> None:
     found = [
         fault
         for name, (seed, reader) in TABLES[table]().items()
@@ -229,7 +229,7 @@ def test_further_files(table: str) -> None:
     assert not found, "\n".join(found)
 
 
-def test_what_was_found_in_further_files(tmp_path: Path) -> None:
+def test_earlier_faults_of_other_files_are_fixed(tmp_path: Path) -> None:
     """Test a pair without images, a summary without times, a model without points, and a name."""
     table = of_others()
     path = tmp_path / "a.db"
@@ -370,7 +370,9 @@ FOUND = {
 
 
 @pytest.mark.parametrize("name", FOUND)
-def test_what_was_found_before_is_refused(name: str, tmp_path: Path, registry: Registry) -> None:
+def test_malformed_files_of_earlier_faults_are_refused(
+    name: str, tmp_path: Path, registry: Registry
+) -> None:
     _, reader = readers(registry)[name]
     for number, data in enumerate(FOUND[name]):
         path = tmp_path / str(number) / name

@@ -22,7 +22,7 @@ NOT_PINNED = {
 """Providers whose weights have no known hash yet; the list must not grow."""
 
 
-def test_what_is_downloaded_is_pinned() -> None:
+def test_downloads_have_a_pinned_hash() -> None:
     registry = Registry.discover()
     ours = {name.partition("[")[0] for name in PLUGIN_PROVIDERS}
     found = set()
@@ -43,7 +43,7 @@ def test_what_is_downloaded_is_pinned() -> None:
     assert found <= NOT_PINNED
 
 
-def test_what_is_not_pinned_is_told() -> None:
+def test_security_policy_lists_unpinned_providers() -> None:
     told = (Path(__file__).parents[2] / "SECURITY.md").read_text(encoding="utf-8")
     assert [name for name in sorted(NOT_PINNED) if f"`{name}`" not in told] == []
     assert f"except for {len(NOT_PINNED)} providers" in " ".join(told.split())

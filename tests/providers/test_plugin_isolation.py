@@ -108,7 +108,7 @@ def mpsfm(environment: dict[str, str], *arguments: str) -> subprocess.CompletedP
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600)
 
 
-def test_the_list_says_what_is_wrong_and_what_to_do(environment: dict[str, str]) -> None:
+def test_plugin_list_states_faults_and_remedies(environment: dict[str, str]) -> None:
     ended = mpsfm(environment, "plugins", "list", "--json")
     assert ended.returncode == 0
     lines: dict[str, dict[str, Any]] = {p["distribution"]: p for p in json.loads(ended.stdout)}
@@ -126,7 +126,7 @@ def test_the_list_says_what_is_wrong_and_what_to_do(environment: dict[str, str])
         assert "unavailable: " in row and reason in row and hint in row, name
 
 
-def test_a_plugin_that_waits_for_the_network_is_given_up(
+def test_plugin_that_waits_for_the_network_is_skipped(
     install_plugin: InstallPlugin, silent_server: tuple[str, int]
 ) -> None:
     """Check that the command ends although the server never answers, because of the time limit."""
@@ -142,7 +142,7 @@ def test_a_plugin_that_waits_for_the_network_is_given_up(
     assert lines["mpsfm-core"]["available"]
 
 
-def test_the_others_work_and_the_broken_ones_raise_only_when_chosen(
+def test_broken_plugins_raise_only_when_selected(
     environment: dict[str, str], tmp_path: Path
 ) -> None:
     ended = mpsfm(environment, "plugins", "check", "healthy", "--only", "deterministic")
@@ -163,7 +163,7 @@ def test_the_others_work_and_the_broken_ones_raise_only_when_chosen(
         registry.create("depth", "of-a-broken-one", None, context)
 
 
-def test_a_broken_plugin_is_checked_with_a_reason(environment: dict[str, str]) -> None:
+def test_check_of_broken_plugin_states_the_reason(environment: dict[str, str]) -> None:
     ended = mpsfm(environment, "plugins", "check", "mpsfm-imports")
     assert ended.returncode == 2
     assert "mpsfm-imports fails to load: ModuleNotFoundError" in ended.stderr

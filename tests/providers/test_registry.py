@@ -143,7 +143,7 @@ class TestDiscovery:
             ),
         ],
     )
-    def test_a_broken_plugin_is_listed_and_hurts_nobody(
+    def test_broken_plugin_is_listed_and_others_work(
         self, install_plugin: InstallPlugin, source: str, reason: str
     ) -> None:
         install_plugin("mpsfm-broken", source)
@@ -157,12 +157,12 @@ class TestDiscovery:
         with pytest.raises(ProviderError, match="did not load: mpsfm-broken"):
             registry.spec("depth", "something-of-broken")
 
-    def test_a_missing_module_comes_with_a_hint(self, install_plugin: InstallPlugin) -> None:
+    def test_missing_module_shows_install_hint(self, install_plugin: InstallPlugin) -> None:
         install_plugin("mpsfm-broken", "import module_that_nobody_has")
         hint = only(Registry.discover(), "mpsfm-broken").install_hint
         assert "module_that_nobody_has" in hint
 
-    def test_a_hanging_plugin_is_left_behind(
+    def test_hanging_plugin_is_skipped(
         self, install_plugin: InstallPlugin, caplog: pytest.LogCaptureFixture
     ) -> None:
         install_plugin("mpsfm-hanging", "import threading\nthreading.Event().wait(6)")
@@ -175,12 +175,12 @@ class TestDiscovery:
         assert "mpsfm-hanging" in caplog.text
         assert only(registry, "mpsfm-tiny").available
 
-    def test_the_time_limit_can_be_set(self, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_time_limit_of_discovery_is_an_option(self, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("MPSFM_PLUGIN_TIMEOUT_S", "soon")
         with pytest.raises(InputError, match="MPSFM_PLUGIN_TIMEOUT_S='soon'"):
             Registry.discover()
 
-    def test_an_entry_point_that_is_no_reference(self, install_plugin: InstallPlugin) -> None:
+    def test_invalid_entry_point_is_listed_with_reason(self, install_plugin: InstallPlugin) -> None:
         install_plugin("mpsfm-odd", "", entry_points="[mpsfm.plugins]\nodd = not a module!\n")
         assert not only(Registry.discover(), "mpsfm-odd").available
 
@@ -195,7 +195,7 @@ class TestDiscovery:
         assert first.available and first.name == "tiny"
         assert "second entry point" in second.reason and second.name == "b"
 
-    def test_a_name_listed_twice_by_one_plugin_keeps_the_first(
+    def test_repeated_name_of_one_plugin_keeps_the_first(
         self, install_plugin: InstallPlugin
     ) -> None:
         source = """
@@ -274,7 +274,7 @@ class TestDiscovery:
         assert registry.call_hook("mpsfm_filter_pairs", pairs=[("a", "b")]) == [[("b", "a")]]
         assert registry.call_hook("mpsfm_filter_pairs", pairs=[("a", "bad")]) == [[]]
 
-    def test_an_unknown_hook_is_told_and_the_providers_stay(
+    def test_unknown_hook_is_reported_and_providers_stay(
         self, install_plugin: InstallPlugin
     ) -> None:
         extra = "    @hookimpl\n    def mpsfm_stage_startd(stage): ...\n"
@@ -307,7 +307,7 @@ class TestSpecifications:
             ({"requires": 3}, "not iterable"),
         ],
     )
-    def test_a_fault_is_listed_and_told_on_selection(
+    def test_faulty_provider_is_listed_and_raises_on_selection(
         self, change: dict[str, Any], reason: str
     ) -> None:
         spec = dataclasses.replace(FLAT, **change)
@@ -320,7 +320,7 @@ class TestSpecifications:
             registry.spec(spec.kind, spec.name)
         assert reason in str(caught.value)
 
-    def test_a_missing_requirement_uses_the_plugins_hint(self) -> None:
+    def test_missing_requirement_shows_the_plugin_hint(self) -> None:
         registry = Registry()
         hint = "pip install 'mpsfm-x[gpu]'"
         registry.add(dataclasses.replace(FLAT, requires=("no_such_module",), install_hint=hint))
@@ -328,7 +328,7 @@ class TestSpecifications:
             registry.spec("depth", "flat")
         assert registry.names("depth") == []
 
-    def test_a_faulty_rival_does_not_take_the_name(self) -> None:
+    def test_faulty_provider_does_not_take_a_used_name(self) -> None:
         registry = Registry()
         registry.add(FLAT, distribution="mpsfm-good")
         registry.add(dataclasses.replace(FLAT, api_version=99), distribution="mpsfm-newer")
@@ -341,7 +341,7 @@ class TestSpecifications:
         assert registry.version("depth", "flat").startswith(CORE)
         assert "belongs to mpsfm-core" in only(registry, "mpsfm-greedy").reason
 
-    def test_a_distribution_before_the_name_resolves_a_clash(self) -> None:
+    def test_distribution_prefix_resolves_equal_names(self) -> None:
         registry = Registry()
         for name in ("mpsfm-a", "mpsfm-b"):
             registry.add(FLAT, distribution=name)
@@ -462,7 +462,7 @@ class TestCreate:
 
 
 class TestHooks:
-    def test_a_failing_listener_is_left_out(self, caplog: pytest.LogCaptureFixture) -> None:
+    def test_failing_event_listener_is_removed(self, caplog: pytest.LogCaptureFixture) -> None:
         heard: list[str] = []
 
         class Broken:

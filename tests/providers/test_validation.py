@@ -144,7 +144,7 @@ def written_to_later() -> DepthPrior:
         (run_mask, (), lambda: np.ones((6, 4), bool), "mask", r"shape \(4, 6\), got \(6, 4\)"),
     ],
 )
-def test_an_answer_that_breaks_a_rule(
+def test_output_that_violates_a_rule_raises(
     run: Callable[..., Any],
     capabilities: tuple[str, ...],
     make: Callable[[], Any],
@@ -217,7 +217,7 @@ def _joint() -> tuple[DepthPrior, NormalPrior]:
     return depth(variance=np.ones((2, 3), np.float32)), normals()
 
 
-def test_a_normal_faces_the_camera_along_its_ray() -> None:
+def test_normal_must_face_the_camera_along_its_ray() -> None:
     """Check normals at the last column, whose ray is (0.4, 0, 1): the sign of n_z alone does not
     decide."""
     assert run_normals(spec("normals"), Provider(lambda: turned(-0.96, 0.28)), VIEW).valid.all()
@@ -253,7 +253,7 @@ def test_features_and_depth_are_given_only_when_declared() -> None:
         (DataError("depth", "must be finite"), ProviderOutputError, "depth: must be finite"),
     ],
 )
-def test_a_crash_names_provider_and_image(
+def test_exception_of_provider_names_provider_and_image(
     error: BaseException, expected: type[MpsfmError], message: str
 ) -> None:
     with pytest.raises(expected, match=message) as caught:

@@ -48,7 +48,7 @@ def leftovers(store: WeightStore) -> list[str]:
     return [p.name for p in store.cache_dir.rglob("*") if ".part" in p.name or ".tmp" in p.name]
 
 
-def test_download_once(tmp_path: Path, server: Server, uri: str) -> None:
+def test_weights_are_downloaded_once(tmp_path: Path, server: Server, uri: str) -> None:
     seen = []
     store = WeightStore(tmp_path, progress=lambda *args: seen.append(args))
     path = store.resolve(uri, SHA256.upper())
@@ -156,7 +156,7 @@ def test_touched_but_intact_file_is_not_fetched_again(
 
 
 @pytest.mark.parametrize(("status", "requests"), [(404, 1), (403, 1), (503, 4)])
-def test_server_errors(
+def test_server_errors_raise(
     tmp_path: Path, server: Server, uri: str, status: int, requests: int
 ) -> None:
     server.status = status
@@ -174,7 +174,7 @@ def test_no_server_is_found_out_with_one_attempt(
         WeightStore(tmp_path).resolve("http://127.0.0.1:9/model.onnx")
 
 
-def test_a_server_that_does_not_answer_is_not_waited_for(
+def test_server_that_does_not_answer_raises(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(weights, "_CONNECT_TIMEOUT_S", 0.05)
@@ -185,7 +185,9 @@ def test_a_server_that_does_not_answer_is_not_waited_for(
             WeightStore(tmp_path).resolve(uri)
 
 
-def test_offline(tmp_path: Path, server: Server, uri: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resolve_offline_raises(
+    tmp_path: Path, server: Server, uri: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("MPSFM_OFFLINE", "1")
     with pytest.raises(WeightsError, match=r"switched off.*mpsfm models fetch"):
         WeightStore(tmp_path).resolve(uri)
@@ -229,7 +231,9 @@ def test_companions_lie_side_by_side(tmp_path: Path, server: Server, uri: str) -
     assert store.resolve(f"{server.url}/v2/model.onnx").parent != path.parent
 
 
-def test_hub_file(tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_hub_file_is_downloaded_at_pinned_revision(
+    tmp_path: Path, server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Check the pinned revision, and that the user's token is not sent to the host of a
     redirect."""
     monkeypatch.setattr("huggingface_hub.constants.ENDPOINT", server.url)
@@ -266,7 +270,7 @@ def test_uris_that_cannot_be(tmp_path: Path, uri: str, message: str) -> None:
     assert store.locate(uri) is None
 
 
-def test_local_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_local_files_are_resolved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "my model.onnx"
     path.write_bytes(CONTENT)
     store = WeightStore(tmp_path / "cache")
@@ -290,7 +294,7 @@ def test_package_resource_without_import(tmp_path: Path, monkeypatch: pytest.Mon
     assert path == package / "data" / "w.pt"
 
 
-def test_verify(tmp_path: Path, server: Server, uri: str) -> None:
+def test_verify_detects_changed_weights(tmp_path: Path, server: Server, uri: str) -> None:
     store = WeightStore(tmp_path)
     with pytest.raises(WeightsError, match="not on this machine"):
         store.verify(uri)
@@ -389,7 +393,7 @@ def test_where_a_server_may_redirect_to(
         assert followed is not None and followed.full_url == target
 
 
-def test_a_damaged_record_of_hashes(tmp_path: Path) -> None:
+def test_damaged_hash_record_raises(tmp_path: Path) -> None:
     store = WeightStore(tmp_path)
     store.cache_dir.mkdir()
     (store.cache_dir / "hashes.json").write_text("{")

@@ -18,7 +18,7 @@ def array(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).random((SIZE // 64, 8), np.float64)
 
 
-def test_the_first_stay_in_memory_and_the_rest_is_on_disk(tmp_path: Path) -> None:
+def test_arrays_above_the_memory_limit_are_on_disk(tmp_path: Path) -> None:
     disk = DiskArrays(tmp_path / "made", in_memory=2 * SIZE)
     arrays = [array(seed) for seed in range(4)]
     kept = [disk.store(each) for each in arrays]

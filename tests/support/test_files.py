@@ -65,7 +65,7 @@ def test_failure_and_interruption_change_nothing(output: Path, error: type) -> N
     assert content(output) == before
 
 
-def test_a_failure_while_swapping_is_undone(output: Path, monkeypatch) -> None:
+def test_failure_while_replacing_restores_old_entries(output: Path, monkeypatch) -> None:
     before = content(output)
     rename = Path.rename
 
@@ -81,7 +81,7 @@ def test_a_failure_while_swapping_is_undone(output: Path, monkeypatch) -> None:
     assert content(output) == before
 
 
-def test_a_full_disk_is_one_clear_error(output: Path) -> None:
+def test_full_disk_raises_one_error(output: Path) -> None:
     before = content(output)
     _, limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, limit))
@@ -96,7 +96,7 @@ def test_a_full_disk_is_one_clear_error(output: Path) -> None:
     assert content(output) == before
 
 
-def test_a_new_folder_that_fails_is_gone_again(tmp_path: Path) -> None:
+def test_failed_new_folder_is_removed(tmp_path: Path) -> None:
     with pytest.raises(RuntimeError), replace_entries(tmp_path / "a" / "b", ENTRIES) as fresh:
         (fresh / "points.ply").write_text("x")
         raise RuntimeError
@@ -113,7 +113,7 @@ def test_checking_leaves_nothing_behind(tmp_path: Path, output: Path) -> None:
     assert not (tmp_path / "new").exists()
 
 
-def test_a_file_in_the_way_is_wrong_input(tmp_path: Path) -> None:
+def test_file_in_place_of_folder_raises(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         refused = pytest.raises(InputError, match="cannot be the output folder")
@@ -122,7 +122,7 @@ def test_a_file_in_the_way_is_wrong_input(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
-def test_a_folder_without_permission_is_wrong_input(output: Path) -> None:
+def test_folder_without_permission_raises(output: Path) -> None:
     output.chmod(0o500)
     with pytest.raises(InputError, match="cannot be written"), lock_output_folder(output):
         pass
@@ -152,7 +152,7 @@ def killed_while(output: Path, step: int) -> bool:
     os._exit(0)
 
 
-def test_what_a_killed_run_was_about_to_do_is_finished(output: Path) -> None:
+def test_replacement_of_killed_run_is_finished(output: Path) -> None:
     for step in range(6):
         before = content(output)
         if not killed_while(output, step):
@@ -194,7 +194,7 @@ def test_only_one_run_has_a_folder(output: Path) -> None:
         pass
 
 
-def test_a_file_is_written_as_a_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_file_is_written_completely_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "below" / "a.txt"
     write_file(path, "old")
 

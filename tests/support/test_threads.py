@@ -91,7 +91,7 @@ class Watcher:
 
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="threads are read from /proc")
 @pytest.mark.parametrize("workers", [1, 2])
-def test_a_run_keeps_its_workers_busy_and_no_more(
+def test_run_has_at_most_as_many_busy_threads_as_allowed(
     photos: Path, tmp_path: Path, workers: int
 ) -> None:
     busy, watcher, registry = Busy(), Watcher(), Registry.discover()
@@ -110,7 +110,7 @@ def test_a_run_keeps_its_workers_busy_and_no_more(
     assert watcher.seen == [{1}] * 3
 
 
-def test_the_limit_is_that_of_all_libraries_and_goes_again() -> None:
+def test_thread_limit_applies_to_all_libraries_and_is_restored() -> None:
     def pools() -> set[int]:
         return {pool["num_threads"] for pool in threadpool_info()}
 

@@ -42,7 +42,7 @@ def outcomes(factory: Any, setup: Any, *only: str) -> dict[str, tuple[str, str]]
     return {r.id: (r.status, r.message) for r in results}
 
 
-def test_an_expected_failure_is_told_with_its_reason() -> None:
+def test_expected_failure_is_reported_with_its_reason() -> None:
     setup = ContractSetup(
         truth_source="painted", expected_failures={"depth-scale": "the network is in mm"}
     )
@@ -53,7 +53,7 @@ def test_an_expected_failure_is_told_with_its_reason() -> None:
     assert message.startswith("the network is in mm (depth is declared metric")
 
 
-def test_an_expected_failure_that_passes_is_a_failure() -> None:
+def test_passing_expected_failure_fails() -> None:
     setup = ContractSetup(
         truth_source="painted", expected_failures={"depth-scale": "the network is in mm"}
     )
@@ -71,7 +71,7 @@ def test_expected_failures_need_a_reason_and_a_check() -> None:
     assert "did you mean 'depth-scale'" in message
 
 
-def test_told_needs_somebody_to_tell() -> None:
+def test_prepared_truth_requires_the_function_prepare() -> None:
     with pytest.raises(ValueError, match="requires the function prepare"):
         ContractSetup(truth_source="prepared")
 
@@ -88,7 +88,7 @@ def test_without_a_known_answer_accuracy_is_skipped_not_passed() -> None:
     )
 
 
-def test_the_plugin_says_how_it_is_tested(tmp_path: Path) -> None:
+def test_plugin_declares_its_contract_setup(tmp_path: Path) -> None:
     folders = []
 
     def contract(folder: Path) -> ContractSetup:
@@ -116,7 +116,7 @@ def test_a_contract_that_fails(contract: Any, message: str) -> None:
     assert message in result.message
 
 
-def test_a_matcher_is_given_features_of_its_family() -> None:
+def test_matcher_gets_features_of_its_family() -> None:
     class Matcher:
         def __init__(self, options: None, context: ProviderContext) -> None: ...
 
@@ -142,7 +142,7 @@ def test_providers_by_name_kind_and_distribution() -> None:
         find_providers(registry, "hear")
 
 
-def test_a_plugin_without_providers_has_nothing_to_check(install_plugin: Any) -> None:
+def test_plugin_without_providers_has_no_checks(install_plugin: Any) -> None:
     source = """
         from mpsfm_core import hookimpl
         @hookimpl
@@ -154,7 +154,7 @@ def test_a_plugin_without_providers_has_nothing_to_check(install_plugin: Any) ->
         find_providers(Registry.discover(), "mpsfm-hooks")
 
 
-def test_an_unavailable_provider_says_why() -> None:
+def test_unavailable_provider_states_the_reason() -> None:
     registry = registry_of(ProviderSpec("depth", "needy", PaintedDepth, requires=("no_such_pkg",)))
     ((kind, name),) = find_providers(registry, "needy")
     with pytest.raises(ProviderError, match="needs no_such_pkg, not installed"):

@@ -16,7 +16,7 @@ def log_errors(errors: DepthErrors, count: int = 200) -> np.ndarray:
     return np.log(np.stack(maps) / FLAT)
 
 
-def test_the_same_image_has_the_same_errors() -> None:
+def test_same_image_has_the_same_errors() -> None:
     first = degrade_depth(FLAT, "a.png")
     np.testing.assert_array_equal(first, degrade_depth(FLAT, "a.png"))
     assert not np.allclose(first, degrade_depth(FLAT, "b.png"))
@@ -31,7 +31,7 @@ def test_errors_have_the_stated_size() -> None:
     assert only_scale.std() == pytest.approx(0.04, rel=0.12)
 
 
-def test_the_declared_std_is_that_after_the_best_scale_of_each_image() -> None:
+def test_declared_std_is_the_error_after_best_scale_per_image() -> None:
     """Check that the declared std excludes the scale, which the mapper estimates per image."""
     for scale in (0.0, 0.05, 0.5):
         errors = DepthErrors(scale=scale, field=0.05)

@@ -70,7 +70,7 @@ def test_locally_wrong_priors_are_off_by_more_in_a_tenth_of_the_area() -> None:
         np.testing.assert_allclose(np.abs(error).max(), np.log(1.2), rtol=1e-3)
 
 
-def test_the_same_seed_gives_the_same_hall() -> None:
+def test_same_seed_gives_the_same_hall() -> None:
     first, second = hall(CALIBRATED_PRIORS).problem, hall(CALIBRATED_PRIORS).problem
     for a, b in zip(first.images, second.images, strict=True):
         np.testing.assert_array_equal(a.keypoints, b.keypoints)

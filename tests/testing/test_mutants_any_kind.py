@@ -217,7 +217,7 @@ def test_caught(caught: Callable[..., None], factory: type, check: str, message:
     caught("depth", factory, check, message, PAINTED)
 
 
-def test_what_cannot_be_constructed_is_said_once(caught: Callable[..., None]) -> None:
+def test_construction_failure_is_reported_once(caught: Callable[..., None]) -> None:
     def broken(options: Any, context: ProviderContext) -> None:
         raise RuntimeError("CUDA is not available")
 
@@ -244,7 +244,7 @@ def test_a_wrapper_of_nothing(caught: Callable[..., None]) -> None:
     caught("wrapper", PaintedDepth, "specification", "has to declare 'wraps-depth'")
 
 
-def test_a_plugin_that_imports_what_it_does_not_need(install_plugin: Callable[..., str]) -> None:
+def test_plugin_with_heavy_import_fails_its_check(install_plugin: Callable[..., str]) -> None:
     source = """
         import scipy
         from mpsfm_core import ProviderSpec, hookimpl

@@ -166,7 +166,7 @@ def _camera_of(view: View, image: np.ndarray) -> Any:
         ("retrieval", "retrieval-sizes", "but .* to another scene", UpperLeft, ()),
     ],
 )
-def test_maps_and_processes(
+def test_faulty_map_provider_fails_its_check(
     caught: Callable[..., None],
     kind: Any,
     check: str,
@@ -241,7 +241,9 @@ class StdOfNetwork(Detector):
         (StdOfNetwork, "features-std", "times the declared std_px"),
     ],
 )
-def test_features(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+def test_faulty_features_provider_fails_its_check(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
     caught("features", factory, check, message)
 
 
@@ -293,7 +295,9 @@ class DistanceScores(Nearest):
         (DistanceScores, "matcher-scores", "reliable matches score"),
     ],
 )
-def test_matchers(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+def test_faulty_matcher_fails_its_check(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
     caught("matcher", factory, check, message, None, "sparse")
 
 
@@ -308,7 +312,7 @@ class UnitOfLateViews(ref.ToldGroup):
         return replace(group, depth=tuple(depth))
 
 
-def test_multiview(caught: Callable[..., None]) -> None:
+def test_faulty_multiview_provider_fails_its_check(caught: Callable[..., None]) -> None:
     caught(
         "multiview",
         UnitOfLateViews,
@@ -375,7 +379,7 @@ class DepthNotMirrored(Wrapper):
         (DepthNotMirrored, "wrapper-inputs", "the depth of another view", "normals"),
     ],
 )
-def test_wrappers(
+def test_faulty_wrapper_fails_its_check(
     caught: Callable[..., None], factory: type, check: str, message: str, wraps: str
 ) -> None:
     caught("wrapper", factory, check, message, None, f"wraps-{wraps}")
@@ -394,6 +398,11 @@ def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
         for name, test in vars(module).items()
         if name.startswith("test_") and hasattr(test, "pytestmark")
     ]
-    tests += [test_maps_and_processes, test_features, test_matchers, test_wrappers]
+    tests += [
+        test_faulty_map_provider_fails_its_check,
+        test_faulty_features_provider_fails_its_check,
+        test_faulty_matcher_fails_its_check,
+        test_faulty_wrapper_fails_its_check,
+    ]
     caught = named(*tests) | SPECIAL | {"multiview-group-sizes"}
     assert {check_id(check) for check in list_checks()} - caught == set()

@@ -225,7 +225,7 @@ class FocalRatio(PaintedDepth):
         (FocalOfWidth, "depth-focal", "144 x 192 view is 108 px", ("estimates-focal",)),
     ],
 )
-def test_depth(
+def test_faulty_depth_provider_fails_its_check(
     caught: Callable[..., None],
     factory: type,
     check: str,
@@ -331,7 +331,9 @@ class EndlessVariance(PaintedNormals):
         (EndlessVariance, "normals-calibration", "does not change the calibrated variance"),
     ],
 )
-def test_normals(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+def test_faulty_normals_provider_fails_its_check(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
     caught("normals", factory, check, message, PAINTED)
 
 
@@ -413,7 +415,7 @@ class DoublesIntrinsics(Wrapper):
         (DoublesIntrinsics, "depth-same-in-larger-view", "grows 2 times", "depth"),
     ],
 )
-def test_wrappers(
+def test_faulty_wrapper_fails_its_check(
     caught: Callable[..., None], factory: type, check: str, message: str, wraps: str
 ) -> None:
     caught("wrapper", factory, check, message, None, f"wraps-{wraps}")

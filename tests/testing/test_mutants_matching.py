@@ -90,7 +90,9 @@ class NotFinite(Detector):
         (NotFinite, "output-rules", "descriptors: must be finite"),
     ],
 )
-def test_features(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+def test_faulty_features_provider_fails_its_check(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
     caught("features", factory, check, message)
 
 
@@ -186,7 +188,7 @@ class WantsTwoNeighbours(MutualNearest):
         (WantsTwoNeighbours, "matcher-few-features", "kth"),
     ],
 )
-def test_sparse_matchers(
+def test_faulty_sparse_matcher_fails_its_check(
     caught: Callable[..., None], factory: type, check: str, message: str
 ) -> None:
     caught("matcher", factory, check, message, None, "sparse")
@@ -225,7 +227,7 @@ class DepthOfRays(ToldMatcher):
         (DepthOfRays, "matcher-pair-depth", r"depth is proportional to z \* \(ray length / z\)"),
     ],
 )
-def test_dense_matchers(
+def test_faulty_dense_matcher_fails_its_check(
     caught: Callable[..., None], factory: type, check: str, message: str
 ) -> None:
     def told(folder: Path) -> ContractSetup:
@@ -271,7 +273,9 @@ class Hash(Thumbnail):
     ],
 )
 @pytest.mark.filterwarnings("ignore:divide by zero", "ignore:invalid value")
-def test_retrieval(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+def test_faulty_retrieval_provider_fails_its_check(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
     caught("retrieval", factory, check, message)
 
 
@@ -318,7 +322,9 @@ class LeftHalf(PaintedMask):
         (LeftHalf, "mask-flip", "the mask of the mirrored view differs"),
     ],
 )
-def test_masks(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+def test_faulty_mask_provider_fails_its_check(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
     caught("mask", factory, check, message, PAINTED)
 
 

@@ -217,5 +217,7 @@ class Chains(Changed):
         (Chains, "no-state", "after other views"),
     ],
 )
-def test_multiview(caught: Callable[..., None], factory: type, check: str, message: str) -> None:
+def test_faulty_multiview_provider_fails_its_check(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
     caught("multiview", factory, check, message, told, *EVERYTHING, options=ref.ToldOptions)

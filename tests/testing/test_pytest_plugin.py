@@ -98,7 +98,7 @@ def test_in_a_file_of_ones_own(site: Path, tmp_path: Path) -> None:
     assert "is declared metric and is 3 times the true depth" in output
 
 
-def test_others_pay_nothing(tmp_path: Path) -> None:
+def test_pytest_without_option_imports_no_core(tmp_path: Path) -> None:
     """Check that pytest without the option imports only the module mpsfm_pytest."""
     (tmp_path / "test_other.py").write_text(
         "import sys\n"

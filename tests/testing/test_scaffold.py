@@ -49,7 +49,7 @@ def written(
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_it_passes_its_contract_at_once(
+def test_new_plugin_passes_its_contract(
     kind: Kind, written: Callable[[Kind], tuple[Registry, Path]]
 ) -> None:
     registry, folder = written(kind)
@@ -76,7 +76,7 @@ def test_its_readme_shows_a_configuration_that_loads(
     load_config(path, registry=registry, complete=False)
 
 
-def test_a_depth_plugin_is_short(tmp_path: Path) -> None:
+def test_depth_plugin_has_less_than_50_lines(tmp_path: Path) -> None:
     files = [path for path in write_plugin("brand-new", "depth", tmp_path) if path.suffix == ".py"]
     lines = [line for path in files for line in path.read_text().splitlines() if line.strip()]
     assert 20 < len(lines) < 50

@@ -76,7 +76,9 @@ def test_depth_normals_and_their_std(views: list[View], context: ProviderContext
     assert np.std(np.concatenate(stds)) > 0.01  # the predicted std varies between pixels
 
 
-def test_kinds_agree(views: list[View], context: ProviderContext) -> None:
+def test_separate_normals_and_mask_equal_joint_prediction(
+    views: list[View], context: ProviderContext
+) -> None:
     """Check that the separate normals and mask providers agree with the joint depth provider."""
     options = CompactOptions()
     depth, normals = CompactDepth(options, context).predict_joint(views[0])

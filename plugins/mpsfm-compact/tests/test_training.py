@@ -58,7 +58,7 @@ def test_augmented_labels_are_those_of_the_augmented_camera(seed: int) -> None:
         np.testing.assert_allclose(found, np.median(found), rtol=0.02)
 
 
-def test_normals_of_depth() -> None:
+def test_normals_of_depth_are_exact_on_planes_and_missing_at_edges() -> None:
     """Check that a plane has its true normal, and that pixels at a depth step have no normal."""
     from training.normals import normals_of_depth
 

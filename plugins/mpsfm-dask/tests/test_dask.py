@@ -21,15 +21,15 @@ def executor() -> Iterator[DaskExecutor]:
     executor.close()
 
 
-def test_items(executor: DaskExecutor, tmp_path: Path) -> None:
+def test_executor_passes_contract_of_items(executor: DaskExecutor, tmp_path: Path) -> None:
     executor_contract.check_items(executor, tmp_path / "items")
 
 
-def test_errors(executor: DaskExecutor) -> None:
+def test_executor_passes_contract_of_errors(executor: DaskExecutor) -> None:
     executor_contract.check_errors(executor)
 
 
-def test_a_lost_worker_loses_nothing(executor: DaskExecutor, tmp_path: Path) -> None:
+def test_lost_worker_loses_no_results(executor: DaskExecutor, tmp_path: Path) -> None:
     executor_contract.check_lost_worker(executor, tmp_path / "items")
 
 
@@ -41,10 +41,10 @@ def test_a_failing_provider(tmp_path: Path) -> None:
     executor_contract.check_failing_provider("dask", {"workers": 2}, tmp_path)
 
 
-def test_options() -> None:
+def test_executor_passes_contract_of_options() -> None:
     executor_contract.check_options(DaskExecutor)
 
 
-def test_no_cluster() -> None:
+def test_missing_cluster_raises() -> None:
     with pytest.raises(ConfigError, match="no Dask workers at"):
         DaskExecutor({"address": "tcp://127.0.0.1:9", "timeout_s": 1})

@@ -54,7 +54,7 @@ def flip(inner):
     return FlipConsistency(inner, None, None)
 
 
-def test_an_exact_provider_stays_exact():
+def test_exact_provider_has_unchanged_output():
     """Check that the principal point, depth, normals and variances are mirrored."""
     exact, fused = Plane().predict(VIEW), flip(Plane()).predict(VIEW)
     np.testing.assert_allclose(fused.depth, exact.depth, rtol=1e-6)
@@ -81,7 +81,7 @@ def test_fused_variance_is_the_larger_of_both():
     np.testing.assert_allclose(fused.variance, [[0.5, 0.5, 0.5, 0.5]], rtol=1e-6)
 
 
-def test_the_better_pass_weighs_more():
+def test_depth_is_weighted_by_inverse_variance():
     depth, variance = np.array([[1.0, 4.0]]), np.array([[0.2, 0.6]])
     fused = flip(Biased(depth, variance)).predict(VIEW)
     mean = (1 / 0.2 + 4 / 0.6) / (1 / 0.2 + 1 / 0.6)

@@ -24,7 +24,7 @@ def seeded():
 
 @pytest.mark.parametrize(("dimension", "heads"), [(96, 1), (256, 4)])
 @pytest.mark.parametrize("counts", [(70, 33), (1, 5)])
-def test_block(dimension, heads, counts):
+def test_fused_block_equals_kornia_block(dimension, heads, counts):
     block = CrossBlock(dimension, heads, flash=True).eval()
     x0, x1 = (3 * torch.randn(1, count, dimension) for count in counts)
     for found, expected in zip(FusedCrossBlock(block)(x0, x1), block(x0, x1), strict=True):
@@ -46,7 +46,7 @@ def test_state_and_other_networks_stay(architecture):
     ("features", "matcher"),
     [("xfeat", "lighterglue"), ("aliked", "lightglue-aliked"), ("disk", "lightglue-disk")],
 )
-def test_published_weights(make, blocks, features, matcher):
+def test_fused_lightglue_with_published_weights_equals_kornia(make, blocks, features, matcher):
     """Check that LightGlue returns the same matches, and scores within 1e-4, in float64."""
     turned = View("b.png", np.roll(blocks.image, (8, 24), (0, 1)), blocks.camera)
     detector, matcher = make("features", features), make("matcher", matcher)

@@ -118,7 +118,7 @@ def test_masked_pixels_have_no_keypoints(make, blocks, name):
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 200), (40, 33)])
-def test_small_views(make, name, shape):
+def test_keypoints_of_small_views_are_inside_the_view(make, name, shape):
     image = np.random.default_rng(0).integers(0, 255, (*shape, 3), dtype=np.uint8)
     size = shape[1], shape[0]
     view = View("small.png", image, PinholeCamera(*size, 100.0, 100.0, size[0] / 2, size[1] / 2))

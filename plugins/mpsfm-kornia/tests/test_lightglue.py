@@ -25,7 +25,7 @@ def shifted(view, dx, dy):
     return type(view)("shifted.png", padded[: -dy or None, : -dx or None].copy(), view.camera)
 
 
-def test_known_shift(make, blocks, family):
+def test_matches_of_shifted_views_have_the_known_shift(make, blocks, family):
     other = shifted(blocks, *SHIFT)
     detector, matcher = make("features", family), make("matcher", FAMILIES[family])
     features = detector.extract(blocks), detector.extract(other)

@@ -141,7 +141,7 @@ class TestSparse:
         same = matcher.match(a, a, keypoints, keypoints).sparse
         np.testing.assert_array_equal(same.indices, [[0, 0]])
 
-    def test_features_are_needed(self, model, scattered, context):
+    def test_sparse_matcher_without_features_raises(self, model, scattered, context):
         with pytest.raises(ProviderError, match="choose a features provider"):
             SparseMatcher(SparseOptions(**model), context).match(*scattered[0])
 

@@ -97,7 +97,7 @@ def test_resizing_does_not_move_the_image(interpolation):
 
 
 @pytest.mark.parametrize("stride", [1, 4])
-def test_cropping_and_back(stride):
+def test_cropped_pixels_are_nan_and_others_keep_their_position(stride):
     """Check that cropped view pixels are NaN, and that other pixels keep their position."""
     size = SideSize(mode="longest", side=100, multiple_of=16, fit="crop")
     canvas = Canvas.plan(size, (200, 150))
@@ -120,7 +120,7 @@ def test_cropping_and_back(stride):
     np.testing.assert_allclose(canvas.to_view(canvas.from_view(xy, (200, 150)), (200, 150)), xy)
 
 
-def test_the_camera_follows_the_image():
+def test_camera_of_network_input_is_scaled_with_the_image():
     canvas = Canvas.plan(FixedSize(mode="fixed", width=40, height=30, fit="pad"), (20, 10))
     camera = canvas.camera(PinholeCamera(20, 10, 15.0, 16.0, 9.0, 4.0))
     assert camera == PinholeCamera(40, 30, 30.0, 32.0, 18.0, 8.0 + 5)

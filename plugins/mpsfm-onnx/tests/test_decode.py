@@ -113,7 +113,7 @@ def test_shift_of_points_is_estimated_from_the_camera(shift):
     np.testing.assert_allclose(prior.depth[valid], 2 * z[valid], rtol=1e-5)
 
 
-def test_the_shift_minimises_the_reprojection_error_of_noisy_points():
+def test_estimated_shift_minimizes_reprojection_error():
     """Check the z-shift from Gauss-Newton, where the linear solution is 8 % smaller."""
     rng = np.random.default_rng(1)
     camera = PinholeCamera(64, 64, 60.0, 60.0, 32.0, 32.0)

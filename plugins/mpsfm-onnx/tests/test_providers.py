@@ -217,7 +217,7 @@ SHIPPED_STAND_INS = {
 
 
 @pytest.mark.parametrize("name", SHIPPED_STAND_INS)
-def test_shipped_interfaces(name, write_onnx, make_view, context):
+def test_shipped_descriptions_fit_their_networks(name, write_onnx, make_view, context):
     """Check the descriptions in the package with networks that return the input's red channel."""
     rule = load_description(name).input
     signature, body = SHIPPED_STAND_INS[name]
@@ -238,7 +238,7 @@ def test_shipped_interfaces(name, write_onnx, make_view, context):
     assert prior.valid.all() and prior.metric == (name != "depth-anything-v2-small")
 
 
-def test_unidepth_interface(write_onnx, make_view, context):
+def test_unidepth_interface_gives_true_depth(write_onnx, make_view, context):
     """Check the ray input, fixed size and std of a network like UniDepth, with points at 4 m."""
     red = "r = Gather <axis = 1> (rgbs, first) a = Mul (r, std) b = Add (a, mean) c = Mul (b, ten)"
     model = write_onnx(
@@ -265,7 +265,7 @@ def test_unidepth_interface(write_onnx, make_view, context):
     np.testing.assert_allclose(prior.variance, 1, rtol=1e-5)
 
 
-def test_moge_interface(write_onnx, make_view, context):
+def test_moge_interface_gives_true_depth(write_onnx, make_view, context):
     """Check MoGe's points of a plane at z = 2 m, given in half meters with a shift and a hole."""
     text = """
     moge (float[b,3,h,w] image, int64 num_tokens) => (

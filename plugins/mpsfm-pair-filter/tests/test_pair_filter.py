@@ -51,14 +51,14 @@ def test_is_listed_as_a_plugin_with_hooks_only():
     assert line.capabilities == ("filter_pairs",)
 
 
-def test_the_lower_of_two_scores_counts(scores):
+def test_lower_of_repeated_scores_is_used(scores):
     with scores.open("a") as file:
         file.write("b.jpg,a.jpg,0.1\n")
     assert read_scores(scores)[frozenset(("a.jpg", "b.jpg"))] == 0.1
 
 
 @pytest.mark.parametrize("line", ["a.jpg,b.jpg", "a.jpg,b.jpg,high", "a.jpg b.jpg 0.3"])
-def test_a_wrong_line_is_named(scores, line):
+def test_wrong_line_of_csv_is_named(scores, line):
     with scores.open("a") as file:
         file.write(f"{line}\n")
     with pytest.raises(InputError, match=r"scores\.csv:5: expected image, image, score"):

@@ -24,13 +24,13 @@ class TestOneCluster:
         yield executor
         executor.close()
 
-    def test_items(self, executor: RayExecutor, tmp_path: Path) -> None:
+    def test_executor_passes_contract_of_items(self, executor: RayExecutor, tmp_path: Path) -> None:
         executor_contract.check_items(executor, tmp_path / "items")
 
-    def test_errors(self, executor: RayExecutor) -> None:
+    def test_executor_passes_contract_of_errors(self, executor: RayExecutor) -> None:
         executor_contract.check_errors(executor)
 
-    def test_a_lost_worker_loses_nothing(self, executor: RayExecutor, tmp_path: Path) -> None:
+    def test_lost_worker_loses_no_results(self, executor: RayExecutor, tmp_path: Path) -> None:
         executor_contract.check_lost_worker(executor, tmp_path / "items")
 
 
@@ -44,5 +44,5 @@ def test_a_failing_provider(tmp_path: Path) -> None:
     executor_contract.check_failing_provider("ray", {"workers": 2}, tmp_path)
 
 
-def test_options() -> None:
+def test_executor_passes_contract_of_options() -> None:
     executor_contract.check_options(RayExecutor)

@@ -40,7 +40,7 @@ def recorded(path: Path) -> dict[str, int]:
     return rows
 
 
-def test_a_run_is_recorded_step_by_step(tmp_path: Path) -> None:
+def test_run_is_recorded_step_by_step(tmp_path: Path) -> None:
     viewer = RerunViewer(tmp_path, lambda name: np.zeros((12, 16, 3), np.uint8))
     registry = Registry()
     registry.register(viewer, name="viewer")
@@ -58,7 +58,7 @@ def test_a_run_is_recorded_step_by_step(tmp_path: Path) -> None:
     assert rows["/log"] == 1
 
 
-def test_a_finished_scene_is_recorded_with_its_cloud(tmp_path: Path) -> None:
+def test_finished_scene_is_recorded_with_its_cloud(tmp_path: Path) -> None:
     viewer = RerunViewer(tmp_path, lambda name: None)
     viewer.show(scene(2), ColoredPoints(np.zeros((4, 3)), np.zeros((4, 3), np.uint8)))
     viewer.finish()
@@ -80,7 +80,7 @@ def values_of(path: Path, entity: str) -> dict[str, Any]:
     }
 
 
-def test_a_model_is_exported(tmp_path: Path) -> None:
+def test_exported_model_has_images_and_depth_maps(tmp_path: Path) -> None:
     """Check exported images and depth maps, and gravity along -z."""
     pycolmap.set_random_seed(0)
     options = pycolmap.SyntheticDatasetOptions()

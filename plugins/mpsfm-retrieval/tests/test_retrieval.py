@@ -101,7 +101,7 @@ class TestAppearance:
         other = type(context)(resolve_weights=context.resolve_weights, seed=1)
         assert not np.allclose(first, Appearance(AppearanceOptions(), other).describe(view))
 
-    def test_masked_pixels_do_not_count(self, context):
+    def test_masked_pixels_are_ignored(self, context):
         image, mask = textured(0), np.ones((240, 320), dtype=np.bool_)
         mask[:, 160:] = False
         changed = image.copy()
@@ -111,7 +111,7 @@ class TestAppearance:
         apart = provider.describe(view_of(image)) @ provider.describe(view_of(changed))
         assert same > 0.97 > apart
 
-    def test_no_features(self, context):
+    def test_descriptor_of_view_without_features_is_color_only(self, context):
         flat = view_of(np.full((60, 80, 3), 90, dtype=np.uint8))
         vector = Appearance(AppearanceOptions(), context).describe(flat)
         assert vector @ vector == pytest.approx(0.3)

@@ -125,7 +125,7 @@ def test_uncertain_keypoints_have_no_match(options, context):
     assert len(matcher.match(A, B, some, there).sparse) == 0
 
 
-def test_what_is_fed_is_normalised(write_onnx, context):
+def test_network_input_is_normalized(write_onnx, context):
     """Check the color normalization by a model whose certainty is the first view's red channel."""
     text = """
     roma (float[b,3,h,w] one, float[b,3,h,w] two) => (float[b,h,w,4] warp, float[b,h,w] sure) {

@@ -60,7 +60,7 @@ class TestNetwork:
         with pytest.raises(ConfigError, match="a sky network needs inputs"):
             SkyNetwork(SkyOptions(model=str(write_onnx(text))), context)
 
-    def test_real_photo(self, shared_data, context):
+    def test_mask_of_real_photo_covers_the_sky(self, shared_data, context):
         """Check an image of the fountain scene with sky at the upper right (0.8 % of pixels)."""
         model = shared_data / "models" / "skysegsmall_384.onnx"
         provider = SkyNetwork(SkyOptions(model=str(model), network="skysegsmall"), context)
@@ -83,7 +83,7 @@ class TestSimple:
         np.testing.assert_array_equal(image, before)
 
     @pytest.mark.parametrize("size", [(1, 1), (3, 200), (200, 3), (1000, 700)])
-    def test_any_size(self, size, context):
+    def test_mask_has_the_size_of_any_view(self, size, context):
         image = np.full((size[1], size[0], 3), 20, dtype=np.uint8)
         mask = SimpleSky(SimpleSkyOptions(), context).mask(view_of(image))
         assert mask.shape == (size[1], size[0]) and mask.all()

@@ -38,7 +38,7 @@ def of_the_library(folder, view):
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", ["depth-anything", "dpt", "glpn"])
-def test_the_map_of_the_library(models, context, photo, name, size):
+def test_depth_equals_pipeline_of_transformers(models, context, photo, name, size):
     view = photo(*size)
     prior = HubDepth(DepthOptions(model=str(models[name])), context).predict(view)
     _, outputs = of_the_library(models[name], view)
@@ -106,7 +106,7 @@ def test_zoedepth_as_the_library_cuts_it(models, context, photo):
     np.testing.assert_allclose(prior.depth, expected, rtol=3e-3)
 
 
-def test_what_a_model_predicts(models, context, tmp_path):
+def test_known_models_have_the_right_output_and_unit(models, context, tmp_path):
     relative = stand_in.depth_anything(tmp_path / "r", depth_estimation_type="relative")
     provider = HubDepth(DepthOptions(model=str(relative)), context)
     assert (provider._output, provider._metric) == ("disparity", False)
@@ -133,7 +133,7 @@ def test_prompted_by_a_sensor(context, photo, tmp_path):
     assert not PromptDepth(options, context).predict(view).valid.any()
 
 
-def test_the_wrong_provider(models, context, tmp_path):
+def test_model_for_another_provider_raises(models, context, tmp_path):
     model = stand_in.prompt_depth_anything(tmp_path / "model")
     with pytest.raises(ConfigError, match="use the provider prompt-depth-anything"):
         HubDepth(DepthOptions(model=str(model)), context)

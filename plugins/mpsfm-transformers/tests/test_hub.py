@@ -64,7 +64,7 @@ def test_missing_model_raises(context):
         HubDepth(DepthOptions(model="./nowhere"), context)
 
 
-def test_the_hash_is_checked(model, context):
+def test_wrong_hash_raises(model, context):
     with pytest.raises(WeightsError, match="expected 0000"):
         HubDepth(DepthOptions(model=str(model), sha256="0" * 64), context)
 
@@ -76,7 +76,7 @@ def test_weights_of_another_model(model, context, tmp_path):
         HubDepth(DepthOptions(model=str(folder)), context)
 
 
-def test_damaged_weights(model, context, tmp_path):
+def test_damaged_weights_raise(model, context, tmp_path):
     folder = shutil.copytree(model, tmp_path / "damaged")
     (folder / "model.safetensors").write_bytes(b"nothing")
     with pytest.raises(WeightsError, match="cannot be loaded by transformers"):
@@ -100,13 +100,13 @@ def test_no_code_of_a_repository_runs(model, context, tmp_path):
         HubDepth(DepthOptions(model=str(folder)), context)
 
 
-def test_a_model_of_another_task(context, tmp_path):
+def test_model_of_another_task_raises(context, tmp_path):
     with pytest.raises(WeightsError, match="cannot be loaded by transformers"):
         HubDepth(DepthOptions(model=str(stand_in.dino(tmp_path / "dino"))), context)
 
 
 @pytest.mark.parametrize("make", [stand_in.dino, stand_in.dinov3])
-def test_dino(context, photo, tmp_path, make):
+def test_dino_descriptor_has_unit_length(context, photo, tmp_path, make):
     provider = Dino(DinoOptions(model=str(make(tmp_path / "dino")), resize=64), context)
     vector = provider.describe(photo())
     assert vector.shape == (16,)

@@ -38,14 +38,14 @@ def viewer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ViserVie
     made.server.stop()
 
 
-def test_the_page_answers(viewer: ViserViewer) -> None:
+def test_web_page_is_served(viewer: ViserViewer) -> None:
     with urllib.request.urlopen(viewer.address, timeout=20) as page:
         assert page.status == 200
         assert b"<html" in page.read()
     assert viewer.address in viewer.finish()
 
 
-def test_the_scene_has_the_cameras_and_their_depth(viewer: ViserViewer) -> None:
+def test_scene_has_cameras_and_depth_maps(viewer: ViserViewer) -> None:
     viewer.show(scene(3))
     assert viewer.frustums.keys() == {f"room/{i}.jpg" for i in range(3)}
     np.testing.assert_allclose(viewer.frustums["room/2.jpg"].position, [2, 0, 0])
@@ -56,14 +56,14 @@ def test_the_scene_has_the_cameras_and_their_depth(viewer: ViserViewer) -> None:
     np.testing.assert_allclose(np.asarray(depth.points)[:, 2], 2, atol=1e-2)
 
 
-def test_removed_images_disappear(viewer: ViserViewer) -> None:
+def test_removed_images_are_removed_from_the_scene(viewer: ViserViewer) -> None:
     viewer.show(scene(3))
     viewer.show(scene(2))
     assert viewer.frustums.keys() == {"room/0.jpg", "room/1.jpg"}
     assert len(viewer.clouds) == 3
 
 
-def test_the_final_cloud_takes_the_place_of_the_depth_maps(viewer: ViserViewer) -> None:
+def test_final_cloud_replaces_the_depth_maps(viewer: ViserViewer) -> None:
     viewer.show(scene(2))
     before = list(viewer.clouds)
     viewer.show(scene(2), ColoredPoints(np.zeros((4, 3)), np.zeros((4, 3), np.uint8)))

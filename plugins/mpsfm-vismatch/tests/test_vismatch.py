@@ -102,7 +102,7 @@ def test_missing_scores_are_one(context: ProviderContext) -> None:
     assert found.scores.tolist() == [1.0, 1.0, 1.0]
 
 
-def test_a_network_of_another_kind(context: ProviderContext) -> None:
+def test_network_of_another_kind_raises(context: ProviderContext) -> None:
     with pytest.raises(
         ConfigError, match=r"Known' has none of the attributes roma_model, matcher, model"
     ):

@@ -64,7 +64,9 @@ def refused(folder: Path, context: ProviderContext, **options: object) -> str:
 @pytest.mark.parametrize(
     ("suffix", "tolerance"), [(".npy", 0), (".npz", 0), (".png", 6e-4), (".tif", 6e-4)]
 )
-def test_formats(name, suffix, tolerance, folder: Path, context: ProviderContext) -> None:
+def test_depth_of_every_format_is_read(
+    name, suffix, tolerance, folder: Path, context: ProviderContext
+) -> None:
     path = folder / "side" / f"{name}{suffix}"
     if suffix == ".npy":
         np.save(path, DEPTH)
@@ -81,7 +83,7 @@ def test_formats(name, suffix, tolerance, folder: Path, context: ProviderContext
 
 @needs_exr
 @pytest.mark.parametrize("channels", [["Z"], ["Y"], ["custom"], ["Z", "A"], ["R", "G", "B"]])
-def test_exr(channels, folder: Path, context: ProviderContext) -> None:
+def test_depth_of_exr_channels_is_read(channels, folder: Path, context: ProviderContext) -> None:
     write_exr(folder / "side" / "a.exr", dict.fromkeys(channels, DEPTH))
     assert np.array_equal(depth_of(folder, context).depth, DEPTH)
 
@@ -100,7 +102,7 @@ def test_exr_without_the_package(
     assert "pip install OpenEXR" in refused(folder, context)
 
 
-def test_invalid_pixels(folder: Path, context: ProviderContext) -> None:
+def test_invalid_pixels_of_stored_depth_are_invalid(folder: Path, context: ProviderContext) -> None:
     stored = DEPTH.copy()
     stored[0, :4] = [0, -1, np.nan, np.inf]
     valid = np.ones(stored.shape, dtype=np.bool_)
@@ -112,7 +114,7 @@ def test_invalid_pixels(folder: Path, context: ProviderContext) -> None:
     assert np.array_equal(prior.valid, expected)
 
 
-def test_suffix(folder: Path, context: ProviderContext) -> None:
+def test_suffix_option_selects_the_depth_file(folder: Path, context: ProviderContext) -> None:
     np.save(folder / "side" / "a_depth.npy", DEPTH)
     assert depth_of(folder, context, suffix="_depth.npy").valid.all()
     message = refused(folder, context)
@@ -175,13 +177,13 @@ def test_any_grid_that_covers_the_view(folder: Path, context: ProviderContext) -
         (DEPTH[0], "must have one channel"),
     ],
 )
-def test_wrong_shapes(content, hint, folder: Path, context: ProviderContext) -> None:
+def test_wrong_shapes_raise(content, hint, folder: Path, context: ProviderContext) -> None:
     np.save(folder / "side" / "a.npy", content)
     assert hint in refused(folder, context)
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".npy", ".png"])
-def test_damaged(suffix, folder: Path, context: ProviderContext) -> None:
+def test_damaged_depth_files_raise(suffix, folder: Path, context: ProviderContext) -> None:
     (folder / "side" / f"a{suffix}").write_bytes(b"PK\x03\x04 damaged")
     assert f"a{suffix} cannot be read" in refused(folder, context)
 
@@ -224,7 +226,7 @@ def test_normal_arrays_and_frames(folder: Path, context: ProviderContext) -> Non
     assert turned.variance is None and np.allclose(turned.normals, NORMALS)
 
 
-def test_missing_normals(folder: Path, context: ProviderContext) -> None:
+def test_missing_normals_raise(folder: Path, context: ProviderContext) -> None:
     with pytest.raises(InputError, match=r"normals of image 'side/a\.jpg'"):
         normals_of(folder, context)
 
@@ -233,7 +235,7 @@ def masks_of(folder: Path, context: ProviderContext, **options: object) -> np.nd
     return MaskFiles(MaskFileOptions(directory=folder, **options), context).mask(VIEW)
 
 
-def test_masks(folder: Path, context: ProviderContext) -> None:
+def test_masks_are_resized_to_the_view(folder: Path, context: ProviderContext) -> None:
     drawn = np.zeros((15, 20), np.uint8)
     drawn[:, 10:] = 200
     cv2.imwrite(str(folder / "side" / "a.jpg.png"), drawn)
@@ -264,7 +266,7 @@ def test_black_mask_is_named(folder: Path, context: ProviderContext) -> None:
     assert masks_of(folder, context, invert=True).all()
 
 
-def test_shared_depth(shared_data: Path, context: ProviderContext) -> None:
+def test_depth_of_shared_scene_is_read(shared_data: Path, context: ProviderContext) -> None:
     folder = shared_data / "data" / "hololens_room"
     name = sorted((folder / "images").iterdir())[0].name
     camera = PinholeCamera(540, 360, 495.5678, 495.482, 270.0029, 169.6941)

@@ -32,7 +32,7 @@ def views() -> tuple[View, View]:
     return View("a", images[0], CAMERA), View("b", images[1], CAMERA)
 
 
-def test_sift_is_colmaps(views, context: ProviderContext) -> None:
+def test_sift_equals_colmap(views, context: ProviderContext) -> None:
     found = Sift(SiftOptions(), context).extract(views[0])
     settings = pycolmap.FeatureExtractionOptions()
     settings.use_gpu = False
@@ -57,7 +57,7 @@ def test_sift_pixel_convention(context: ProviderContext) -> None:
     assert distance.min() < 0.1
 
 
-def test_sift_options(views, context: ProviderContext) -> None:
+def test_sift_options_limit_and_orient_keypoints(views, context: ProviderContext) -> None:
     full = Sift(SiftOptions(), context).extract(views[0])
     few = Sift(SiftOptions(max_keypoints=50), context).extract(views[0])
     # Several orientations may add keypoints at the same position.
@@ -69,7 +69,7 @@ def test_sift_options(views, context: ProviderContext) -> None:
     assert not np.allclose(plain.descriptors, full.descriptors, atol=0.05)
 
 
-def test_sift_resized(views, context: ProviderContext) -> None:
+def test_resized_sift_returns_pixels_of_the_view(views, context: ProviderContext) -> None:
     """Check that SIFT at half the size returns keypoints and scales in pixels of the view."""
     found = Sift(SiftOptions(resize=160), context).extract(views[0])
     assert found.std_px == 2.0
@@ -79,12 +79,12 @@ def test_sift_resized(views, context: ProviderContext) -> None:
     assert found.scales.min() > 1.5 * full.scales.min()
 
 
-def test_sift_of_nothing(context: ProviderContext) -> None:
+def test_sift_of_blank_view_finds_no_keypoints(context: ProviderContext) -> None:
     found = Sift(SiftOptions(), context).extract(as_view(np.zeros((40, 60, 3), np.uint8)))
     assert len(found) == 0 and found.descriptors.shape == (0, 128)
 
 
-def test_matches_are_right(views, context: ProviderContext) -> None:
+def test_matches_are_correct(views, context: ProviderContext) -> None:
     sift = Sift(SiftOptions(), context)
     a, b = (sift.extract(view) for view in views)
     sparse = MutualNearest(MutualNearestOptions(), context).match(*views, a, b).sparse
@@ -118,7 +118,9 @@ def brute_force(a: np.ndarray, b: np.ndarray, limit: float) -> dict[tuple[int, i
 
 @pytest.mark.parametrize("ratio", [None, 0.8])
 @pytest.mark.parametrize("sizes", [(300, 280), (3, 40), (40, 3)])
-def test_brute_force(ratio, sizes, context, views, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_matches_equal_brute_force(
+    ratio, sizes, context, views, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(mutual_nearest, "_BLOCK", 64)
     a, b = random_features(sizes[0], 1), random_features(sizes[1], 2)
     options = MutualNearestOptions(ratio=ratio)
@@ -159,13 +161,13 @@ def test_max_distance(context: ProviderContext, views) -> None:
 
 
 @pytest.mark.parametrize("sizes", [(0, 0), (0, 5), (5, 0), (1, 1)])
-def test_hardly_any_features(sizes, context: ProviderContext, views) -> None:
+def test_few_features_give_no_matches(sizes, context: ProviderContext, views) -> None:
     a, b = random_features(sizes[0], 1), random_features(sizes[1], 2)
     sparse = MutualNearest(MutualNearestOptions(), context).match(*views, a, b).sparse
     assert len(sparse) == min(sizes)
 
 
-def test_refusals(context: ProviderContext, views) -> None:
+def test_match_of_wrong_features_raises(context: ProviderContext, views) -> None:
     matcher = MutualNearest(MutualNearestOptions(), context)
     with pytest.raises(ProviderError, match="choose a features provider"):
         matcher.match(*views)

@@ -49,7 +49,7 @@ def test_planes_are_exact(normal, context: ProviderContext) -> None:
     assert errors_deg(found, truth).max() < 0.05
 
 
-def test_smaller_grid(context: ProviderContext) -> None:
+def test_smaller_depth_map_gives_the_same_normal(context: ProviderContext) -> None:
     """Check that a depth map of another size yields the same normal."""
     small = CAMERA.resized(160, 120)
     normal = np.array([0.5, -0.3, -0.8]) / np.linalg.norm([0.5, -0.3, -0.8])
@@ -58,7 +58,7 @@ def test_smaller_grid(context: ProviderContext) -> None:
     assert found.shape == (120, 160) and errors_deg(found, normal).max() < 0.05
 
 
-def test_analytic_scene(context: ProviderContext) -> None:
+def test_normals_of_analytic_scene_are_accurate(context: ProviderContext) -> None:
     """Check normals of planes and spheres with occlusions; creases between walls are smoothed."""
     rendering = room_scene().render(CAMERA, arc_poses(1, 0.0)[0])
     found = predict(prior(rendering.depth), context)
@@ -135,7 +135,9 @@ def test_needs_a_depth_with_variance(context: ProviderContext) -> None:
             NormalsFromDepth(NormalsFromDepthOptions(), context).predict(VIEW, depth)
 
 
-def test_rendered_kitchen(shared_data: Path, context: ProviderContext) -> None:
+def test_normals_of_rendered_kitchen_are_accurate(
+    shared_data: Path, context: ProviderContext
+) -> None:
     folder = shared_data / "data" / "rendered_kitchen"
     camera = PinholeCamera(640, 480, 502.299385, 502.299385, 320, 240)
     view = View("a", np.zeros((480, 640, 3), np.uint8), camera)

@@ -51,6 +51,6 @@ def test_memory_is_lent_and_used_again(ends, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a0", "b0", "b1", "b2"]
 
 
-def test_a_message_larger_than_those_before(ends):
+def test_message_larger_than_earlier_messages_is_received(ends):
     for size in (1, 100_000, 10):
         assert exchange(ends, {"x": np.ones(size)})["x"].sum() == size

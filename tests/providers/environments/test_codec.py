@@ -20,7 +20,7 @@ def there_and_back(value, copy=True):
     return decode_message(packed.text, block, copy)
 
 
-def test_values_come_back():
+def test_decoded_values_equal_encoded_values():
     view = View(
         "a", np.arange(36, dtype=np.uint8).reshape(3, 4, 3), PinholeCamera(4, 3, 5, 5, 2, 1)
     )
@@ -42,14 +42,14 @@ def test_values_come_back():
         np.testing.assert_array_equal(one, other)
 
 
-def test_what_is_not_copied_cannot_be_written_to():
+def test_shared_arrays_are_read_only():
     array = there_and_back(np.zeros(3), copy=False)
     with pytest.raises(ValueError, match="read-only"):
         array[0] = 1
 
 
 @pytest.mark.parametrize("value", [object(), np.array([object()]), {1: lambda: 0}])
-def test_no_objects(value):
+def test_encode_of_other_objects_raises(value):
     with pytest.raises(DataError, match="cannot be sent to another process"):
         EncodedMessage(value)
 

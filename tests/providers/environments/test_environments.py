@@ -26,7 +26,7 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.testing.contract import run_checks
 
 
-def test_what_is_there_is_listed_without_starting_it(registry, monkeypatch):
+def test_providers_are_listed_without_starting_the_environment(registry, monkeypatch):
     monkeypatch.setattr(Environment, "start", lambda self: pytest.fail("started"))
     line = next(line for line in registry.status() if line.name == "far@far")
     assert line.available
@@ -40,7 +40,7 @@ def test_what_is_there_is_listed_without_starting_it(registry, monkeypatch):
     assert not any(line.name == "sift@far" for line in registry.status())
 
 
-def test_the_contract_passes_through_unchanged(registry):
+def test_provider_in_environment_passes_the_contract(registry):
     results = run_checks(registry, "depth", "far@far")
     assert not [result for result in results if result.status == "fail"]
     passed = {result.id for result in results if result.status == "pass"}
@@ -60,7 +60,7 @@ def test_answers_are_those_of_the_provider(registry, context, named):
     assert len(matches.dense) == 1
 
 
-def test_in_a_configuration(registry):
+def test_configuration_selects_provider_in_environment(registry):
     config = load_config("fast-cpu", ["depth.use=far", "depth.environment=far"], registry=registry)
     assert config.depth.use == "far@far"
     assert config.depth.options["mode"] == "painted"
@@ -74,7 +74,7 @@ def test_in_a_configuration(registry):
         load_config("fast-cpu", ["depth.use=far", "depth.environment=near"], registry=registry)
 
 
-def test_a_place_is_said_once():
+def test_environment_given_twice_raises():
     assert ProviderConfig.model_validate({"use": "a", "environment": "b"}).use == "a@b"
     with pytest.raises(ValueError, match="already selects it"):
         ProviderConfig.model_validate({"use": "a@c", "environment": "b"})
@@ -117,7 +117,7 @@ def test_weights_are_found_by_this_process(registry, tmp_path):
         ("ours", "far.pt is damaged"),
     ],
 )
-def test_a_failure_ends_one_call(registry, context, named, name, message):
+def test_failure_of_provider_ends_one_call(registry, context, named, name, message):
     provider = registry.create("depth", "far@far", None, context)
     spec = registry.spec("depth", "far@far")
     with pytest.raises((ProviderRunError, WeightsError), match=message):
@@ -135,7 +135,7 @@ def test_a_worker_that_hangs(registry, context, named, monkeypatch):
     assert provider.predict(named("next.png")).valid.any()
 
 
-def test_what_cannot_be_constructed_there(registry, context):
+def test_construction_failure_in_environment_raises(registry, context):
     with pytest.raises(ProviderError, match="ImportError: libcudart"):
         registry.create("depth", "far@far", {"mode": "unbuildable"}, context)
 
@@ -146,7 +146,7 @@ def test_another_version_of_the_protocols(far, monkeypatch):
         far.start()
 
 
-def test_an_environment_that_does_not_start(tmp_path):
+def test_environment_that_does_not_start_raises(tmp_path):
     broken = Environment(tmp_path / "broken")
     broken.python.parent.mkdir(parents=True)
     broken.python.write_text("#!/bin/sh\necho 'no numpy here' >&2\nexit 1\n")
@@ -155,7 +155,7 @@ def test_an_environment_that_does_not_start(tmp_path):
         broken.start()
 
 
-def test_names(monkeypatch, tmp_path):
+def test_invalid_or_missing_environment_names_raise(monkeypatch, tmp_path):
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     with pytest.raises(InputError, match="lower-case"):
         create_environment("Not a name", ["x"])
@@ -166,7 +166,7 @@ def test_names(monkeypatch, tmp_path):
         create_environment("there", ["x"])
 
 
-def test_it_is_there_as_a_whole_or_not_at_all(monkeypatch, tmp_path):
+def test_environment_is_created_completely_or_not_at_all(monkeypatch, tmp_path):
     """Check that an environment is created next to its final folder, invisible to other
     processes."""
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
@@ -193,7 +193,7 @@ def test_it_is_there_as_a_whole_or_not_at_all(monkeypatch, tmp_path):
 
 
 @pytest.mark.slow
-def test_what_cannot_be_installed_leaves_nothing_behind(monkeypatch, tmp_path):
+def test_failed_installation_leaves_no_environment(monkeypatch, tmp_path):
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     with pytest.raises(ProviderError, match="cannot be created"):
         create_environment("new", [str(tmp_path / "nowhere")])

@@ -151,7 +151,7 @@ def test_weights_that_lie_beside_a_network_become_one_file_that_moves_with_it(
 
 
 @pytest.mark.slow
-def test_what_onnx_has_no_word_for(
+def test_operation_without_onnx_equivalent_raises(
     code: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     net = code / "their_net.py"
@@ -161,7 +161,7 @@ def test_what_onnx_has_no_word_for(
 
 
 @pytest.mark.slow
-def test_a_checkpoint_with_code_in_it_is_refused(
+def test_checkpoint_with_code_is_refused(
     code: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     torch.save({"gain": print}, tmp_path / "net.pt")
@@ -169,7 +169,9 @@ def test_a_checkpoint_with_code_in_it_is_refused(
         export_model("net", recipe(tmp_path, monkeypatch), [code], str(tmp_path / "net.pt"))
 
 
-def test_what_is_not_there(code: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_checkout_or_checkpoint_raises(
+    code: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = recipe(tmp_path, monkeypatch)
     with pytest.raises(InputError, match="git clone https://github"):
         export_model("net", made, [tmp_path / "nowhere"], export.RANDOM)

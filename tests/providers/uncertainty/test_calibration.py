@@ -17,7 +17,7 @@ def stds(calibration: DepthCalibration, prior: DepthPrior) -> list[float]:
     return list(np.sqrt(variance.astype(np.float64)).ravel())
 
 
-def test_the_total_std_is_the_largest_of_three() -> None:
+def test_total_std_is_the_maximum_of_three_terms() -> None:
     prior = DepthPrior.from_arrays(DEPTH, np.full((2, 2), 0.1**2))
     calibration = DepthCalibration(std_scale=2.0, relative_std=0.1, std_floor=0.3)
     assert stds(calibration, prior) == pytest.approx([0.3, 0.3, 0.4, 0.8], rel=1e-6)
@@ -25,7 +25,7 @@ def test_the_total_std_is_the_largest_of_three() -> None:
     assert stds(calibration, prior) == pytest.approx([0.5, 0.5, 0.5, 0.8], rel=1e-6)
 
 
-def test_the_network_can_be_ignored_and_a_floor_needs_metres() -> None:
+def test_zero_std_scale_ignores_network_and_floor_needs_meters() -> None:
     prior = DepthPrior.from_arrays(DEPTH, np.ones((2, 2)), metric=False)
     calibration = DepthCalibration(relative_std=0.1, std_floor=0.3, use_network_variance=False)
     assert stds(calibration, prior) == pytest.approx([0.1, 0.2, 0.4, 0.8], rel=1e-6)
@@ -40,14 +40,14 @@ def test_pixels_beside_a_step_get_more() -> None:
     assert found == pytest.approx([0.1, 0.3, 0.3, 0.1, 0.1], rel=1e-5)
 
 
-def test_a_step_to_an_invalid_pixel_is_no_edge() -> None:
+def test_depth_step_to_invalid_pixel_is_no_edge() -> None:
     prior = DepthPrior.from_arrays(np.array([[1.0, 1.0, np.nan, 5.0]]))
     calibration = DepthCalibration(relative_std=0.1, std_floor=0, edge_ratio=1.1, edge_std_scale=3)
     assert stds(calibration, prior) == pytest.approx([0.1, 0.1, 0, 0.5], rel=1e-5)
 
 
 @pytest.mark.parametrize("space", ["depth", "disparity"])
-def test_a_shift_is_in_medians_of_the_map(space: str) -> None:
+def test_shift_is_in_units_of_the_median_depth(space: str) -> None:
     prior = DepthPrior.from_arrays(np.array([[1.0, 2.0, 5.0]]))
     shifted = DepthCalibration(shift=0.5, shift_space=space).apply(prior).depth.ravel()
     expected = [2.0, 3.0, 6.0] if space == "depth" else [1 / 1.25, 1 / 0.75, 1 / 0.45]
@@ -55,7 +55,7 @@ def test_a_shift_is_in_medians_of_the_map(space: str) -> None:
 
 
 @pytest.mark.parametrize("space", ["depth", "disparity"])
-def test_a_shift_carries_the_variance_along(space: str) -> None:
+def test_shift_of_disparity_changes_the_variance(space: str) -> None:
     depth, step = np.array([[1.0, 2.0, 5.0]]), 1e-3
     calibration = DepthCalibration(
         std_scale=1.0, relative_std=0, std_floor=0, shift=0.3, shift_space=space
@@ -72,7 +72,7 @@ def test_depth_that_a_shift_destroys_is_invalid() -> None:
     assert applied.valid.tolist() == [[False, True, True]]
 
 
-def test_a_map_without_valid_pixels_stays_so() -> None:
+def test_map_without_valid_pixels_stays_invalid() -> None:
     prior = DepthPrior.from_arrays(np.zeros((2, 3)))
     assert not DepthCalibration(shift=0.4).apply(prior).valid.any()
 

@@ -41,12 +41,12 @@ def write(path: Path, calibration: Calibration) -> Path:
 
 
 @pytest.mark.parametrize("name", ["a.yaml", "a.json"])
-def test_what_is_written_is_read_again(tmp_path: Path, name: str) -> None:
+def test_written_calibration_is_read_unchanged(tmp_path: Path, name: str) -> None:
     assert load_calibration(write(tmp_path / name, DEPTH)) == DEPTH
     assert load_calibration(write(tmp_path / name, NORMALS), "normals") == NORMALS
 
 
-def test_the_class_follows_the_kind() -> None:
+def test_kind_selects_the_calibration_class() -> None:
     values = {"std_scale": 2.0, "use_network_variance": True}
     file = CalibrationFile.model_validate(
         {"kind": "normals", "calibration": values, "provenance": PROVENANCE}
@@ -54,7 +54,7 @@ def test_the_class_follows_the_kind() -> None:
     assert isinstance(file.calibration, NormalCalibration)
 
 
-def test_a_configuration_takes_the_file(tmp_path: Path) -> None:
+def test_configuration_reads_the_calibration_file(tmp_path: Path) -> None:
     write(tmp_path / "depth.yaml", DEPTH)
     config = tmp_path / "run.yaml"
     config.write_text(
@@ -65,7 +65,7 @@ def test_a_configuration_takes_the_file(tmp_path: Path) -> None:
     assert load_config(config).depth.calibration == DEPTH.model_dump(mode="json")
 
 
-def test_the_other_kind_is_refused_with_the_place(tmp_path: Path) -> None:
+def test_calibration_of_other_kind_raises_with_its_key(tmp_path: Path) -> None:
     write(tmp_path / "depth.yaml", DEPTH)
     config = tmp_path / "run.yaml"
     config.write_text(
@@ -86,7 +86,9 @@ def test_the_other_kind_is_refused_with_the_place(tmp_path: Path) -> None:
         ("a: [\n", "not valid YAML"),
     ],
 )
-def test_wrong_files_are_told_by_name(tmp_path: Path, text: str, message: str) -> None:
+def test_wrong_calibration_files_raise_with_their_name(
+    tmp_path: Path, text: str, message: str
+) -> None:
     path = tmp_path / "wrong.yaml"
     path.write_text(text)
     with pytest.raises(ConfigError, match=r"wrong\.yaml") as caught:
@@ -94,6 +96,6 @@ def test_wrong_files_are_told_by_name(tmp_path: Path, text: str, message: str) -
     assert message in str(caught.value)
 
 
-def test_a_missing_file(tmp_path: Path) -> None:
+def test_missing_calibration_file_raises(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         load_calibration(tmp_path / "nowhere.yaml")
