@@ -205,3 +205,13 @@ def test_plugins_check_plugin_without_providers_checks_hooks(
     code, out, _ = mpsfm("plugins", "check", "listener")
     assert code == 0
     assert "pass  plugin/listener: hook-exports" in out
+
+
+@pytest.mark.parametrize(("option", "code"), [((), 0), (("--strict",), 1)])
+def test_plugins_check_strict_fails_if_check_cannot_measure(
+    option: tuple[str, ...], code: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MPSFM_CHECKING", "1")  # The check runs in this process.
+    found, text, _ = mpsfm("plugins", "check", "depth/flat", "--only", "depth-scale", *option)
+    assert found == code, text
+    assert "1 unmeasured: the ground truth is unknown" in text
