@@ -308,18 +308,23 @@ def run_mapper(
         >>> largest = result.reconstructions[0]
         >>> largest.poses["a"], largest.images[0].depth.variance
     """
-    if isinstance(options, Mapping):
-        options = parse_settings(MapperOptions, options, ())
     stages = Stages(Registry(), on_event)
     with stages.stage("mapping"):
-        return mapper.reconstruct(problem, options, stages)
+        return mapper.reconstruct(problem, _parse_mapper_options(options), stages)
+
+
+def _parse_mapper_options(options: MapperOptions | Mapping[str, Any] | None) -> MapperOptions:
+    """Return mapper options from options or settings."""
+    if isinstance(options, MapperOptions):
+        return options
+    return parse_settings(MapperOptions, options or {}, ())
 
 
 def undistort_views(
     result: MappingResult,
     problem: MappingProblem,
     images: ImageSet,
-    options: MapperOptions | None = None,
+    options: MapperOptions | Mapping[str, Any] | None = None,
 ) -> tuple[MappingResult, MappingProblem, ImageSet]:
     """Undistort images again with the radial distortion that the mapper estimated.
 
@@ -330,16 +335,19 @@ def undistort_views(
         result: Result of :func:`run_mapper`.
         problem: Mapping problem, the input of :func:`run_mapper`.
         images: Images of the mapping problem.
-        options: Mapper options, with which depth maps are refined.
+        options: Options of the mapper for the refinement of depth maps, as in :func:`run_mapper`.
+
+    Raises:
+        SettingsError: a mapper option is unknown or out of range.
 
     Example:
         >>> result, problem, images = mpsfm.undistort_views(result, problem, images)
     """
+    options = _parse_mapper_options(options)
     refined = undistort_images(images, problem, result.reconstructions)
     if refined is images:
         return result, problem, images
     problem = undistort_problem(images, refined, problem)
-    options = options or MapperOptions()
     parts = refine_reconstructions(refined, problem, result.reconstructions, options)
     return replace(result, reconstructions=parts), problem, refined
 

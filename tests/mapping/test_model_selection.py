@@ -9,14 +9,15 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
-from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.consistency.depth_agreement import measure_depth_agreement
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.model_selection import (
     MapperRun,
     compute_explained_score,
     compute_total_score,
+    is_settled,
     select_run,
+    sum_run_times,
 )
 from mpsfm_core.mapping.options import ConsistencyOptions, MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
@@ -36,7 +37,7 @@ def problem() -> MappingProblem:
 
 
 def with_false_matches(problem: MappingProblem, share: float) -> MappingProblem:
-    """Return the problem with a share of wrong matches in each pair."""
+    """Replace a share of each pair's matches by wrong matches."""
     pairs = []
     for pair in problem.pairs:
         matches = pair.matches.copy()
@@ -46,7 +47,7 @@ def with_false_matches(problem: MappingProblem, share: float) -> MappingProblem:
     return MappingProblem(problem.images, tuple(pairs))
 
 
-def test_correct_poses_explain_correct_matches(problem: MappingProblem) -> None:
+def test_compute_explained_score_of_true_poses_is_nearly_total(problem: MappingProblem) -> None:
     (model,) = reconstruct(problem).reconstructions
     total = compute_total_score(problem)
     assert total == pytest.approx(sum(pair.scores.sum() for pair in problem.pairs))
@@ -58,11 +59,11 @@ def test_correct_poses_explain_correct_matches(problem: MappingProblem) -> None:
     assert compute_explained_score(model, doubtful) < 0.6 * total
 
 
-def test_explained_matches_need_one_run(problem: MappingProblem) -> None:
+def test_reconstruct_runs_once_if_matches_are_explained(problem: MappingProblem) -> None:
     assert reconstruct(problem).report.runs == 1
 
 
-def test_agreeing_runs_end_the_search(problem: MappingProblem) -> None:
+def test_reconstruct_stops_after_two_equal_runs(problem: MappingProblem) -> None:
     doubtful = with_false_matches(problem, 0.35)
     result = reconstruct(doubtful, MapperOptions(max_runs=5))
     assert result.report.runs == 2
@@ -76,86 +77,70 @@ def test_agreeing_runs_end_the_search(problem: MappingProblem) -> None:
         np.testing.assert_array_equal(image.depth.depth, same.depth.depth)
 
 
-class Scripted:
-    """Mapper whose runs are given by the share of matches that each component explains."""
-
-    script: Sequence[Sequence[float]] = ()
-    is_deterministic = False
-    pair_weights = None
-
-    def __init__(
-        self, problem: MappingProblem, options: MapperOptions, events: object, weighed: object
-    ) -> None:
-        self.explained = self.script[options.seed]
-
-    def run(self, paused: object = None) -> MapperRun:
-        # the points of a model identify the component by its explained share
-        models = [Reconstruction((), np.full((1, 3), e), np.zeros(1)) for e in self.explained]
-        report = MappingReport(seconds={"all": 2.0}, counts={"all": 1})
-        return MapperRun(models, self.explained, report)
+def make_run(explained_ratios: Sequence[float]) -> MapperRun:
+    """Return a run whose components have no images and explain the given shares of the scores."""
+    models = [Reconstruction((), np.zeros((0, 3)), np.zeros(0)) for _ in explained_ratios]
+    report = MappingReport(seconds={"all": 2.0}, counts={"all": 1})
+    return MapperRun(models, explained_ratios, report)
 
 
 @pytest.mark.parametrize(
-    ("script", "kept", "runs"),
+    ("explained_ratios", "selected", "settled"),
     [
-        ([[0.5], [0.6], [0.55]], 0.6, 3),
-        ([[0.5], [0.6], [0.505], [0.9]], 0.6, 3),
-        ([[0.5], [0.5], [0.9]], 0.5, 2),
-        ([[0.5], [0.8], [0.9]], 0.8, 2),
-        ([[0.4, 0.4], [0.9]], 0.4, 1),
-        ([[], [0.3], [0.2]], 0.3, 3),
-        ([[], []], None, 2),
+        ([[0.5]], 0, False),
+        ([[0.5], [0.6]], 1, False),
+        ([[0.5], [0.6], [0.505]], 1, True),
+        ([[0.5], [0.5]], 0, True),
+        ([[0.5], [0.8]], 1, True),
+        ([[0.4, 0.4]], 0, True),
+        ([[], [0.3]], 1, False),
+        ([[], []], 0, True),
     ],
-    ids=["most", "agreement-with-any", "same", "enough", "enough-in-groups", "none-first", "none"],
+    ids=["one", "two", "same-as-first", "same", "enough", "enough-in-two", "none-first", "none"],
 )
-def test_reconstruct_selects_the_run_that_explains_most(
-    monkeypatch: pytest.MonkeyPatch,
-    problem: MappingProblem,
-    script: list[list[float]],
-    kept: float | None,
-    runs: int,
+def test_select_run_by_explained_ratio_until_settled(
+    explained_ratios: list[list[float]], selected: int, settled: bool
 ) -> None:
-    monkeypatch.setattr(Scripted, "script", script)
-    monkeypatch.setattr(mapper, "Mapper", Scripted)
-    result = reconstruct(problem, MapperOptions(max_runs=3))
-    assert result.report.runs == runs
-    assert result.report.seconds == ({"all": 2.0 * runs}) and result.report.counts == {"all": runs}
-    found = [float(model.points[0, 0]) for model in result.reconstructions]
-    assert found[:1] == ([] if kept is None else [kept])
+    runs = [make_run(ratios) for ratios in explained_ratios]
+    assert is_settled(runs, MapperOptions().enough_explained) == settled
+    assert select_run(runs, OPTIONS) is runs[selected]
 
 
-def test_deterministic_mapper_needs_one_run(
-    monkeypatch: pytest.MonkeyPatch, problem: MappingProblem
-) -> None:
-    monkeypatch.setattr(Scripted, "script", [[0.1], [0.2]])
-    monkeypatch.setattr(Scripted, "is_deterministic", True)
-    monkeypatch.setattr(mapper, "Mapper", Scripted)
-    assert reconstruct(problem).report.runs == 1
+def test_sum_run_times_adds_seconds_and_counts_of_all_runs() -> None:
+    runs = [make_run([0.5])] * 3
+    report = sum_run_times(runs[0].report, runs)
+    assert (report.runs, report.seconds, report.counts) == (3, {"all": 6.0}, {"all": 3})
 
 
-def test_select_run_prefers_repeated_result(problem: MappingProblem) -> None:
-    """A single run is selected only if it explains clearly more than two runs with the same
-    result."""
+def test_reconstruct_with_fixed_poses_runs_once(problem: MappingProblem) -> None:
+    doubtful = with_false_matches(problem, 0.35)
+    (model,) = reconstruct(problem).reconstructions
+    options = MapperOptions(known_poses="fixed")
+    assert reconstruct(doubtful.with_poses(model.poses), options).report.runs == 1
+
+
+def test_select_run_prefers_the_more_frequent_of_equal_runs(problem: MappingProblem) -> None:
+    """A single run is selected only if it explains clearly more than two equal runs."""
     (model,) = reconstruct(problem).reconstructions
 
     def run(size: int, explained: float) -> MapperRun:
         return MapperRun([replace(model, images=model.images[:size])], [explained], MappingReport())
 
-    alone, one, other = run(4, 0.662), run(3, 0.655), run(3, 0.660)
-    assert select_run([alone, one, other], OPTIONS) is other
-    assert select_run([alone, one], OPTIONS) is alone
+    single, first, second = run(4, 0.662), run(3, 0.655), run(3, 0.660)
+    assert select_run([single, first, second], OPTIONS) is second
+    assert select_run([single, first], OPTIONS) is single
     clearly = run(4, 0.68)
-    assert select_run([clearly, one, other], OPTIONS) is clearly
+    assert select_run([clearly, first, second], OPTIONS) is clearly
 
 
-def test_select_run_of_equal_runs_prefers_agreeing_depth(problem: MappingProblem) -> None:
-    """If two runs explain equally many matches, the depth maps must agree in the selected run."""
+def test_select_run_prefers_agreeing_depth_of_equal_runs(problem: MappingProblem) -> None:
+    """Two runs explain equally much, but one has an image that looks away from the others."""
     (model,) = reconstruct(problem).reconstructions
     *rest, last = model.images
     turned = np.diag([-1.0, 1.0, -1.0])
     away = replace(last, rotation=turned @ last.rotation, translation=turned @ last.translation)
-    elsewhere = replace(model, images=(*rest, away))
-    assert measure_depth_agreement(elsewhere, OPTIONS) < measure_depth_agreement(model, OPTIONS)
+    contradicted = replace(model, images=(*rest, away))
+    assert measure_depth_agreement(contradicted, OPTIONS) < measure_depth_agreement(model, OPTIONS)
     right = MapperRun([model], [0.650], MappingReport())
-    wrong = MapperRun([elsewhere], [0.655], MappingReport())
+    wrong = MapperRun([contradicted], [0.655], MappingReport())
     assert select_run([right, wrong], OPTIONS) is select_run([wrong, right], OPTIONS) is right

@@ -11,11 +11,14 @@ import numpy as np
 import pycolmap
 import pytest
 
+import mpsfm_core as mpsfm
 from mpsfm_core.data import MappingProblem
+from mpsfm_core.data.options import SettingsError
 from mpsfm_core.geometry import pixel_centers, project, sample_nearest, scale_pixels, transform
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.undistortion import undistort_camera
+from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     CalibrationOutcome,
     IntrinsicEstimate,
@@ -129,6 +132,14 @@ def test_undistort_without_distortion_changes_nothing(solved, images) -> None:
     assert undistort_images(images, solved.problem, [solved.best]) is images
     moved = undistort_problem(images, images, solved.problem)
     assert all(new is old for new, old in zip(moved.images, solved.problem.images, strict=True))
+
+
+@pytest.mark.parametrize("options", [None, {"seed": 1}, MapperOptions(seed=1)])
+def test_undistort_views_takes_options_as_run_mapper_does(solved, images, options) -> None:
+    result = mpsfm.undistort_views(solved.result, solved.problem, images, options)
+    assert result[0] is solved.result and result[2] is images
+    with pytest.raises(SettingsError, match="sed"):
+        mpsfm.undistort_views(solved.result, solved.problem, images, {"sed": 1})
 
 
 def test_model_and_summary_have_the_refined_camera(images, mapped) -> None:
