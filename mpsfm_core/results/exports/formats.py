@@ -12,15 +12,7 @@ from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.providers import ExportFormat
 from mpsfm_core.providers.first_party import EXPORTS, install_hint
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.results.exports import (
-    bundler,
-    colmap_database,
-    colmap_text,
-    glb,
-    gsplat,
-    nerfstudio,
-    nvm,
-)
+from mpsfm_core.results.exports import colmap_database, colmap_text, glb, gsplat, nerfstudio
 from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.support.files import replace_entries
 from mpsfm_core.support.format_versions import VERSION
@@ -62,8 +54,6 @@ FORMATS = (
         glb.write,
         align_gravity=True,
     ),
-    ExportFormat("bundler", "bundle.out of Bundler, undistorted", bundler.ENTRIES, bundler.write),
-    ExportFormat("nvm", "N-View Match of VisualSFM, undistorted", nvm.ENTRIES, nvm.write),
 )
 """Export formats that the core package provides."""
 

@@ -195,53 +195,6 @@ def test_trimesh_reads_the_glb(result: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(place, turned[[0, 2, 1]] * [1, 1, -1], atol=1e-5)
 
 
-def test_bundler_projection_equals_its_manual(result: Path, tmp_path: Path) -> None:
-    """Project by x = f * -P / P.z with P = R X + t (Snavely's manual). Tested by hand in
-    MeshLab."""
-    export(result, "bundler", tmp_path)
-    names = (tmp_path / "list.txt").read_text().split()
-    assert names == [f"images/{name}" for name in REGISTERED]
-    assert all((tmp_path / name).is_file() for name in names)
-    lines = iter((tmp_path / "bundle.out").read_text().splitlines())
-    assert next(lines) == "# Bundle file v0.3"
-    cameras, points = map(int, next(lines).split())
-    blocks = [[[*map(float, next(lines).split())] for _ in range(5)] for _ in range(cameras)]
-    for _ in range(points):
-        xyz, color = np.array(next(lines).split(), float), next(lines).split()
-        assert len(color) == 3
-        count, *views = next(lines).split()
-        assert len(views) == 4 * int(count)
-        for view in np.array(views, float).reshape(-1, 4):
-            (focal, k1, k2), *rotation, translation = blocks[int(view[0])]
-            assert (k1, k2) == (0, 0)
-            local = np.array(rotation) @ xyz + translation
-            np.testing.assert_allclose(-focal * local[:2] / local[2], view[2:], atol=0.5)
-    assert next(lines, None) is None
-
-
-def test_nvm_projection_equals_its_documentation(result: Path, tmp_path: Path) -> None:
-    """Project by x = f * (R (X - C)) with R from the quaternion (VisualSFM). Tested by hand in
-    MeshLab."""
-    export(result, "nvm", tmp_path)
-    lines = (tmp_path / "reconstruction.nvm").read_text().splitlines()
-    assert lines[0].strip() == "NVM_V3"
-    count = int(lines[2])
-    cameras = []
-    for line in lines[3 : 3 + count]:
-        name, numbers = line.split("\t")
-        assert (tmp_path / name).is_file()
-        focal, w, x, y, z, *center = map(float, numbers.split()[:8])
-        cameras.append((focal, pycolmap.Rotation3d([x, y, z, w]).matrix(), np.array(center)))
-    points = int(lines[4 + count])
-    assert points == 60
-    for line in lines[5 + count : 5 + count + points]:
-        values = [float(value) for value in line.split()]
-        for view in np.array(values[7:]).reshape(int(values[6]), 4):
-            focal, rotation, center = cameras[int(view[0])]
-            local = rotation @ (np.array(values[:3]) - center)
-            np.testing.assert_allclose(focal * local[:2] / local[2], view[2:], atol=0.5)
-
-
 def test_aligned_exports_have_gravity_down_and_a_centered_origin(
     result: Path, tmp_path: Path
 ) -> None:
@@ -297,7 +250,7 @@ def test_repeated_export_replaces_only_the_earlier_export(result: Path, tmp_path
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "images").mkdir()
     (tmp_path / "images" / "old.png").write_text("")
-    export(result, "bundler", tmp_path)
+    export(result, "gsplat", tmp_path)
     assert (tmp_path / "notes.txt").read_text() == "mine"
     assert not (tmp_path / "images" / "old.png").exists()
 
