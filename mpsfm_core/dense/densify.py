@@ -151,29 +151,73 @@ def densify(
     """
     image_rows = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
     images = [reconstruction.images[row] for row in image_rows]
-    neighbors = select_source_views(images, max(_NUM_SOURCES, _MAX_SPLAT_VIEWS))
-    sources = [views[:_NUM_SOURCES] for views in neighbors]
-    compared_views = _symmetric_neighbors(sources)
-    views = _ViewCache(images, view_of, options)
+    steps = _DensifySteps(images, view_of, options, checkpoints, store_array, poses_use_depth)
+    rows = [row for row, views in enumerate(steps.sources) if views]
+    with ThreadPoolExecutor(workers or thread_limit()) as pool:
+        for row, image in zip(rows, pool.map(steps.match_image, rows), strict=True):
+            steps.matched[row] = image
+            progress(len(steps.matched), len(rows))
+        checks = dict(zip(rows, pool.map(steps.check_image, rows), strict=True))
+        steps.consistency.update({row: result for row, (result, _) in checks.items()})
+        constraints = {row: known for row, (_, known) in checks.items() if known}
+        steps.scale_stds.update(estimate_scale_stds(constraints))
+        dense_images, measured_masks = list(reconstruction.images), {}
+        for row, (dense_image, mask) in zip(rows, pool.map(steps.fuse_image, rows), strict=True):
+            dense_images[image_rows[row]], measured_masks[dense_image.name] = dense_image, mask
+    names = [image.name for image in images]
+    report = DenseReport(
+        {names[row]: [names[view] for view in views] for row, views in enumerate(steps.sources)},
+        {name: _confirmed_ratio(steps.consistency.get(row)) for row, name in enumerate(names)},
+        measured_masks,
+    )
+    return replace(reconstruction, images=tuple(dense_images)), report
 
-    def match_image(row: int) -> _MatchedImage:
-        view, name = views[row], images[row].name
-        stereo = checkpoints.load(name) if checkpoints else None
+
+class _DensifySteps:
+    """Steps of densification for one image each, which run in parallel threads.
+
+    The attributes ``matched``, ``consistency`` and ``scale_stds`` contain the results of a step for
+    all images, which the next step needs.
+    """
+
+    def __init__(
+        self,
+        images: Sequence[RegisteredImage],
+        view_of: Callable[[str], View],
+        options: DenseOptions,
+        checkpoints: StereoCheckpoints | None,
+        store_array: ArrayStore,
+        poses_use_depth: bool,
+    ) -> None:
+        self._images, self._options, self._checkpoints = images, options, checkpoints
+        self._store_array, self._poses_use_depth = store_array, poses_use_depth
+        self._neighbors = select_source_views(images, max(_NUM_SOURCES, _MAX_SPLAT_VIEWS))
+        self.sources = [views[:_NUM_SOURCES] for views in self._neighbors]
+        self._compared_views = _symmetric_neighbors(self.sources)
+        self._views = _ViewCache(images, view_of, options)
+        self.matched: dict[int, _MatchedImage] = {}
+        self.consistency: dict[int, GeometricConsistency] = {}
+        self.scale_stds: dict[int, float] = {}
+
+    def match_image(self, row: int) -> _MatchedImage:
+        """Compute or load the stereo depth of an image."""
+        view, name = self._views[row], self._images[row].name
+        stereo = self._checkpoints.load(name) if self._checkpoints else None
         if stereo is None:
-            stereo = match_stereo_depth(view, [views[source] for source in sources[row]])
-            if checkpoints:
-                checkpoints.save(name, stereo)
+            stereo = match_stereo_depth(view, [self._views[j] for j in self.sources[row]])
+            if self._checkpoints:
+                self._checkpoints.save(name, stereo)
         supported = view.usable & (stereo.cost < _MAX_COST)
-        return _MatchedImage(
-            view.grid, store_array(stereo.log_depth), stereo.parallax, store_array(supported)
-        )
+        store = self._store_array
+        return _MatchedImage(view.grid, store(stereo.log_depth), stereo.parallax, store(supported))
 
-    def check_image(row: int) -> tuple[GeometricConsistency, ScaleConstraints | None]:
-        image = matched[row]
-        differences = _compare_with_views(row, matched, compared_views[row])
+    def check_image(self, row: int) -> tuple[GeometricConsistency, ScaleConstraints | None]:
+        """Check stereo depth against neighboring views, and measure constraints of the scale."""
+        image = self.matched[row]
+        differences = _compare_with_views(row, self.matched, self._compared_views[row])
         patches = {
             source: measure_patch_offsets(
-                views[row], image.log_depth, views[source], difference.agree
+                self._views[row], image.log_depth, self._views[source], difference.agree
             )
             for source, difference in differences.items()
         }
@@ -185,43 +229,24 @@ def densify(
         pose_std_px = estimate_pose_error_px(patches[source] for source in consistent)
         consistency = evaluate_consistency(image.parallax_px, consistent.values(), pose_std_px)
         constraints = (
-            _measure_constraints(image, consistent, views[row], options)
-            if poses_use_depth
+            _measure_constraints(image, consistent, self._views[row], self._options)
+            if self._poses_use_depth
             else None
         )
-        return _store_consistency(consistency, store_array), constraints
+        return _store_consistency(consistency, self._store_array), constraints
 
-    def fuse_image(row: int) -> tuple[RegisteredImage, Bool]:
-        view = views[row]
+    def fuse_image(self, row: int) -> tuple[RegisteredImage, Bool]:
+        """Fuse stereo depth with input depth, and return the mask of pixels with stereo depth."""
+        view = self._views[row]
         known = LogDepthMap(view.log_depth, view.log_std)
-        stereo = _merge_stereo_depth(row, view, matched, consistency, neighbors[row])
-        measured = fuse_known_depth(stereo, known)
-        posterior = compute_depth_posterior(known, measured, options.correlation_px)
-        scale_std = scale_stds.get(row, 0.0)
-        image = _replace_depth(images[row], view, posterior, scale_std, store_array)
-        return image, store_array(measured.known)
-
-    rows = [row for row, views_ in enumerate(sources) if views_]
-    matched: dict[int, _MatchedImage] = {}
-    with ThreadPoolExecutor(workers or thread_limit()) as pool:
-        for row, image in zip(rows, pool.map(match_image, rows), strict=True):
-            matched[row] = image
-            progress(len(matched), len(rows))
-        checks = dict(zip(rows, pool.map(check_image, rows), strict=True))
-        consistency = {row: result for row, (result, _) in checks.items()}
-        scale_stds = estimate_scale_stds(
-            {row: constraints for row, (_, constraints) in checks.items() if constraints}
+        stereo = _merge_stereo_depth(
+            row, view, self.matched, self.consistency, self._neighbors[row]
         )
-        dense_images, measured_masks = list(reconstruction.images), {}
-        for row, (dense_image, mask) in zip(rows, pool.map(fuse_image, rows), strict=True):
-            dense_images[image_rows[row]], measured_masks[dense_image.name] = dense_image, mask
-    names = [image.name for image in images]
-    report = DenseReport(
-        {names[row]: [names[view] for view in views_] for row, views_ in enumerate(sources)},
-        {name: _confirmed_ratio(consistency.get(row)) for row, name in enumerate(names)},
-        measured_masks,
-    )
-    return replace(reconstruction, images=tuple(dense_images)), report
+        measured = fuse_known_depth(stereo, known)
+        posterior = compute_depth_posterior(known, measured, self._options.correlation_px)
+        scale_std = self.scale_stds.get(row, 0.0)
+        image = _replace_depth(self._images[row], view, posterior, scale_std, self._store_array)
+        return image, self._store_array(measured.known)
 
 
 def _confirmed_ratio(consistency: GeometricConsistency | None) -> float:
