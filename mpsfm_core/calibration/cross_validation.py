@@ -49,8 +49,6 @@ class StudyOptions(Options):
     to all images."""
     bootstraps: int = Field(100, ge=0)
     """Number of bootstrap samples for confidence intervals; 0 disables the intervals."""
-    samples_per_image: int = Field(500, ge=20)
-    """Maximum number of pixels sampled per image from true maps, whose errors are correlated."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,6 +32,9 @@ Samples = TypeVar("Samples", DepthSamples, NormalSamples)
 ALL_ALIGNMENTS: tuple[Alignment, ...] = ("scale", "scale-shift", "disparity")
 """Candidate alignments to true depth, for depth priors that are not metric."""
 
+SAMPLES_PER_IMAGE = 500
+"""Maximum number of pixels sampled per image from true maps, whose errors are correlated. [ours]"""
+
 
 class PriorComparison:
     """Comparison of depth or normal priors with ground truth.
@@ -71,10 +74,7 @@ class PriorComparison:
         Raises:
             InputError: No image has a true map file with enough valid pixels.
         """
-        sampling = self._options
-        truth = FileTruth(
-            self._context, self._kind, options, sampling.samples_per_image, sampling.seed
-        )
+        truth = FileTruth(self._context, self._kind, options, SAMPLES_PER_IMAGE, self._options.seed)
         known = [i for i in range(len(self._context.images)) if truth.has(self._context.view(i))]
         if not known:
             raise InputError(
@@ -98,14 +98,14 @@ class PriorComparison:
         Raises:
             InputError: No image has enough points with valid prior depth.
         """
-        names, sampling = self._context.images.names, self._options
+        names = self._context.images.names
         points = {i: truth[name] for i, name in enumerate(names) if name in truth}
         known = [i for i, found in points.items() if len(found.xy) >= MIN_SAMPLES]
 
         def depth(index: int) -> DepthSamples | None:
             size = self._context.images[index].pinhole.size
-            rng = np.random.default_rng([sampling.seed, index])
-            even = sample_evenly(points[index], size, sampling.samples_per_image, rng)
+            rng = np.random.default_rng([self._options.seed, index])
+            even = sample_evenly(points[index], size, SAMPLES_PER_IMAGE, rng)
             return self._depth(index, even)
 
         return self._depth_data(self._compare(known, depth), in_meters=False)

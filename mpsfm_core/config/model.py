@@ -74,16 +74,12 @@ class RuntimeOptions(Options):
 class FastPass(Options):
     """Inexpensive features and sparse matcher for a first matching and mapping pass.
 
-    The blocks ``features`` and ``matcher`` then match only pairs with an image that has fewer than
-    ``min_points`` points.
+    The blocks ``features`` and ``matcher`` then match only pairs with an image that observes fewer
+    than 100 points.
     """
 
     features: ProviderConfig
     matcher: ProviderConfig
-    min_points: int = expert(100, ge=1)
-    """Minimum number of points with at least three observations per image. Images with fewer points
-    after the fast pass are matched again; a larger value matches more images again. [COLMAP
-    init_min_num_inliers]"""
     partners: int = expert(15, ge=1)
     """Value of ``pairs.partners`` for images that are matched again, unless all pairs are matched.
     A larger number of partners takes more time. [tuned: benchmarks.pairs]"""

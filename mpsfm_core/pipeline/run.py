@@ -406,7 +406,7 @@ class _Run:
         """
         config = self._config
         assert config.fast_pass is not None
-        seeds = select_seed_images(mapping, config.fast_pass.min_points)
+        seeds = select_seed_images(mapping)
         unconstrained = frozenset(range(len(images))) - {image.index for image in seeds}
         if not unconstrained:
             return extraction, images, mapping

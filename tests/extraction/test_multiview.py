@@ -11,7 +11,7 @@ import pytest
 from mpsfm_core import DepthPrior, MultiViewPrior, View
 from mpsfm_core.data.errors import ConfigError, DataError
 from mpsfm_core.extraction.cache import Cache, pack, unpack
-from mpsfm_core.extraction.priors.multiview import choose_groups, consecutive_groups
+from mpsfm_core.extraction.priors.multiview import choose_groups
 from mpsfm_core.geometry import compose, invert
 from mpsfm_core.providers import ProviderSpec
 from mpsfm_core.providers.provider_config import ProviderConfig
@@ -37,10 +37,6 @@ def test_choose_groups_partitions_images_and_fills_small_groups() -> None:
     owned = [image for group, own in groups for image in group[:own]]
     assert sorted(owned) == list(range(7))
     assert all(len(group) == 3 and len(set(group)) == 3 for group, _ in groups)
-
-
-def test_consecutive_groups_split_in_order() -> None:
-    assert consecutive_groups([3, 5, 7, 9, 11], 2) == [(3, 5), (7, 9), (11,)]
 
 
 def test_multiview_prior_of_group_is_cached(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -111,8 +110,3 @@ class GroupPriors:
     def _predict_poses(self, group: Group) -> Float64 | None:
         """Predict the poses of an image group; depth maps stay in the disk cache."""
         return self.predict(group).poses
-
-
-def consecutive_groups(images: Sequence[int], size: int) -> list[Group]:
-    """Split an image sequence into groups of ``size`` consecutive images."""
-    return [tuple(images[start : start + size]) for start in range(0, len(images), size)]

@@ -10,8 +10,14 @@ from mpsfm_core.data import MappingProblem, PinholeCamera
 from mpsfm_core.mapping.initialization.camera_splitting import split_cameras
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, RegisteredImage
 
+MIN_POINTS = 100
+"""Minimum number of points with at least three observations that a seed image observes. [COLMAP
+init_min_num_inliers]"""
 
-def select_seed_images(mapping: MappingResult, min_points: int) -> list[RegisteredImage]:
+
+def select_seed_images(
+    mapping: MappingResult, min_points: int = MIN_POINTS
+) -> list[RegisteredImage]:
     """Select the well-constrained images of the largest reconstruction.
 
     Args:
