@@ -39,7 +39,6 @@ def densify_model(
     images: PathLike,
     output: PathLike,
     options: DenseOptions | None = None,
-    workers: int | None = None,
 ) -> DenseReport:
     """Compute and write depth maps of a posed model by multi-view stereo.
 
@@ -52,7 +51,6 @@ def densify_model(
         images: Folder of the original photos.
         output: Output folder for the depth maps, ``dense.ply`` and the model.
         options: Options of the dense stage.
-        workers: Number of threads, or None for one thread per core.
 
     Returns:
         Report of the dense stage as plain data.
@@ -61,7 +59,7 @@ def densify_model(
         InputError: model or photos cannot be read, image names do not match, the model has no
             points, or ``output`` cannot be written.
     """
-    with lock_output_folder(Path(output)), limit_threads(workers):
+    with lock_output_folder(Path(output)), limit_threads(None):
         return _densify_model(Path(model), Path(images), Path(output), options)
 
 

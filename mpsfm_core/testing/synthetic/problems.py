@@ -32,6 +32,10 @@ class SyntheticNoise(NamedTuple):
     """Std of the independent relative depth error of each pixel."""
 
 
+_NORMAL_STD_DEG = 1.0
+"""Angular std that the normal priors declare, in degrees."""
+
+
 def make_mapping_problem(
     scene: AnalyticScene,
     camera: PinholeCamera,
@@ -40,7 +44,6 @@ def make_mapping_problem(
     points_per_view: int = 150,
     map_width: int = 160,
     declared_depth_std: float = 0.01,
-    declared_normal_std_deg: float = 1.0,
     noise: SyntheticNoise | None = None,
     links: Sequence[tuple[int, int]] | None = None,
     two_view_tracks: bool = False,
@@ -56,7 +59,6 @@ def make_mapping_problem(
             that a view sees becomes a keypoint of this view.
         map_width: Width of the prior maps in pixels.
         declared_depth_std: Relative std that the depth priors declare.
-        declared_normal_std_deg: Angular std that the normal priors declare.
         noise: Standard deviations of the errors of keypoints and depth, by default zero.
         links: Image pairs to match, by default all. Image pairs with fewer than 15 common points
             are dropped.
@@ -91,7 +93,7 @@ def make_mapping_problem(
             keypoints[i],
             map_width,
             declared_depth_std,
-            declared_normal_std_deg,
+            _NORMAL_STD_DEG,
             noise,
             rng,
         )

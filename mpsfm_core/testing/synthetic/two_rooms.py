@@ -34,6 +34,12 @@ from mpsfm_core.testing.synthetic.scenes import (
 SHIFT = np.array([5.2, 0.0, 0.0])
 """Vector in meters from a point of the first room to its copy in the second room."""
 CAMERA = PinholeCamera(640, 480, 400.0, 400.0, 320.0, 240.0)
+VIEWS_PER_ROOM = 7
+"""Number of views per room."""
+_POINTS_PER_VIEW = 60
+"""Number of surface points that are sampled in each view."""
+_MAP_WIDTH = 160
+"""Width of the depth and normal prior maps in pixels."""
 MIN_MATCHES = 15
 """Smallest number of verified matches of an image pair [COLMAP min_num_inliers]."""
 MIN_SIGHT = 0.3
@@ -78,7 +84,7 @@ def make_twin_rooms() -> AnalyticScene:
     return AnalyticScene((shell, *walls, *lintels, *same, *different))
 
 
-def make_twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], list[int]]:
+def make_twin_room_poses(seed: int) -> tuple[list[Float64], list[int]]:
     """Create camera poses in both rooms and along the corridor.
 
     The camera positions vary with the seed. Cameras that would be inside of furniture are moved in
@@ -86,7 +92,6 @@ def make_twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], l
 
     Args:
         seed: Seed of the camera positions.
-        per_room: Number of views per room.
 
     Returns:
         Pose ``cam_from_world`` (3, 4) of each view, and its room: 0, 1, or -1 in the corridor.
@@ -95,8 +100,8 @@ def make_twin_room_poses(seed: int, per_room: int = 7) -> tuple[list[Float64], l
     eyes, targets, room = [], [], []
     for number in (0, 1):
         middle = np.array([2.5, 1.9, 1.4]) + number * SHIFT
-        turn = rng.uniform(0, 2 * np.pi / per_room)
-        for angle in turn + 2 * np.pi * np.arange(per_room) / per_room:
+        turn = rng.uniform(0, 2 * np.pi / VIEWS_PER_ROOM)
+        for angle in turn + 2 * np.pi * np.arange(VIEWS_PER_ROOM) / VIEWS_PER_ROOM:
             outward = np.array([1.7 * np.cos(angle), 1.3 * np.sin(angle), 0.0])
             eyes.append(middle + outward)
             targets.append(middle - 0.7 * outward - [0.0, 0.0, 0.4])
@@ -138,9 +143,6 @@ def make_twin_room_problem(
     seed: int = 0,
     *,
     errors: DepthErrors | None = None,
-    per_room: int = 7,
-    points_per_view: int = 60,
-    map_width: int = 160,
     keypoint_noise_px: float = 0.5,
 ) -> SymmetricProblem:
     """Create a synthetic mapping problem of two similar rooms.
@@ -153,24 +155,21 @@ def make_twin_room_problem(
         seed: Seed of the random poses, surface points and errors.
         errors: Model of the errors of the depth priors, which report the std of these errors. If
             None, the depth priors are exact and report a relative std of 1 %.
-        per_room: Number of views per room.
-        points_per_view: Number of surface points that are sampled in each view.
-        map_width: Width of the depth and normal prior maps in pixels.
         keypoint_noise_px: Std of the errors of keypoint positions in pixels.
 
     Returns:
         The mapping problem with its true solution.
     """
     scene = make_twin_rooms()
-    poses, room = make_twin_room_poses(seed, per_room)
+    poses, room = make_twin_room_poses(seed)
     rng = np.random.default_rng([seed, 1])
-    numbers, keypoints = _keypoints(scene, poses, points_per_view, rng)
+    numbers, keypoints = _keypoints(scene, poses, rng)
     noise = SyntheticNoise(keypoints_px=keypoint_noise_px)
     images = []
     for i, (pose, xy) in enumerate(zip(poses, keypoints, strict=True)):
         noisy = xy + keypoint_noise_px * rng.normal(size=xy.shape)
         image = render_mapping_image(
-            f"view_{i}.png", scene, CAMERA, pose, noisy, map_width, 0.01, 2.0, noise, rng
+            f"view_{i}.png", scene, CAMERA, pose, noisy, _MAP_WIDTH, 0.01, 2.0, noise, rng
         )
         if errors:
             depth = degrade_depth(image.depth.depth, image.name, errors, seed)
@@ -194,7 +193,7 @@ def make_twin_room_problem(
 
 
 def _keypoints(
-    scene: AnalyticScene, poses: Sequence[Float64], points_per_view: int, rng: np.random.Generator
+    scene: AnalyticScene, poses: Sequence[Float64], rng: np.random.Generator
 ) -> tuple[list[Int64], list[Float64]]:
     """Return the surface points that each view sees, and their pixels.
 
@@ -205,7 +204,7 @@ def _keypoints(
     numbers: list[list[Int64]] = [[] for _ in poses]
     pixels: list[list[Float64]] = [[] for _ in poses]
     for i, pose in enumerate(poses):
-        samples = scene.sample(CAMERA, pose, rng.uniform(2, size - 2, (points_per_view, 2)))
+        samples = scene.sample(CAMERA, pose, rng.uniform(2, size - 2, (_POINTS_PER_VIEW, 2)))
         for copy in (-1, 0, 1):
             points = samples.points + copy * SHIFT
             twins = (samples.points[:, 1] > 0) & (points[:, 0] > 0) & (points[:, 0] < 10.2)
@@ -213,7 +212,7 @@ def _keypoints(
                 xy, seen = _find_visible(scene, other, points)
                 rows = np.flatnonzero(seen & (twins | (copy == 0)))
                 label = np.full(len(rows), copy)
-                numbers[j].append(np.stack([i * points_per_view + rows, label], axis=1))
+                numbers[j].append(np.stack([i * _POINTS_PER_VIEW + rows, label], axis=1))
                 pixels[j].append(xy[rows])
     return [np.concatenate(n) for n in numbers], [np.concatenate(p) for p in pixels]
 
