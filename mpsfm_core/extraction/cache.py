@@ -120,11 +120,12 @@ def pack(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
     """Flatten a data object to a dictionary of arrays by field path; omit fields that are None."""
     if isinstance(value, Reason):
         value = json.dumps(value.to_json())
-    if isinstance(value, tuple):
+    if isinstance(value, (tuple, Mapping)):
+        parts = value.items() if isinstance(value, Mapping) else enumerate(value)
         return {
             name: array
-            for index, part in enumerate(value)
-            for name, array in pack(part, f"{prefix}/{index}").items()
+            for key, part in parts
+            for name, array in pack(part, f"{prefix}/{key}").items()
         }
     if not is_dataclass(value):
         array = np.asarray(value)
