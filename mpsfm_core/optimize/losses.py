@@ -4,18 +4,21 @@ A loss function maps the squared residual ``s`` and the loss scale ``a`` to ``(r
 The loss scale has the unit of the residual. The minimized cost is ``sum(rho(s)) / 2``, and ``rho'``
 is the weight in iteratively re-weighted least squares (IRLS). All loss functions accept numpy
 arrays and, in compiled kernels, scalars. :func:`evaluate_loss` selects a function by its
-:class:`~mpsfm_core.optimize.options.Loss`.
+:class:`Loss`.
 """
 # mypy: allow-untyped-decorators
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 from numba.extending import register_jitable
 from numpy.typing import NDArray
 
+from mpsfm_core.optimize.options import Loss
 from mpsfm_core.support import jit
 
 
@@ -45,9 +48,21 @@ def truncated(s: NDArray[Any], scale: float) -> tuple[Any, Any]:
     return np.minimum(s, scale * scale), (s < scale * scale) * 1.0
 
 
+LOSSES: Mapping[Loss, Callable[[NDArray[Any], float], tuple[Any, Any]]] = MappingProxyType(
+    {
+        Loss.TRIVIAL: trivial,
+        Loss.SOFT_L1: soft_l1,
+        Loss.CAUCHY: cauchy,
+        Loss.TRUNCATED: truncated,
+    }
+)
+"""Loss functions for numpy arrays, by member of the enumeration :class:`Loss`. Kernels use
+:func:`evaluate_loss`."""
+
+
 @jit.helper()
 def evaluate_loss(loss: int, s: float, scale: float) -> Any:
-    """Evaluate ``(rho, rho')`` of a squared residual for the integer value of a ``Loss``."""
+    """Evaluate ``(rho, rho')`` of a squared residual for the integer value of a :class:`Loss`."""
     if loss == 1:
         return soft_l1(s, scale)
     if loss == 2:
