@@ -35,9 +35,9 @@ by more in log camera height."""
 _ENOUGH = 0.04
 """Minimum share of floor pixels in a perspective image that yield a camera height."""
 _USUAL = 0.3
-"""Maximum difference of the log camera height of one image from the median of its panorama. An
-image with a larger difference shows a table or bed instead of the floor, and gets the median height
-of the panorama.
+"""Maximum difference of the log camera height of one image from the median of its panorama. If the
+difference is larger, the image shows a table or bed instead of the floor, and the median height of
+its panorama is used.
 """
 _OUTDOORS = 0.3
 """Minimum share of sky above the horizon in an outdoor panorama. Outdoors, only ground pixels get

@@ -24,8 +24,8 @@ _SMALLEST_SIDE = 32
 """Minimum side of an image in pixels, because image processors round sides down to multiples of up
 to 32."""
 _LARGEST_RATIO = 16
-"""Maximum aspect ratio of an image. An image processor could give a thinner image a side of 0
-pixels."""
+"""Maximum aspect ratio of an image. Image processors could resize images of larger aspect ratio to
+a side of 0 pixels."""
 
 
 @dataclass(frozen=True)
