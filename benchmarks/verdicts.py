@@ -246,11 +246,15 @@ def describe(run: Mapping[str, Any]) -> dict[str, Any]:
     verdict = judge(run["summary"])
     errors = list(run["errors_deg"].values())
     wrong = [sum(error > limit for error in errors) for limit in MAX_ERRORS_DEG]
+    evidence = run["summary"]["reconstructions"][0]["evidence"]["images"]
+    predicted = [image["pose_error_deg"] for image in evidence.values()]
     return {
         "set": run["set"],
         "registered": f"{len(run['summary']['images']['registered'])} of "
         f"{run['summary']['images']['total']}",
         "wrong": [f"{count} of {len(errors)}" for count in wrong] if errors else ["-", "-"],
+        "max_error_deg": f"{max(errors):.1f}" if errors else "-",
+        "predicted_deg": "-" if None in predicted else f"{max(predicted):.1f}",
         "verdict": verdict.level,
         "doubts": ", ".join(doubt.reason.code.value for doubt in verdict.doubts),
     }
@@ -259,11 +263,14 @@ def describe(run: Mapping[str, Any]) -> dict[str, Any]:
 def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
     """Format a Markdown table with the verdict and the number of wrong images of each photo set."""
     limits = " | ".join(f"> {limit:g} deg" for limit in MAX_ERRORS_DEG)
-    lines = [f"| set | registered | {limits} | verdict | doubts |", "|---" * 6 + "|"]
+    lines = [
+        f"| set | registered | {limits} | max. error, deg | predicted | verdict | doubts |",
+        "|---" * 8 + "|",
+    ]
     for row in rows:
-        wrong = " | ".join(row.get("wrong", ["-", "-"]))
-        registered, doubts = row.get("registered", "0"), row["doubts"] or "-"
-        lines.append(f"| {row['set']} | {registered} | {wrong} | {row['verdict']} | {doubts} |")
+        cells = [row["set"], row.get("registered", "0"), *row.get("wrong", ["-", "-"])]
+        cells += [row.get("max_error_deg", "-"), row.get("predicted_deg", "-")]
+        lines.append("| " + " | ".join([*cells, row["verdict"], row["doubts"] or "-"]) + " |")
     return "\n".join(lines)
 
 
