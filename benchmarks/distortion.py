@@ -1,11 +1,14 @@
 """Accuracy of our defaults and COLMAP's defaults on photos with added radial distortion.
 
-    python -m benchmarks.distortion [SCENE ...] [--radial -0.25 -0.1 0 0.05] [--width 640]
+    python -m benchmarks.distortion [SCENE ...] [--lenses MODEL:K1,K2,... ...] [--width 640]
         [--max-images N] [--seeds 1] [--without-colmap] [--set KEY=VALUE ...] [--folder FOLDER]
 
-The images of a scene are resampled to a SIMPLE_RADIAL camera with the principal point at the image
-center. The focal length of the SIMPLE_RADIAL camera is the shortest one for which no pixel is
-blank. Neither program gets intrinsics. The result table has the columns of
+The images of a scene are resampled to a camera with lens distortion and the principal point at the
+image center. A lens is a COLMAP camera model with its distortion coefficients, such as
+``RADIAL:-0.2,0.05``. The focal length of the camera is the shortest one for which no pixel is
+blank. Both programs estimate the camera model of the lens, and get no intrinsics. COLMAP estimates
+one camera per photo by default, and one camera for all photos in an additional row of models other
+than SIMPLE_RADIAL. The result table has the columns of
 :mod:`benchmarks.real_photos`. Table rows are stored in ``--folder``, so that an interrupted
 benchmark continues.
 """
@@ -25,10 +28,19 @@ import pycolmap
 from benchmarks._scenes import shared_folder
 from benchmarks.real_photos import format_table, reconstruct_and_measure
 from mpsfm_core.data import Float64
+from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel
 from mpsfm_core.geometry import inside, pixel_centers
 from mpsfm_core.inputs.undistortion import resize_camera
 from mpsfm_core.results.colmap_model import write_model
 
+DEFAULT_MODEL = CameraModel.SIMPLE_RADIAL
+LENSES = [
+    *(f"SIMPLE_RADIAL:{radial:+g}" for radial in (-0.25, -0.1, 0.0, 0.05)),
+    "RADIAL:-0.2,0.05",
+    "OPENCV_FISHEYE:0.05,-0.02",
+]
+"""Camera models and distortion coefficients of the resampled images."""
+ONE_CAMERA = "COLMAP, one camera"
 NUM_BISECTIONS = 40
 """Number of bisection steps in the search for the shortest focal length with which a resampled
 image has no blank pixels."""
@@ -38,7 +50,7 @@ def main() -> None:
     """Parse the command line, resample the scenes, reconstruct them, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("scenes", nargs="*", default=["fountain", "rendered_kitchen"])
-    parser.add_argument("--radial", nargs="+", type=float, default=[-0.25, -0.1, 0.0, 0.05])
+    parser.add_argument("--lenses", nargs="+", default=LENSES, metavar="MODEL:K1,K2,...")
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--max-images", type=int, default=12)
     parser.add_argument("--seeds", type=int, default=1)
@@ -52,27 +64,47 @@ def main() -> None:
     rows = []
     with kept or tempfile.TemporaryDirectory(prefix="mpsfm-distortion-") as folder:
         for scene in arguments.scenes:
-            for radial in arguments.radial:
-                target = Path(folder) / f"{scene} {radial:+g}"
+            for lens in arguments.lenses:
+                target = Path(folder) / f"{scene} {lens.replace(':', ' ')}"
+                model, coefficients = parse_lens(lens)
                 if not (target / "gt").is_dir():
                     source = shared_folder() / "data" / scene
-                    distort_scene(source, target, radial, arguments.width, arguments.max_images)
-                for method in methods:
+                    size = arguments.width, arguments.max_images
+                    distort_scene(source, target, model, coefficients, *size)
+                shared = [ONE_CAMERA] if "COLMAP" in methods and model != DEFAULT_MODEL else []
+                for method in methods + shared:
                     stored = target / f"{method}.json"
                     if not stored.exists():
-                        row = reconstruct_and_measure(target, method, arguments.overrides)
+                        row = reconstruct_and_measure(target, method, arguments.overrides, model)
                         stored.write_text(json.dumps(row), encoding="utf-8")
                     rows.append(json.loads(stored.read_text(encoding="utf-8")))
     print(format_table(rows))
 
 
-def distort_scene(source: Path, target: Path, radial: float, width: int, max_images: int) -> None:
-    """Write a scene with images resampled to a camera with radial distortion.
+def parse_lens(text: str) -> tuple[CameraModel, Float64]:
+    """Parse a lens ``MODEL:K1,K2,...`` to the camera model and (4,) distortion coefficients."""
+    name, _, values = text.partition(":")
+    coefficients = np.zeros(NUM_DISTORTION)
+    given = [float(value) for value in values.split(",")]
+    coefficients[: len(given)] = given
+    return CameraModel(name), coefficients
+
+
+def distort_scene(
+    source: Path,
+    target: Path,
+    model: CameraModel,
+    coefficients: Float64,
+    width: int,
+    max_images: int,
+) -> None:
+    """Write a scene with images resampled to a camera with lens distortion.
 
     Args:
         source: Scene folder with ``images/`` and the COLMAP model ``gt/`` of pinhole cameras.
         target: Folder to which the resampled scene is written.
-        radial: Radial distortion coefficient of the new camera.
+        model: Camera model of the new camera.
+        coefficients: (4,) distortion coefficients of the new camera.
         width: Width of the new images in pixels.
         max_images: Maximum number of images; the selected images are evenly spaced in the order of
             their names.
@@ -80,12 +112,12 @@ def distort_scene(source: Path, target: Path, radial: float, width: int, max_ima
     truth = pycolmap.Reconstruction(source / "gt")
     images = sorted(truth.images.values(), key=lambda image: str(image.name))
     images = images[:: -(-len(images) // max_images)]
-    model = pycolmap.Reconstruction()
+    distorted_truth = pycolmap.Reconstruction()
     (target / "images").mkdir(parents=True, exist_ok=True)
     for number, image in enumerate(images, start=1):
         height = round(image.camera.height * width / image.camera.width)
         pinhole = resize_camera(image.camera, (width, height))
-        camera = find_camera(pinhole, radial)
+        camera = find_camera(pinhole, model, coefficients)
         camera.camera_id = number
         rgb = cv2.imread(str(source / "images" / image.name))
         reduced = cv2.resize(rgb, (width, height), interpolation=cv2.INTER_AREA)
@@ -97,31 +129,33 @@ def distort_scene(source: Path, target: Path, radial: float, width: int, max_ima
         )  # fmt: skip
         name = f"{Path(str(image.name)).stem}.png"
         cv2.imwrite(str(target / "images" / name), distorted)
-        model.add_camera_with_trivial_rig(camera)
-        model.add_image_with_trivial_frame(
+        distorted_truth.add_camera_with_trivial_rig(camera)
+        distorted_truth.add_image_with_trivial_frame(
             pycolmap.Image(name=name, camera_id=number, image_id=number), image.cam_from_world()
         )
-    write_model(target / "gt", model, text=True)
+    write_model(target / "gt", distorted_truth, text=True)
 
 
-def find_camera(pinhole: pycolmap.Camera, radial: float) -> pycolmap.Camera:
-    """Return the SIMPLE_RADIAL camera of shortest focal length without pixels outside the image."""
+def find_camera(
+    pinhole: pycolmap.Camera, model: CameraModel, coefficients: Float64
+) -> pycolmap.Camera:
+    """Return the camera of shortest focal length without pixels outside the image."""
     width, height = pinhole.width, pinhole.height
     corners = np.array([[x, y] for x in (0.5, width - 0.5) for y in (0.5, height - 0.5)])
+
+    def make_camera(focal_px: float) -> pycolmap.Camera:
+        intrinsics = np.array([focal_px, focal_px, width / 2, height / 2])
+        params = model.to_params(intrinsics, coefficients)
+        return pycolmap.Camera(model=model.value, width=width, height=height, params=params)
+
     low_px, high_px = 0.2 * pinhole.mean_focal_length(), 5 * pinhole.mean_focal_length()
     for _ in range(NUM_BISECTIONS):
         focal_px = (low_px * high_px) ** 0.5
-        camera = pycolmap.Camera(
-            model="SIMPLE_RADIAL",
-            width=width,
-            height=height,
-            params=[focal_px, width / 2, height / 2, radial],
-        )
+        camera = make_camera(focal_px)
         xy = map_pixels(camera, pinhole, corners)
         fits = bool(np.isfinite(xy).all() and inside(xy, (width, height)).all())
         low_px, high_px = (low_px, focal_px) if fits else (focal_px, high_px)
-    camera.params = np.array([high_px, width / 2, height / 2, radial])
-    return camera
+    return make_camera(high_px)
 
 
 def map_pixels(camera: pycolmap.Camera, pinhole: pycolmap.Camera, xy: Float64) -> Float64:

@@ -28,6 +28,7 @@ import pycolmap
 from benchmarks._scenes import percent
 from mpsfm_core import reconstruct
 from mpsfm_core.data import Float64, Pose
+from mpsfm_core.data.camera_models import CameraModel
 from mpsfm_core.data.errors import MpsfmError
 from mpsfm_core.evaluation.alignment import umeyama
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
@@ -73,21 +74,31 @@ def main() -> None:
         print(json.dumps({"rows": rows}))
 
 
-def reconstruct_and_measure(folder: Path, method: str, overrides: Sequence[str]) -> dict[str, Any]:
+def reconstruct_and_measure(
+    folder: Path,
+    method: str,
+    overrides: Sequence[str],
+    camera_model: CameraModel = CameraModel.SIMPLE_RADIAL,
+) -> dict[str, Any]:
     """Reconstruct a photo set, then print and return its row of the result table.
 
     Args:
         folder: Folder of the photo set.
-        method: Reconstruction method, either ``COLMAP``, or ``seed`` and the random seed of our
-            mapper.
+        method: Reconstruction method, either ``COLMAP``, ``COLMAP, one camera`` for all images, or
+            ``seed`` and the random seed of our mapper.
         overrides: Settings ``KEY=VALUE`` that override our configuration.
+        camera_model: Camera model that both programs estimate.
     """
     start, verdict = time.perf_counter(), ""
-    if method == "COLMAP":
-        models = reconstruct_with_colmap(folder / "images")
+    if method.startswith("COLMAP"):
+        is_shared = method.endswith("one camera")
+        models = reconstruct_with_colmap(folder / "images", camera_model, is_shared=is_shared)
     else:
-        seed = f"runtime.seed={method.split()[1]}"
-        models, verdict = reconstruct_with_defaults(folder / "images", [seed, *overrides])
+        settings = [
+            f"runtime.seed={method.split()[1]}",
+            f"inputs.camera_model={camera_model.value}",
+        ]
+        models, verdict = reconstruct_with_defaults(folder / "images", [*settings, *overrides])
     row = {"set": folder.name, "method": method, **measure(models, folder), "verdict": verdict}
     row["seconds"] = time.perf_counter() - start
     print(json.dumps(row), file=sys.stderr, flush=True)
@@ -114,15 +125,25 @@ def reconstruct_with_defaults(
     return [result.model, *result.further_models], text
 
 
-def reconstruct_with_colmap(images: Path) -> list[pycolmap.Reconstruction]:
-    """Return the models of COLMAP's incremental mapper with SIFT and all pairs, largest first."""
+def reconstruct_with_colmap(
+    images: Path, camera_model: CameraModel, *, is_shared: bool
+) -> list[pycolmap.Reconstruction]:
+    """Return the models of COLMAP's incremental mapper with SIFT and all pairs, largest first.
+
+    Args:
+        images: Folder of the photos.
+        camera_model: Camera model that COLMAP estimates.
+        is_shared: All images share a camera, instead of COLMAP's default.
+    """
+    mode = pycolmap.CameraMode.SINGLE if is_shared else pycolmap.CameraMode.AUTO
     with tempfile.TemporaryDirectory(prefix="mpsfm-colmap-") as folder:
         database = Path(folder) / "database.db"
         pycolmap.set_random_seed(0)
         pycolmap.extract_features(
             database,
             images,
-            reader_options=pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL"),
+            camera_mode=mode,
+            reader_options=pycolmap.ImageReaderOptions(camera_model=camera_model.value),
             extraction_options=pycolmap.FeatureExtractionOptions(use_gpu=False),
         )
         pycolmap.match_exhaustive(

@@ -326,7 +326,7 @@ def undistort_views(
     images: ImageSet,
     options: MapperOptions | Mapping[str, Any] | None = None,
 ) -> tuple[MappingResult, MappingProblem, ImageSet]:
-    """Undistort images again with the radial distortion that the mapper estimated.
+    """Undistort images again with the distortion that the mapper estimated.
 
     Depth maps are refined again in the newly undistorted views. If the mapper estimated no
     distortion, all arguments are returned unchanged.

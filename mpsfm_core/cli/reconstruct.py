@@ -46,6 +46,14 @@ def reconstruct(
             help="Photos of a folder or the set share a camera, or none; default: by EXIF.",
         ),
     ] = None,
+    camera_model: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL",
+            help="Estimate SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL (default), RADIAL, OPENCV or "
+            "OPENCV_FISHEYE cameras.",
+        ),
+    ] = None,
     image_list: ImageList = None,
     poses: Annotated[
         Path | None,
@@ -87,6 +95,8 @@ def reconstruct(
     settings = config_overrides(overrides, offline)
     if camera_per is not None:
         settings.append(f"inputs.camera_per={camera_per}")
+    if camera_model is not None:
+        settings.append(f"inputs.camera_model={camera_model}")
     run(
         images,
         output,

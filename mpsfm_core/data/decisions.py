@@ -131,6 +131,10 @@ class CameraReason(ReasonCode):
     """The images do not constrain the radial distortion, whose std is ``radial_std``."""
     DISTORTION_OUT_OF_RANGE = ("distortion-out-of-range", "radial")
     """The refined coefficient ``radial`` is implausible for SIMPLE_RADIAL."""
+    PARAMETER_NOT_OBSERVABLE = ("parameter-not-observable", "parameter", "std")
+    """The images do not constrain the intrinsic parameter, whose std is ``std``."""
+    PARAMETER_OUT_OF_RANGE = ("parameter-out-of-range", "parameter", "value")
+    """The refined ``value`` of the intrinsic parameter is implausible."""
 
 
 class GpsReason(ReasonCode):

@@ -15,6 +15,7 @@ from mpsfm_core.data.arrays import (
     require_array,
     require_unit_interval,
 )
+from mpsfm_core.data.camera_models import NO_DISTORTION, CameraModel, Distortion
 from mpsfm_core.data.cameras import PinholeCamera
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.data.priors import DepthPrior, NormalPrior
@@ -49,10 +50,13 @@ class MappingImage:
     """Prior std of the logarithm of a guessed focal length."""
     focal_guess_px: float | None = None
     """Prior mean of ``fx`` in pixels of the undistorted view (None means ``camera.fx``)."""
-    radial: float = 0.0
-    """Radial distortion (coefficient of SIMPLE_RADIAL) that was removed from the undistorted view.
+    camera_model: CameraModel = CameraModel.SIMPLE_RADIAL
+    """COLMAP camera model whose parameters self-calibration estimates for a guessed camera."""
+    distortion: Distortion = NO_DISTORTION
+    """Distortion coefficients k1, k2, p1, p2 of OPENCV, or k1, k2, k3, k4 of OPENCV_FISHEYE, that
+    were removed from the undistorted view.
 
-    Bundle adjustment refines the radial distortion together with a guessed focal length."""
+    Bundle adjustment refines the distortion together with a guessed focal length."""
     known_pose: Pose | None = None
     """Known camera pose ``cam_from_world`` that the user provides, or None."""
     depth_group: int | None = None
@@ -84,11 +88,18 @@ class MappingImage:
     def with_camera(self, camera: PinholeCamera) -> MappingImage:
         """Return a copy of the image with another focal length and the same focal length prior.
 
-        The radial distortion that was removed from the view stays the same in pixels, so its
-        coefficient is multiplied by the squared ratio of new to old focal length.
+        The distortion that was removed from the view stays the same in pixels, so its coefficients
+        are multiplied by powers of the ratio of new to old focal length. A fisheye image keeps its
+        camera, because its view depends on the focal length.
         """
-        radial = self.radial * (camera.fx / self.camera.fx) ** 2
-        return replace(self, camera=camera, focal_guess_px=self.focal_prior_px, radial=radial)
+        if self.camera_model.is_fisheye:
+            return self
+        ratio = camera.fx / self.camera.fx
+        k1, k2, p1, p2 = self.distortion
+        distortion = k1 * ratio**2, k2 * ratio**4, p1 * ratio, p2 * ratio
+        return replace(
+            self, camera=camera, focal_guess_px=self.focal_prior_px, distortion=distortion
+        )
 
     @property
     def focal_prior_px(self) -> float:

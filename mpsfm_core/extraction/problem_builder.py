@@ -21,6 +21,7 @@ from mpsfm_core.data import (
     SparseMatches,
     VerifiedPair,
 )
+from mpsfm_core.data.camera_models import CameraModel
 from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.extraction.match_graph import MatchGraph, NamePair
 from mpsfm_core.extraction.matching.verification import CALIBRATED, verify_matches
@@ -249,6 +250,7 @@ class _Builder:
             focal_known=source is None or source.focal_known,
             camera_id=0 if source is None else source.camera.camera_id,
             focal_log_std=0.7 if source is None else source.focal_log_std,
+            camera_model=CameraModel.SIMPLE_RADIAL if source is None else source.camera_model,
             known_pose=None if name not in poses else pose_from(name, poses[name]),
         )
 

@@ -314,6 +314,7 @@ def assemble_problem(images: ImageSet, graph: MatchGraph, priors: Priors) -> Map
                 focal_known=image.focal_known,
                 camera_id=image.camera.camera_id,
                 focal_log_std=image.focal_log_std,
+                camera_model=image.camera_model,
                 depth_group=priors.groups.get(image.name),
                 proposed_pose=priors.proposed_poses.get(image.name),
             )

@@ -17,6 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, Float64, PinholeCamera, UInt8, View
+from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.geometry.pycolmap_conversion import camera_key, colmap_from_pinhole
 from mpsfm_core.inputs.camera_sharing import FocalSource, guess_cameras
@@ -101,6 +102,8 @@ class SourceImage:
     """Pixels (H, W, 3) uint8 RGB of an image in memory, None for an image file."""
     predicted_log_std: float | None = None
     """Std of the log focal length that a camera provider predicted, None without prediction."""
+    camera_model: CameraModel = CameraModel.SIMPLE_RADIAL
+    """Camera model whose parameters the mapper estimates if the user gave no intrinsics."""
 
     def original_pixels(self, xy: Float64) -> Float64:
         """Map pixels (n, 2) of the undistorted view to pixels of the upright original image."""
@@ -211,7 +214,8 @@ class ImageSet:
             number = image.camera.camera_id
             if image.focal_known or number not in focals:
                 return image
-            camera = _simple_camera(image.original_size, focals[number], number)
+            model = image.camera_model
+            camera = _simple_camera(image.original_size, focals[number], number, model)
             return replace(
                 image,
                 camera=camera,
@@ -505,7 +509,8 @@ def _add_guessed_cameras(
         name: (camera, FOCAL_FROM_USER) for name, camera in known.items()
     }
     for name, guess in guesses.items():
-        camera = _simple_camera(files[name].size, guess.focal_px, max_id + guess.number)
+        number = max_id + guess.number
+        camera = _simple_camera(files[name].size, guess.focal_px, number, options.camera_model)
         cameras[name] = camera, guess.source
     return cameras
 
@@ -520,15 +525,35 @@ def _source_image(
 ) -> SourceImage:
     pinhole = _view_camera(camera, options)
     orientation = file.header.orientation
-    return SourceImage(name, path, camera, pinhole, focal, file.digest, orientation, file.gps)
+    is_known = focal == FOCAL_FROM_USER
+    return SourceImage(
+        name,
+        path,
+        camera,
+        pinhole,
+        focal,
+        file.digest,
+        orientation,
+        file.gps,
+        camera_model=CameraModel.SIMPLE_RADIAL if is_known else options.camera_model,
+    )
 
 
-def _simple_camera(size: tuple[int, int], focal: float, number: int) -> pycolmap.Camera:
-    """Return a SIMPLE_PINHOLE camera with the principal point at the image center."""
-    width, height = size
-    params = [focal, width / 2, height / 2]
+def _simple_camera(
+    size: tuple[int, int], focal_px: float, number: int, model: CameraModel
+) -> pycolmap.Camera:
+    """Return a camera without distortion coefficients and with a central principal point.
+
+    The camera has the model SIMPLE_PINHOLE, or OPENCV_FISHEYE if ``model`` is a fisheye model.
+    """
+    params = np.array([focal_px, focal_px, size[0] / 2, size[1] / 2])
+    guessed = model if model.is_fisheye else CameraModel.SIMPLE_PINHOLE
     return pycolmap.Camera(
-        model="SIMPLE_PINHOLE", width=width, height=height, params=params, camera_id=number
+        model=guessed.value,
+        width=size[0],
+        height=size[1],
+        params=guessed.to_params(params, np.zeros(NUM_DISTORTION)),
+        camera_id=number,
     )
 
 

@@ -7,6 +7,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from mpsfm_core.data.camera_models import CameraModel
 from mpsfm_core.data.cameras import MapOrientation
 from mpsfm_core.data.options import Options, expert
 
@@ -54,6 +55,10 @@ class InputOptions(Options):
     a camera. With ``auto``, images of one size share a camera if EXIF names the same camera, lens
     and focal length, and images without EXIF share a camera by folder and size. The mapper gives
     images that contradict the shared focal length their own camera."""
+    camera_model: CameraModel = CameraModel.SIMPLE_RADIAL
+    """COLMAP camera model of images without given intrinsics, whose parameters the mapper estimates
+    [COLMAP ImageReader.camera_model]. A model with more parameters needs more photos. The views of
+    ``OPENCV_FISHEYE`` images are undistorted before matching."""
     default_focal_ratio: float = expert(1.2, gt=0)
     """Ratio of focal length to longer image side for images without a known focal length [COLMAP
     default_focal_length_factor]."""

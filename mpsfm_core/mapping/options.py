@@ -141,7 +141,11 @@ class RefinementOptions(Options):
     refine_focal: bool = Field(True)
     """Refine guessed focal lengths that the images determine; known focal lengths stay fixed."""
     refine_distortion: bool = Field(True)
-    """Estimate the radial distortion (SIMPLE_RADIAL) of cameras whose focal length is refined."""
+    """Estimate the distortion of the camera model (``inputs.camera_model``) for cameras whose focal
+    length is refined."""
+    refine_principal_point: bool = False
+    """Estimate the principal point of cameras whose focal length is refined. [COLMAP
+    Mapper.ba_refine_principal_point]"""
     final_robust: bool = expert(False)
     """End with a global refinement with a sharper depth loss.
     [paper, robust reconstruction] [tuned: benchmarks.ablation]"""

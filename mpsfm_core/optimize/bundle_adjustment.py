@@ -1,11 +1,12 @@
 """Bundle adjustment with depth regularization (paper 3.3, ``C_BA + C_reg``).
 
-The variables are camera poses, 3D points and, optionally, focal lengths ``f``, radial distortions
-``k`` and log scales ``s`` of depth maps. Bundle adjustment minimizes::
+The variables are camera poses, 3D points and, optionally, intrinsic parameters ``q`` (log focal
+length, principal point, distortion coefficients) and log scales ``s`` of depth maps. Bundle
+adjustment minimizes::
 
     1/2 sum rho_r(|project(R X + t) - xy|^2 / std_px^2)
     + 1/2 sum rho_d((log z - log d - s)^2 / std^2) + 1/2 sum (s - expected)^2 / std_s^2
-    + 1/2 sum (log f - log f_prior)^2 / std_f^2 + 1/2 sum k^2 / std_k^2
+    + 1/2 sum (q - q_prior)^2 / std_q^2
 
 The optimizer is Levenberg-Marquardt (Triggs et al., "Bundle Adjustment -- A Modern Synthesis",
 2000). Each step eliminates the 3D points with the Schur complement, solves the reduced camera
@@ -20,11 +21,11 @@ from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 from threadpoolctl import ThreadpoolController
 
 from mpsfm_core.data import Float64
+from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.bundle_problem import (
     BundleProblem,
@@ -45,8 +46,8 @@ MAX_DAMPING = 1e16
 """Levenberg-Marquardt damping above which bundle adjustment stops. [ours]"""
 MAX_FOCAL_STEP = 1.0
 """Largest change of a log focal length per Levenberg-Marquardt step. [ours]"""
-MAX_RADIAL_STEP = 0.1
-"""Largest change of a radial distortion coefficient per Levenberg-Marquardt step. [ours]"""
+MAX_DISTORTION_STEP = 0.1
+"""Largest change of a distortion coefficient per Levenberg-Marquardt step. [ours]"""
 CG_TOLERANCE = 1e-3
 """Relative tolerance of conjugate gradients on the reduced camera system. [ours]"""
 MAX_CG_ITERATIONS = 500
@@ -64,15 +65,12 @@ class BundleResult:
     translations: Float64
     log_scales: Float64
     intrinsics: Float64
-    radial: Float64
+    distortion: Float64
     points: Float64
-    std_log_focals: Float64
-    """(k,) posterior standard deviation of each variable log focal length, from the inverse of the
-    reduced camera system at the solution. The standard deviation is NaN for a constant focal length
-    and infinite for an undetermined focal length."""
-    std_radial: Float64
-    """(k,) posterior standard deviation of each camera's radial distortion, NaN for a constant and
-    infinite for an undetermined distortion."""
+    std_intrinsics: Float64
+    """(k, 8) posterior standard deviation of each variable intrinsic parameter, from the inverse of
+    the reduced camera system at the solution. The standard deviation is NaN for a constant and
+    infinite for an undetermined intrinsic parameter."""
     initial_cost: float
     final_cost: float
     iterations: int
@@ -92,7 +90,7 @@ def start_at(problem: BundleProblem, result: BundleResult) -> BundleProblem:
         translations=result.translations,
         log_scales=result.log_scales,
         intrinsics=result.intrinsics,
-        radial=result.radial,
+        distortion=result.distortion,
         points=result.points,
     )
 
@@ -101,9 +99,9 @@ def adjust_bundle(problem: BundleProblem, options: BundleOptions | None = None) 
     """Adjust poses, points, intrinsics and depth scales; the cost never increases.
 
     As in COLMAP, an observation whose point is behind the camera, or more than 89.9999 degrees off
-    the optical axis, has residual 0. An observation where radial distortion folds the image over
-    also has residual 0. If a solver step makes an observation invisible, the observation keeps its
-    previous cost. The adjusted parameters do not depend on the number of threads, bit for bit.
+    the optical axis, has residual 0. An observation where distortion folds the image over also has
+    residual 0. If a solver step makes an observation invisible, the observation keeps its previous
+    cost. The adjusted parameters do not depend on the number of threads, bit for bit.
 
     Args:
         problem: Initial parameters and observations of bundle adjustment, which stay unchanged.
@@ -161,7 +159,7 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
             message = "no step lowers the cost"
             break
     stds = normal.compute_intrinsic_stds(state)
-    return BundleResult(*state, *stds, initial_cost, cost, iteration, converged, message)
+    return BundleResult(*state, stds, initial_cost, cost, iteration, converged, message)
 
 
 class SchurComplementSolver:
@@ -169,7 +167,7 @@ class SchurComplementSolver:
 
     def __init__(self, p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> None:
         layout = p.bundle.layout
-        poses, intrinsics = len(layout.pair), int(self._intrinsic_slots(layout).max(initial=-1)) + 1
+        poses, intrinsics = len(layout.pair), int(layout.intrinsic_slot.max(initial=-1)) + 1
         size = kernels.NUM_IMAGE_PARAMS * poses + intrinsics
         view = int(kernels.NUM_IMAGE_PARAMS)
         block, border = (len(p.pairs), view, view), (intrinsics, view * poses)
@@ -214,15 +212,10 @@ class SchurComplementSolver:
         self._fix_constants()
         return cost + self._prior_cost(state)
 
-    @staticmethod
-    def _intrinsic_slots(layout: kernels.ParameterLayout) -> NDArray[np.int32]:
-        """Return the indices (2k,) of the intrinsic parameters in the reduced camera system."""
-        return np.concatenate([layout.focal_slot, layout.radial_slot])
-
     def _prior_cost(self, state: kernels.BundleParameters) -> float:
-        """Return the cost of the priors on depth scales, focal lengths and radial distortions."""
-        cost = self.p.scale_prior.cost(state) + self.p.focal_prior.cost(state)
-        return cost + self.p.radial_prior.cost(state)
+        """Return the cost of the priors on depth scales and intrinsic parameters."""
+        costs = (prior.cost(state) for prior in self.p.intrinsic_priors)
+        return sum(costs, self.p.scale_prior.cost(state))
 
     def _add_scale_prior(self, state: kernels.BundleParameters) -> None:
         """Add the prior of the depth maps' log scales to the reduced camera system."""
@@ -235,16 +228,16 @@ class SchurComplementSolver:
         self.total.gradient[rows] += prior.weight * residuals
 
     def _add_intrinsic_priors(self, state: kernels.BundleParameters) -> None:
-        """Add the priors of focal lengths and radial distortions to the reduced camera system."""
+        """Add the priors of intrinsic parameters to the reduced camera system."""
         num_poses = len(self.p.bundle.layout.pair)
-        for prior in (self.p.focal_prior, self.p.radial_prior):
+        for prior in self.p.intrinsic_priors:
             rows = kernels.NUM_IMAGE_PARAMS * num_poses + prior.slot
             self.total.corner[prior.slot, prior.slot] += prior.weight
             self.total.diagonal[rows] += prior.weight
             self.total.gradient[rows] += prior.weight * prior.residuals(state)
 
-    def compute_intrinsic_stds(self, state: kernels.BundleParameters) -> tuple[Float64, Float64]:
-        """Compute the posterior standard deviation of log focal lengths and radial distortions.
+    def compute_intrinsic_stds(self, state: kernels.BundleParameters) -> Float64:
+        """Compute the posterior standard deviation of intrinsic parameters.
 
         The posterior variance of an intrinsic parameter is a diagonal entry of the inverse reduced
         camera system.
@@ -253,18 +246,17 @@ class SchurComplementSolver:
             state: Poses, points, intrinsics and depth scales at which the residuals are linearized.
 
         Returns:
-            (k,) posterior standard deviations of log focal lengths and (k,) of radial distortions,
-            NaN for constant and infinite for undetermined parameters.
+            (k, 8) posterior standard deviations, NaN for constant and infinite for undetermined
+            parameters.
         """
-        slots = self._intrinsic_slots(self.p.bundle.layout)
-        stds, num_cameras = np.full(len(slots), np.nan), len(slots) // 2
-        cameras = np.flatnonzero(slots >= 0)
-        if not len(cameras):
-            return stds[:num_cameras], stds[num_cameras:]
+        slots = self.p.bundle.layout.intrinsic_slot
+        stds, variable = np.full(slots.shape, np.nan), slots >= 0
+        if not variable.any():
+            return stds
         self.linearize(state, MIN_DAMPING)
         diagonal = self.total.diagonal
         boost = np.where(diagonal > 0, MIN_DAMPING * diagonal, 1.0)
-        rows = kernels.NUM_IMAGE_PARAMS * len(self.p.bundle.layout.pair) + slots[cameras]
+        rows = kernels.NUM_IMAGE_PARAMS * len(self.p.bundle.layout.pair) + slots[variable]
         units = np.zeros((len(diagonal), len(rows)))
         units[rows, np.arange(len(rows))] = 1.0
         if self.dense:
@@ -273,8 +265,8 @@ class SchurComplementSolver:
             columns = np.stack([self._solve_sparse(boost, unit) for unit in units.T], axis=1)
         variances = columns[rows, np.arange(len(rows))]
         determined = (diagonal[rows] > 0) & (variances > 0)
-        stds[cameras] = np.where(determined, np.sqrt(np.where(determined, variances, 1)), np.inf)
-        return stds[:num_cameras], stds[num_cameras:]
+        stds[variable] = np.where(determined, np.sqrt(np.where(determined, variances, 1)), np.inf)
+        return stds
 
     def _fix_constants(self) -> None:
         """Remove constant parameters of images from the reduced camera system."""
@@ -334,11 +326,12 @@ class SchurComplementSolver:
         return visible, cost - visible - lost, predicted
 
     def _limit_intrinsic_steps(self, delta: Float64) -> None:
-        """Limit the changes of focal lengths and radial distortions in a step ``delta`` (d,)."""
-        layout, first = self.p.bundle.layout, self.total.border.shape[1]
-        limits = ((layout.focal_slot, MAX_FOCAL_STEP), (layout.radial_slot, MAX_RADIAL_STEP))
-        for slots, limit in limits:
-            rows = first + slots[slots >= 0]
+        """Limit the changes of focal lengths and distortion in a step ``delta`` (d,)."""
+        slots, first = self.p.bundle.layout.intrinsic_slot, self.total.border.shape[1]
+        focals = slots[:, IntrinsicParameter.FOCAL_LENGTH : IntrinsicParameter.ASPECT_RATIO + 1]
+        coefficients = slots[:, IntrinsicParameter.RADIAL_DISTORTION :]
+        for limited, limit in ((focals, MAX_FOCAL_STEP), (coefficients, MAX_DISTORTION_STEP)):
+            rows = first + limited[limited >= 0]
             delta[rows] = np.clip(delta[rows], -limit, limit)
 
     def _solve_dense(self, boost: Float64, rhs: Float64) -> Float64:

@@ -6,15 +6,18 @@ Kernels allocate no memory, so numba's reference counting is disabled (``_nrt=Fa
 times faster.
 
 Observations are sorted by point, then by image. Each image with a variable pose or depth scale has
-a pose slot, the index of its 7 parameters among the variable parameters. Each variable focal length
-and radial distortion has an intrinsic slot, its index among the variable intrinsic parameters. A
+a pose slot, the index of its 7 parameters among the variable parameters. Each variable intrinsic
+parameter of a camera has an intrinsic slot, its index among the variable intrinsic parameters. A
 vector of camera parameters contains 7 parameters per pose slot (rotation, translation, log scale of
 the depth map), followed by one parameter per intrinsic slot. A step updates rotation, translation,
-log scale, focal length and radial distortion by ``R <- exp(w) R``, ``t <- t + dt``, ``s <- s +
-ds``, ``f <- f exp(a)`` and ``k <- k + dk``.
+log scale and focal length by ``R <- exp(w) R``, ``t <- t + dt``, ``s <- s + ds`` and ``f <- f
+exp(a)``, and adds the changes of the other intrinsic parameters.
 
-The camera model is COLMAP's SIMPLE_RADIAL with two focal lengths, ``(fx u (1 + k r^2) + cx, fy v
-(1 + k r^2) + cy)`` with ``u = x / z``, ``v = y / z`` and ``r^2 = u^2 + v^2``.
+The camera models are COLMAP's OPENCV and OPENCV_FISHEYE, ``(fx (m u + a) + cx, fy (m v + b) + cy)``
+with ``u = x / z``, ``v = y / z``. OPENCV has the radial factor ``m = 1 + k1 r^2 + k2 r^4`` with
+``r^2 = u^2 + v^2``, and the tangential distortion ``(a, b)`` of the coefficients ``p1`` and ``p2``.
+OPENCV_FISHEYE has ``m = t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8) / r`` with ``t = atan(r)``, and
+no tangential distortion. PINHOLE, SIMPLE_RADIAL and RADIAL are OPENCV with coefficients of 0.
 """
 
 from __future__ import annotations
@@ -25,6 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.data.camera_models import NUM_INTRINSICS, IntrinsicParameter
+from mpsfm_core.geometry.distortion import MIN_SLOPE
 from mpsfm_core.optimize.losses import evaluate_loss
 from mpsfm_core.support import jit
 
@@ -48,14 +53,20 @@ cameras. Points with outliers converge slowly under robust losses, and the addit
 the run time. [tuned: benchmarks.bundle_adjustment]"""
 POINT_STEP_DAMPING = 1e-6
 """Levenberg-Marquardt damping of the steps of single points with fixed cameras. [ours]"""
-MIN_RADIAL_SLOPE = 0.1
-"""Smallest derivative ``1 + 3 k r^2`` of the distorted radius at a point that projects into an
-image. Radial distortion folds the image over where the derivative is 0. [ours]"""
-NUM_IMAGE_PARAMS, NUM_INTRINSIC_PARAMS = np.int64(7), np.int64(1)
-"""Number of parameters per pose slot (pose and log scale of the depth map), and per intrinsic
-slot."""
+MIN_FISHEYE_RADIUS2 = 1e-8
+"""Squared radius ``u^2 + v^2`` below which the radial factor of a fisheye camera is its Taylor
+polynomial of first order in ``u^2 + v^2``. [ours]"""
+NUM_IMAGE_PARAMS, _COLUMN = np.int64(7), np.int64(1)
+"""Number of parameters of an image (pose and log scale of its depth map), and of one column."""
 LOG_SCALE_IDX = 6
 """Index of the depth map's log scale among the 7 parameters of an image."""
+LOG_FOCAL = int(IntrinsicParameter.FOCAL_LENGTH)
+LOG_ASPECT = int(IntrinsicParameter.ASPECT_RATIO)
+CENTER_X = int(IntrinsicParameter.PRINCIPAL_POINT_X)
+CENTER_Y = int(IntrinsicParameter.PRINCIPAL_POINT_Y)
+DISTORTION = int(IntrinsicParameter.RADIAL_DISTORTION)
+"""Indices of intrinsic parameters, as plain integers for numba. The four distortion coefficients
+follow ``DISTORTION``."""
 _ONLY = np.int64(0)
 """Row index for arrays of normal equations that have a single row."""
 
@@ -83,11 +94,15 @@ class ParameterLayout(NamedTuple):
 
     camera_of_image: Int32
     pose_slot: Int32
-    focal_slot: Int32
-    """(k,) intrinsic slot (index among the variable intrinsics) of each camera's focal length."""
-    radial_slot: Int32
-    """(k,) intrinsic slot (index among the variable intrinsics) of each camera's radial
-    distortion."""
+    intrinsic_slot: Int32
+    """(k, 8) intrinsic slot (index among the variable intrinsics) of each
+    :class:`~mpsfm_core.data.camera_models.IntrinsicParameter`."""
+    calibrated: Bool
+    """(k,) bool, True for cameras with a variable intrinsic parameter."""
+    distorted: Bool
+    """(k,) bool, True for cameras with distortion, or with a variable distortion coefficient."""
+    fisheye: Bool
+    """(k,) bool, True for OPENCV_FISHEYE and False for OPENCV cameras."""
     variable_point: Bool
     variable_scale: Bool
     pair: Int32
@@ -122,8 +137,8 @@ class BundleParameters(NamedTuple):
     """(n,) log of the scale factor on the depth map of each image."""
     intrinsics: Float64
     """(k, 4) camera parameters fx, fy, cx, cy in pixels."""
-    radial: Float64
-    """(k,) radial distortion coefficient of each camera."""
+    distortion: Float64
+    """(k, 4) distortion coefficients k1, k2, p1, p2, or k1, k2, k3, k4 of a fisheye camera."""
     points: Float64
     """(p, 3) points in the world frame."""
 
@@ -152,12 +167,15 @@ class EliminationBuffers(NamedTuple):
     slots: Int64
     """(longest,) pose slots of the images that observe the current point."""
     intrinsics: Int64
-    """(2 longest,) intrinsic slots of the cameras that observe the current point."""
+    """(8 longest,) intrinsic slots of the cameras that observe the current point."""
     y: Float64
     """(longest, 3, 7) blocks of the normal equations between the point and image parameters."""
     yf: Float64
-    """(2 longest, 3, 1) blocks of the normal equations between the point and intrinsics."""
+    """(8 longest, 3, 1) blocks of the normal equations between the point and intrinsics."""
     columns: Float64
+    effects: Float64
+    """(8, 3) effects of the intrinsic parameters on the current observation. An intrinsic parameter
+    with the effect ``(m, a, b)`` displaces the camera-frame point by ``(m x + a, m y + b, 0)``."""
     before: Float64
     """(longest, 2) cost and point depth of each observation before a step."""
     block: Float64
@@ -171,10 +189,9 @@ class LinearizedObservation(NamedTuple):
 
     The point in the camera frame is ``(x, y, z) = q + t`` with the rotated point ``q = R X``. The
     vector ``g`` is the gradient of the cost by the camera-frame point, and ``h`` is the
-    Gauss-Newton matrix, whose entry ``hxy`` is 0 without distortion. Steps of pose, 3D point, focal
-    length and radial distortion displace the camera-frame point by ``w x q + dt``, ``R dX``,
-    ``by_focal (x, y, 0) da`` and ``by_radial (x, y, 0) dk``. The fields ``gs``, ``hss`` and ``hzs``
-    are the derivatives by the log scale of the depth map.
+    Gauss-Newton matrix, whose entry ``hxy`` is 0 without distortion. Steps of pose and 3D point
+    displace the camera-frame point by ``w x q + dt`` and ``R dX``. The fields ``gs``, ``hss`` and
+    ``hzs`` are the derivatives by the log scale of the depth map.
     """
 
     visible: bool
@@ -197,8 +214,6 @@ class LinearizedObservation(NamedTuple):
     hss: float
     hzs: float
     hxy: float
-    by_focal: float
-    by_radial: float
 
 
 def allocate_buffers(longest: int) -> EliminationBuffers:
@@ -206,10 +221,11 @@ def allocate_buffers(longest: int) -> EliminationBuffers:
     longest = max(longest, 1)
     return EliminationBuffers(
         slots=np.empty(longest, np.int64),
-        intrinsics=np.empty(2 * longest, np.int64),
+        intrinsics=np.empty(NUM_INTRINSICS * longest, np.int64),
         y=np.empty((longest, 3, NUM_IMAGE_PARAMS)),
-        yf=np.empty((2 * longest, 3, 1)),
+        yf=np.empty((NUM_INTRINSICS * longest, 3, 1)),
         columns=np.empty((3, NUM_IMAGE_PARAMS)),
+        effects=np.empty((NUM_INTRINSICS, 3)),
         before=np.empty((longest, 2)),
         block=np.empty((1, 10)),
         vector=np.empty(3),
@@ -272,6 +288,142 @@ def number_covisible_poses(
     return count
 
 
+class DistortedRay(NamedTuple):
+    """Distorted ray ``(factor u + shift_u, factor v + shift_v)`` with its derivatives.
+
+    The Jacobian by ``(u, v)`` is symmetric. Its rows are ``(factor + 2 growth u^2 + tuu, 2 growth u
+    v + tuv)`` and ``(2 growth u v + tuv, factor + 2 growth v^2 + tvv)``. The derivative of the
+    distorted radius without tangential distortion is ``slope``.
+    """
+
+    valid: bool
+    factor: float
+    growth: float
+    slope: float
+    shift_u: float
+    shift_v: float
+    tuu: float
+    tuv: float
+    tvv: float
+
+
+@_helper
+def _distort_fisheye(r2: float, k1: float, k2: float, k3: float, k4: float) -> DistortedRay:
+    """Evaluate OPENCV_FISHEYE at a ray with squared radius ``r2``."""
+    n = 0.0
+    if r2 < MIN_FISHEYE_RADIUS2:
+        growth = k1 - 1.0 / 3.0
+        return DistortedRay(True, 1.0 + growth * r2, growth, 1.0 + 3.0 * growth * r2, n, n, n, n, n)
+    r = np.sqrt(r2)
+    t = np.arctan(r)
+    t2 = t * t
+    factor = t * (1.0 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4)))) / r
+    by_angle = 1.0 + t2 * (3.0 * k1 + t2 * (5.0 * k2 + t2 * (7.0 * k3 + t2 * (9.0 * k4))))
+    slope = by_angle / (1.0 + r2)
+    growth = 0.5 * (slope - factor) / r2
+    valid = factor * r > MIN_SLOPE * t and by_angle > MIN_SLOPE
+    return DistortedRay(valid, factor, growth, slope, n, n, n, n, n)
+
+
+@_helper
+def distort_ray(
+    u: float, v: float, coefficients: Float64, camera: int, fisheye: bool
+) -> DistortedRay:
+    """Distort the ray ``(u, v, 1)`` by four coefficients of OPENCV or OPENCV_FISHEYE.
+
+    Args:
+        u: First normalized coordinate ``x / z``.
+        v: Second normalized coordinate ``y / z``.
+        coefficients: (k, 4) coefficients k1, k2, p1, p2, or k1, k2, k3, k4 of a fisheye camera.
+        camera: Row of the camera in ``coefficients``.
+        fisheye: Use OPENCV_FISHEYE.
+
+    Returns:
+        The distorted ray, invalid where the distortion folds the image over.
+    """
+    r2 = u * u + v * v
+    k1, k2 = coefficients[camera, 0], coefficients[camera, 1]
+    p1, p2 = coefficients[camera, 2], coefficients[camera, 3]
+    if fisheye:
+        return _distort_fisheye(r2, k1, k2, p1, p2)
+    factor = 1.0 + (k1 + k2 * r2) * r2
+    growth = k1 + 2.0 * k2 * r2
+    slope = 1.0 + (3.0 * k1 + 5.0 * k2 * r2) * r2
+    shift_u = 2.0 * p1 * u * v + p2 * (r2 + 2.0 * u * u)
+    shift_v = 2.0 * p2 * u * v + p1 * (r2 + 2.0 * v * v)
+    tuu = 2.0 * p1 * v + 6.0 * p2 * u
+    tuv = 2.0 * p1 * u + 2.0 * p2 * v
+    tvv = 6.0 * p1 * v + 2.0 * p2 * u
+    a, b = factor + 2.0 * growth * u * u + tuu, factor + 2.0 * growth * v * v + tvv
+    mixed = 2.0 * growth * u * v + tuv
+    valid = factor > MIN_SLOPE and slope > MIN_SLOPE
+    valid = valid and a > 0.0 and a * b - mixed * mixed > 0.5 * MIN_SLOPE * MIN_SLOPE
+    return DistortedRay(valid, factor, growth, slope, shift_u, shift_v, tuu, tuv, tvv)
+
+
+@_helper
+def _radial_derivative(n: int, r2: float, fisheye: bool) -> float:
+    """Return the derivative of the radial factor by the radial coefficient ``k1 .. k4``."""
+    if not fisheye:
+        return r2 if n == 0 else r2 * r2
+    r = np.sqrt(r2)
+    t = np.arctan(r)
+    value: float = t * t if r2 < MIN_FISHEYE_RADIUS2 else t * t * t / r
+    for _ in range(n):
+        value *= t * t
+    return value
+
+
+@_helper
+def _fill_effects(
+    s: LinearizedObservation,
+    camera: int,
+    layout: ParameterLayout,
+    state: BundleParameters,
+    effects: Float64,
+) -> None:
+    """Write the effects of the variable intrinsic parameters on an observation.
+
+    An intrinsic parameter that changes the distorted ray by ``w`` has the effect of a displacement
+    ``z A^-1 w`` of the camera-frame point, with the Jacobian ``A`` of the distortion. With ``w = m
+    (u, v) + t`` and the Jacobian ``T`` of the tangential distortion, the displacement is ``(m /
+    slope) (x, y) + A^-1 (z t - (m / slope) T (x, y))``, because ``(u, v)`` is an eigenvector of ``A
+    - T``.
+    """
+    fisheye = layout.fisheye[camera]
+    inverse = 1.0 / s.z
+    u, v = s.x * inverse, s.y * inverse
+    d = distort_ray(u, v, state.distortion, camera, fisheye)
+    r2 = u * u + v * v
+    a, b = d.factor + 2.0 * d.growth * u * u + d.tuu, d.factor + 2.0 * d.growth * v * v + d.tvv
+    mixed = 2.0 * d.growth * u * v + d.tuv
+    scale = 1.0 / (a * b - mixed * mixed)
+    for n in range(NUM_INTRINSICS):
+        if layout.intrinsic_slot[camera, n] < 0:
+            continue
+        m = tu = tv = 0.0
+        if n == LOG_FOCAL:
+            m, tu, tv = d.factor, d.shift_u, d.shift_v
+        elif n == LOG_ASPECT:
+            tv = d.factor * v + d.shift_v
+        elif n == CENTER_X:
+            tu = 1.0 / state.intrinsics[camera, 0]
+        elif n == CENTER_Y:
+            tv = 1.0 / state.intrinsics[camera, 1]
+        elif n < DISTORTION + 2 or fisheye:
+            m = _radial_derivative(n - DISTORTION, r2, fisheye)
+        elif n == DISTORTION + 2:
+            tu, tv = 2.0 * u * v, r2 + 2.0 * v * v
+        else:
+            tu, tv = r2 + 2.0 * u * u, 2.0 * u * v
+        by = m / d.slope
+        tu = s.z * tu - by * (d.tuu * s.x + d.tuv * s.y)
+        tv = s.z * tv - by * (d.tuv * s.x + d.tvv * s.y)
+        effects[n, 0] = by
+        effects[n, 1] = (b * tu - mixed * tv) * scale
+        effects[n, 2] = (a * tv - mixed * tu) * scale
+
+
 @_helper
 def _add_depth_residual(
     k: int,
@@ -322,29 +474,29 @@ def _linearize_distorted_observation(
     bundle: BundleData,
     state: BundleParameters,
 ) -> LinearizedObservation:
-    """Linearize an observation in front of a camera with radial distortion."""
+    """Linearize an observation in front of a camera with lens distortion."""
     obs, robust = bundle.obs, bundle.robust
     n = 0.0
     inverse = 1.0 / z
-    u, v, radial = x * inverse, y * inverse, state.radial[camera]
-    r2 = u * u + v * v
-    factor, radius_slope = 1.0 + radial * r2, 1.0 + 3.0 * radial * r2
-    if not (factor > MIN_RADIAL_SLOPE and radius_slope > MIN_RADIAL_SLOPE):
+    u, v = x * inverse, y * inverse
+    d = distort_ray(u, v, state.distortion, camera, bundle.layout.fisheye[camera])
+    if not d.valid:
         return LinearizedObservation(
-            False, n, qx, qy, qz, x, y, z, n, n, n, n, n, n, n, n, n, n, n, n, n, n
+            False, n, qx, qy, qz, x, y, z, n, n, n, n, n, n, n, n, n, n, n, n
         )
     fx = state.intrinsics[camera, 0] * obs.weight[k]
     fy = state.intrinsics[camera, 1] * obs.weight[k]
-    ru = fx * u * factor + (state.intrinsics[camera, 2] - obs.xy[k, 0]) * obs.weight[k]
-    rv = fy * v * factor + (state.intrinsics[camera, 3] - obs.xy[k, 1]) * obs.weight[k]
+    ru = fx * u * d.factor + (state.intrinsics[camera, 2] - obs.xy[k, 0]) * obs.weight[k]
+    rv = fy * v * d.factor + (state.intrinsics[camera, 3] - obs.xy[k, 1]) * obs.weight[k]
+    ru, rv = ru + fx * d.shift_u, rv + fy * d.shift_v
     rho, weight = evaluate_loss(
         robust.reprojection_loss, ru * ru + rv * rv, robust.reprojection_scale
     )
     # Rows of the Jacobian d(ru, rv) / d(x, y), whose product with -(u, v) is the derivative by z.
-    ux = fx * inverse * (factor + 2.0 * radial * u * u)
-    uy = fx * inverse * 2.0 * radial * u * v
-    vx = fy * inverse * 2.0 * radial * u * v
-    vy = fy * inverse * (factor + 2.0 * radial * v * v)
+    ux = fx * inverse * (d.factor + 2.0 * d.growth * u * u + d.tuu)
+    uy = fx * inverse * 2.0 * d.growth * u * v + fx * inverse * d.tuv
+    vx = fy * inverse * 2.0 * d.growth * u * v + fy * inverse * d.tuv
+    vy = fy * inverse * (d.factor + 2.0 * d.growth * v * v + d.tvv)
     gx, gy = weight * (ux * ru + vx * rv), weight * (uy * ru + vy * rv)
     gz = -gx * u - gy * v
     hxx, hyy = weight * (ux * ux + vx * vx), weight * (uy * uy + vy * vy)
@@ -356,7 +508,7 @@ def _linearize_distorted_observation(
     )
     return LinearizedObservation(
         True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, hxz, hyz, hzz, gs, hss, hzs,
-        hxy, factor / radius_slope, r2 / radius_slope,
+        hxy,
     )  # fmt: skip
 
 
@@ -378,10 +530,10 @@ def linearize_observation(
     n = 0.0
     if not (z > MIN_DEPTH and z * MAX_SLOPE > abs(x) + abs(y)):
         return LinearizedObservation(
-            False, n, qx, qy, qz, x, y, z, n, n, n, n, n, n, n, n, n, n, n, n, n, n
+            False, n, qx, qy, qz, x, y, z, n, n, n, n, n, n, n, n, n, n, n, n
         )
     camera = bundle.layout.camera_of_image[image]
-    if state.radial[camera] != 0.0 or bundle.layout.radial_slot[camera] >= 0:
+    if bundle.layout.distorted[camera]:
         return _linearize_distorted_observation(
             k, image, camera, qx, qy, qz, x, y, z, bundle, state
         )
@@ -406,7 +558,7 @@ def linearize_observation(
     )
     return LinearizedObservation(
         True, 0.5 * rho, qx, qy, qz, x, y, z, gx, gy, gz, hxx, hyy, hxz, hyz, hzz, gs, hss, hzs,
-        n, 1.0, n,
+        n,
     )  # fmt: skip
 
 
@@ -479,7 +631,8 @@ def _add_pose(
 @_helper
 def _add_intrinsic(
     s: LinearizedObservation,
-    by: float,
+    x: float,
+    y: float,
     columns: Float64,
     intrinsic: int,
     slot: int,
@@ -488,10 +641,9 @@ def _add_intrinsic(
 ) -> None:
     """Add the gradient and blocks of an intrinsic parameter to the camera system.
 
-    A change of the intrinsic parameter by 1 has the effect of moving the camera-frame point by ``by
-    (x, y, 0)``.
+    A change of the intrinsic parameter by 1 has the effect of moving the camera-frame point by
+    ``(x, y, 0)``.
     """
-    x, y = by * s.x, by * s.y
     own = x * x * s.hxx + y * y * s.hyy
     if s.hxy != 0.0:
         own += 2.0 * x * y * s.hxy
@@ -506,23 +658,62 @@ def _add_intrinsic(
 
 
 @_helper
-def _add_focal_and_radial(
-    s: LinearizedObservation, focal: int, radial: int, system: ReducedCameraSystem
+def _add_intrinsic_pair(
+    s: LinearizedObservation,
+    first: int,
+    second: int,
+    slots: Int32,
+    camera: int,
+    effects: Float64,
+    system: ReducedCameraSystem,
 ) -> None:
-    """Add the block between the focal length and the radial distortion of a camera."""
+    """Add the block between two variable intrinsic parameters of a camera."""
+    m, a, b = effects[first, 0], effects[first, 1], effects[first, 2]
+    n, c, d = effects[second, 0], effects[second, 1], effects[second, 2]
     both = s.x * s.x * s.hxx + s.y * s.y * s.hyy + 2.0 * s.x * s.y * s.hxy
-    both *= s.by_focal * s.by_radial
-    system.corner[focal, radial] += both
-    system.corner[radial, focal] += both
+    both *= m * n
+    hx, hy = s.hxx * s.x + s.hxy * s.y, s.hxy * s.x + s.hyy * s.y
+    both += m * (hx * c + hy * d) + n * (hx * a + hy * b)
+    both += a * (s.hxx * c + s.hxy * d) + b * (s.hxy * c + s.hyy * d)
+    row, column = slots[camera, first], slots[camera, second]
+    system.corner[row, column] += both
+    system.corner[column, row] += both
 
 
 @_helper
-def _fill_intrinsic_column(s: LinearizedObservation, by: float, columns: Float64) -> None:
+def _fill_intrinsic_column(s: LinearizedObservation, x: float, y: float, columns: Float64) -> None:
     """Multiply an observation's Gauss-Newton matrix by the Jacobian of the intrinsic parameter."""
-    x, y = by * s.x, by * s.y
     columns[0, 0] = x * s.hxx + y * s.hxy
     columns[1, 0] = y * s.hyy + x * s.hxy
     columns[2, 0] = x * s.hxz + y * s.hyz
+
+
+@_helper
+def _add_intrinsics(
+    s: LinearizedObservation,
+    camera: int,
+    slot: int,
+    bundle: BundleData,
+    state: BundleParameters,
+    columns: Float64,
+    effects: Float64,
+    system: ReducedCameraSystem,
+) -> None:
+    """Add the variable intrinsic parameters of an observation to the camera system."""
+    layout = bundle.layout
+    poses = len(layout.pair)
+    _fill_effects(s, camera, layout, state, effects)
+    for n in range(NUM_INTRINSICS):
+        intrinsic = layout.intrinsic_slot[camera, n]
+        if intrinsic >= 0:
+            x = effects[n, 0] * s.x + effects[n, 1]
+            y = effects[n, 0] * s.y + effects[n, 2]
+            _add_intrinsic(s, x, y, columns, intrinsic, slot, poses, system)
+            for before in range(n):
+                if layout.intrinsic_slot[camera, before] >= 0:
+                    _add_intrinsic_pair(
+                        s, before, n, layout.intrinsic_slot, camera, effects, system
+                    )
 
 
 @_helper
@@ -713,6 +904,7 @@ def eliminate_points(
     """
     obs, layout = bundle.obs, bundle.layout
     slots, intrinsics, columns = scratch.slots, scratch.intrinsics, scratch.columns
+    effects = scratch.effects
     poses = len(layout.pair)
     cost = 0.0
     for p in range(first, last):
@@ -726,17 +918,12 @@ def eliminate_points(
             cost += s.cost
             image = obs.image[k]
             slot = layout.pose_slot[image]
-            focal = layout.focal_slot[layout.camera_of_image[image]]
-            radial = layout.radial_slot[layout.camera_of_image[image]]
+            camera = layout.camera_of_image[image]
             _fill_pose_columns(s, columns)
             if slot >= 0:
                 _add_pose(s, columns, slot, layout.pair[slot, slot], system)
-            if focal >= 0:
-                _add_intrinsic(s, s.by_focal, columns, focal, slot, poses, system)
-            if radial >= 0:
-                _add_intrinsic(s, s.by_radial, columns, radial, slot, poses, system)
-            if focal >= 0 and radial >= 0:
-                _add_focal_and_radial(s, focal, radial, system)
+            if layout.calibrated[camera]:
+                _add_intrinsics(s, camera, slot, bundle, state, columns, effects, system)
             if not layout.variable_point[p]:
                 continue
             _add_point(s, state.rotations, image, eliminated, p)
@@ -750,15 +937,15 @@ def eliminate_points(
                 _add_coupling(
                     columns, NUM_IMAGE_PARAMS, state.rotations, image, scratch.y, count - 1, fresh
                 )
-            for parameter in range(2):
-                intrinsic, by = (focal, s.by_focal) if parameter == 0 else (radial, s.by_radial)
+            for parameter in range(NUM_INTRINSICS if layout.calibrated[camera] else 0):
+                intrinsic = layout.intrinsic_slot[camera, parameter]
                 if intrinsic >= 0:
                     n = _find_or_add(intrinsics, num_intrinsics, intrinsic)
-                    _fill_intrinsic_column(s, by, columns)
+                    x = effects[parameter, 0] * s.x + effects[parameter, 1]
+                    y = effects[parameter, 0] * s.y + effects[parameter, 2]
+                    _fill_intrinsic_column(s, x, y, columns)
                     fresh = n == num_intrinsics
-                    _add_coupling(
-                        columns, NUM_INTRINSIC_PARAMS, state.rotations, image, scratch.yf, n, fresh
-                    )
+                    _add_coupling(columns, _COLUMN, state.rotations, image, scratch.yf, n, fresh)
                     num_intrinsics = max(num_intrinsics, n + 1)
         if not _invert_factor(eliminated, p, damping):
             for a in range(10):
@@ -771,7 +958,7 @@ def eliminate_points(
         for a in range(count):
             _whiten(eliminated, p, scratch.y, a, NUM_IMAGE_PARAMS)
         for f in range(num_intrinsics):
-            _whiten(eliminated, p, scratch.yf, f, NUM_INTRINSIC_PARAMS)
+            _whiten(eliminated, p, scratch.yf, f, _COLUMN)
         _eliminate_from_poses(count, z0, z1, z2, layout.pair, system, scratch)
         _eliminate_from_intrinsics(count, num_intrinsics, z0, z1, z2, poses, system, scratch)
     return cost
@@ -809,14 +996,15 @@ def _joint_step(
             dy = delta[n + 2] * s.qx - delta[n] * s.qz + delta[n + 4]
             dz = delta[n] * s.qy - delta[n + 1] * s.qx + delta[n + 5]
             ds = delta[n + LOG_SCALE_IDX]
-        focal = layout.focal_slot[layout.camera_of_image[image]]
-        radial = layout.radial_slot[layout.camera_of_image[image]]
-        if focal >= 0:
-            dx += s.by_focal * s.x * delta[NUM_IMAGE_PARAMS * len(layout.pair) + focal]
-            dy += s.by_focal * s.y * delta[NUM_IMAGE_PARAMS * len(layout.pair) + focal]
-        if radial >= 0:
-            dx += s.by_radial * s.x * delta[NUM_IMAGE_PARAMS * len(layout.pair) + radial]
-            dy += s.by_radial * s.y * delta[NUM_IMAGE_PARAMS * len(layout.pair) + radial]
+        camera = layout.camera_of_image[image]
+        if s.visible and layout.calibrated[camera]:
+            _fill_effects(s, camera, layout, state, scratch.effects)
+            for n in range(NUM_INTRINSICS):
+                if layout.intrinsic_slot[camera, n] >= 0:
+                    row = NUM_IMAGE_PARAMS * len(layout.pair) + layout.intrinsic_slot[camera, n]
+                    m = scratch.effects[n, 0]
+                    dx += (m * s.x + scratch.effects[n, 1]) * delta[row]
+                    dy += (m * s.y + scratch.effects[n, 2]) * delta[row]
         ux = s.hxx * dx + s.hxz * dz
         uy = s.hyy * dy + s.hyz * dz
         if s.hxy != 0.0:
@@ -954,14 +1142,22 @@ def update_cameras(
                 for c in range(3):
                     value += turn[a][c] * state.rotations[image, c, b]
                 trial.rotations[image, a, b] = value
-    for camera in range(len(layout.focal_slot)):
-        if layout.focal_slot[camera] >= 0:
-            scale = np.exp(delta[NUM_IMAGE_PARAMS * len(layout.pair) + layout.focal_slot[camera]])
-            trial.intrinsics[camera, 0] *= scale
-            trial.intrinsics[camera, 1] *= scale
-        if layout.radial_slot[camera] >= 0:
-            slot = layout.radial_slot[camera]
-            trial.radial[camera] += delta[NUM_IMAGE_PARAMS * len(layout.pair) + slot]
+    first = NUM_IMAGE_PARAMS * len(layout.pair)
+    for camera in range(len(layout.intrinsic_slot)):
+        for n in range(NUM_INTRINSICS):
+            if layout.intrinsic_slot[camera, n] < 0:
+                continue
+            change = delta[first + layout.intrinsic_slot[camera, n]]
+            if n == LOG_FOCAL:
+                scale = np.exp(change)
+                trial.intrinsics[camera, 0] *= scale
+                trial.intrinsics[camera, 1] *= scale
+            elif n == LOG_ASPECT:
+                trial.intrinsics[camera, 1] *= np.exp(change)
+            elif n < DISTORTION:
+                trial.intrinsics[camera, n] += change
+            else:
+                trial.distortion[camera, n - DISTORTION] += change
 
 
 @_kernel

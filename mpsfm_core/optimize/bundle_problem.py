@@ -12,6 +12,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.data.camera_models import (
+    NUM_DISTORTION,
+    NUM_INTRINSICS,
+    IntrinsicParameter,
+    intrinsic_parameters,
+)
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.options import BundleOptions
@@ -24,6 +30,7 @@ MAX_RANGES = 8
 MAX_BUFFER_BYTES = 1 << 30
 """Maximum size in bytes of all copies of the reduced camera system, one per range. [ours]"""
 
+DISTORTION = IntrinsicParameter.RADIAL_DISTORTION
 Result = TypeVar("Result")
 PointRange = tuple[int, int, int]
 """Range of 3D points, as the number of the range, the index of its first point, and the index after
@@ -66,23 +73,20 @@ class BundleProblem:
     """(n,) bool, True for images with variable pose (None makes all poses variable)."""
     variable_point: Bool | None = None
     """(p,) bool, True for variable 3D points (None makes all points variable)."""
-    variable_focal: Bool | None = None
-    """(k,) bool, True for cameras with variable focal length and constant ``fx / fy``. None keeps
-    all focal lengths constant."""
-    prior_log_focals: Float64 | None = None
-    """(k,) mean of the prior on ``log fx`` of each camera (None uses ``intrinsics``)."""
-    prior_std_log_focals: Float64 | float = np.inf
-    """(k,) standard deviation of the prior on ``log fx``, or one number for all cameras (infinite
-    without prior)."""
-    radial: Float64 | None = None
-    """(k,) radial distortion coefficient of each camera, as in COLMAP's SIMPLE_RADIAL (None uses
-    0)."""
-    variable_radial: Bool | None = None
-    """(k,) bool, True for cameras with variable radial distortion (None keeps all distortions
-    constant)."""
-    prior_std_radial: Float64 | float = np.inf
-    """(k,) standard deviation of the zero-mean prior on ``radial``, or one number for all cameras
-    (infinite without prior)."""
+    distortion: Float64 | None = None
+    """(k, 4) distortion coefficients k1, k2, p1, p2 of COLMAP's OPENCV, or k1, k2, k3, k4 of
+    OPENCV_FISHEYE (None uses 0)."""
+    fisheye: Bool | None = None
+    """(k,) bool, True for OPENCV_FISHEYE cameras and False for OPENCV cameras (None has no fisheye
+    cameras)."""
+    variable_intrinsics: Bool | None = None
+    """(k, 8) bool, True for the variable :class:`~mpsfm_core.data.camera_models.IntrinsicParameter`
+    of each camera (None keeps all intrinsics constant)."""
+    prior_intrinsics: Float64 | None = None
+    """(k, 8) mean of the prior on each intrinsic parameter (None uses the initial values)."""
+    prior_std_intrinsics: Float64 | float = np.inf
+    """(k, 8) standard deviation of the prior on each intrinsic parameter, or one number for all
+    intrinsic parameters (infinite without prior)."""
     log_scales: Float64 | None = None
     """(n,) log of the scale factor on the depth map of each image (None uses 0)."""
     expected_log_scales: Float64 | None = None
@@ -117,46 +121,28 @@ class ScalePrior(NamedTuple):
         return 0.5 * float(residuals @ (self.weight * residuals))
 
 
-class FocalPrior(NamedTuple):
-    """Gaussian prior on the variable log focal lengths of cameras."""
+class IntrinsicPrior(NamedTuple):
+    """Gaussian prior on one variable intrinsic parameter of the cameras."""
 
+    parameter: IntrinsicParameter
     camera: Int64
-    """(s,) index of the camera of each focal length."""
+    """(s,) index of each camera."""
     slot: Int64
-    """(s,) intrinsic slot (index among the variable intrinsics) of each focal length."""
-    log_focal: Float64
+    """(s,) intrinsic slot of the parameter of each camera."""
+    mean: Float64
     """(s,) mean."""
     weight: Float64
-    """(s,) inverse variance of the prior on each log focal length."""
+    """(s,) inverse variance of the prior on the parameter of each camera."""
 
     def residuals(self, state: kernels.BundleParameters) -> Float64:
-        """Return the residuals (s,) of the prior: log focal lengths minus their prior means."""
-        residuals: Float64 = np.log(state.intrinsics[self.camera, 0]) - self.log_focal
+        """Return the residuals (s,), intrinsic parameters minus their prior means."""
+        intrinsics, distortion = state.intrinsics[self.camera], state.distortion[self.camera]
+        values = intrinsic_parameters(intrinsics, distortion)[:, self.parameter]
+        residuals: Float64 = values - self.mean
         return residuals
 
     def cost(self, state: kernels.BundleParameters) -> float:
-        """Return the cost of the focal length prior, half the weighted sum of squared residuals."""
-        residuals = self.residuals(state)
-        return 0.5 * float(residuals @ (self.weight * residuals))
-
-
-class RadialPrior(NamedTuple):
-    """Gaussian prior with zero mean on the variable radial distortions of cameras."""
-
-    camera: Int64
-    """(s,) index of the camera of each radial distortion."""
-    slot: Int64
-    """(s,) intrinsic slot (index among the variable intrinsics) of each radial distortion."""
-    weight: Float64
-    """(s,) inverse variance of the prior on each radial distortion."""
-
-    def residuals(self, state: kernels.BundleParameters) -> Float64:
-        """Return the residuals (s,) of the zero-mean prior, which equal the radial distortions."""
-        residuals: Float64 = state.radial[self.camera]
-        return residuals
-
-    def cost(self, state: kernels.BundleParameters) -> float:
-        """Return the cost of the distortion prior, half the weighted sum of squared residuals."""
+        """Return the cost of the prior, half the weighted sum of squared residuals."""
         residuals = self.residuals(state)
         return 0.5 * float(residuals @ (self.weight * residuals))
 
@@ -169,8 +155,7 @@ class PreparedBundle(NamedTuple):
     pairs: Int64
     """(b, 2) pose slots of the two images of each block of the reduced camera system."""
     scale_prior: ScalePrior
-    focal_prior: FocalPrior
-    radial_prior: RadialPrior
+    intrinsic_priors: list[IntrinsicPrior]
     held: Bool
     """(s, 7) bool, True for constant parameters of the images with a pose slot."""
     ranges: list[PointRange]
@@ -197,16 +182,19 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
     obs = _observations(problem, images, points)
     variable_pose = _mask(problem.variable_pose, "variable_pose", images, True)
     variable_point = _mask(problem.variable_point, "variable_point", points, True)
-    variable_focal = _mask(problem.variable_focal, "variable_focal", cameras, False)
-    variable_radial = _mask(problem.variable_radial, "variable_radial", cameras, False)
+    variable = _variable_intrinsics(problem.variable_intrinsics, cameras)
     variable_scale = _mask(problem.variable_scale, "variable_scale", images, False)
+    fisheye = _mask(problem.fisheye, "fisheye", cameras, False)
+    intrinsic_slot = np.ascontiguousarray(_slots(variable.T.ravel()).reshape(-1, cameras).T)
     moving = variable_pose | variable_scale
     poses = np.count_nonzero(moving)
     layout = kernels.ParameterLayout(
         _indices(problem.camera_of_image, "camera_of_image", images, cameras),
         _slots(moving),
-        _slots(variable_focal),
-        _slots(variable_radial, first=int(np.count_nonzero(variable_focal))),
+        intrinsic_slot,
+        np.asarray(variable.any(axis=1)),
+        fisheye | (state.distortion != 0).any(axis=1) | variable[:, DISTORTION:].any(axis=1),
+        fisheye,
         variable_point,
         variable_scale,
         np.full((poses, poses), -1, dtype=np.int32),
@@ -228,8 +216,7 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
         state,
         pairs,
         _scale_prior(problem, variable_scale, layout.pose_slot),
-        _focal_prior(problem, variable_focal, layout.focal_slot),
-        _radial_prior(problem, variable_radial, layout.radial_slot),
+        _intrinsic_priors(problem, variable, intrinsic_slot),
         held[moving],
         _ranges(obs.start, len(pairs)),
         int(np.diff(obs.start).max(initial=0)),
@@ -256,13 +243,15 @@ def range_executor(ranges: list[PointRange], threads: int | None) -> Iterator[Ra
 
 
 def _state(problem: BundleProblem) -> kernels.BundleParameters:
-    count = len(problem.rotations)
+    count, cameras = len(problem.rotations), len(problem.intrinsics)
+    no_distortion = np.zeros((cameras, NUM_DISTORTION))
+    distortion = no_distortion if problem.distortion is None else problem.distortion
     return kernels.BundleParameters(
         _numbers(problem.rotations, "rotations", (count, 3, 3)).copy(),
         _numbers(problem.translations, "translations", (count, 3)).copy(),
         _numbers_or_zero(problem.log_scales, "log_scales", count).copy(),
-        _numbers(problem.intrinsics, "intrinsics", (len(problem.intrinsics), 4)).copy(),
-        _numbers_or_zero(problem.radial, "radial", len(problem.intrinsics)).copy(),
+        _numbers(problem.intrinsics, "intrinsics", (cameras, 4)).copy(),
+        _numbers(distortion, "distortion", (cameras, NUM_DISTORTION)).copy(),
         _numbers(problem.points, "points", (len(problem.points), 3)).copy(),
     )
 
@@ -314,30 +303,37 @@ def _scale_prior(
     return ScalePrior(image, slot, expected[image], 1.0 / std[image] ** 2)
 
 
-def _focal_prior(
-    problem: BundleProblem, variable: Bool, focal_slot: NDArray[np.int32]
-) -> FocalPrior:
-    count = len(variable)
-    std = np.broadcast_to(np.asarray(problem.prior_std_log_focals, dtype=np.float64), (count,))
+def _variable_intrinsics(variable: Bool | None, cameras: int) -> Bool:
+    """Validate the mask (k, 8) of variable intrinsic parameters."""
+    if variable is None:
+        return np.zeros((cameras, NUM_INTRINSICS), dtype=np.bool_)
+    if variable.shape != (cameras, NUM_INTRINSICS) or variable.dtype != np.bool_:
+        shape = f"({cameras}, {NUM_INTRINSICS})"
+        raise DataError("variable_intrinsics", f"mask must be bool of shape {shape}")
+    return variable
+
+
+def _intrinsic_priors(
+    problem: BundleProblem, variable: Bool, slot: NDArray[np.int32]
+) -> list[IntrinsicPrior]:
+    shape = variable.shape
+    std = np.asarray(problem.prior_std_intrinsics, dtype=np.float64)
+    if std.ndim and std.shape != shape:
+        raise DataError("prior_std_intrinsics", f"array must have shape {shape}, got {std.shape}")
+    std = np.broadcast_to(std, shape)
     if not (std > 0).all():
-        raise DataError("prior_std_log_focals", "must be positive")
-    means = problem.prior_log_focals
+        raise DataError("prior_std_intrinsics", "must be positive")
+    means = problem.prior_intrinsics
     if means is None:
-        means = np.log(problem.intrinsics[:, 0])
-    means = _numbers(means, "prior_log_focals", (count,))
-    camera = np.flatnonzero(variable & np.isfinite(std))
-    slot = focal_slot[camera].astype(np.int64)
-    return FocalPrior(camera, slot, means[camera], 1.0 / std[camera] ** 2)
-
-
-def _radial_prior(
-    problem: BundleProblem, variable: Bool, radial_slot: NDArray[np.int32]
-) -> RadialPrior:
-    std = np.broadcast_to(np.asarray(problem.prior_std_radial, dtype=np.float64), variable.shape)
-    if not (std > 0).all():
-        raise DataError("prior_std_radial", "must be positive")
-    camera = np.flatnonzero(variable & np.isfinite(std))
-    return RadialPrior(camera, radial_slot[camera].astype(np.int64), 1.0 / std[camera] ** 2)
+        means = intrinsic_parameters(problem.intrinsics, problem.distortion)
+    means = _numbers(means, "prior_intrinsics", shape)
+    priors = []
+    for parameter in IntrinsicParameter:
+        camera = np.flatnonzero(variable[:, parameter] & np.isfinite(std[:, parameter]))
+        slots = slot[camera, parameter].astype(np.int64)
+        weight = 1.0 / std[camera, parameter] ** 2
+        priors.append(IntrinsicPrior(parameter, camera, slots, means[camera, parameter], weight))
+    return priors
 
 
 def _numbers(values: ArrayLike, name: str, shape: tuple[int, ...]) -> Float64:
@@ -374,8 +370,8 @@ def _mask(values: Bool | None, name: str, count: int, default: bool) -> Bool:
     return array
 
 
-def _slots(variable: Bool, first: int = 0) -> NDArray[np.int32]:
-    return np.where(variable, first + np.cumsum(variable) - 1, -1).astype(np.int32)
+def _slots(variable: Bool) -> NDArray[np.int32]:
+    return np.where(variable, np.cumsum(variable) - 1, -1).astype(np.int32)
 
 
 def _scale_gauge(anchor: int, variable: Bool, state: kernels.BundleParameters) -> tuple[int, int]:

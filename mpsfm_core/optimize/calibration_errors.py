@@ -23,6 +23,7 @@ of the robust loss (Huber, "Robust Statistics", 1981, 7.6).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -30,11 +31,13 @@ from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import bsr_array, csr_array, diags_array
 
 from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.data.camera_models import NUM_INTRINSICS, IntrinsicParameter
 from mpsfm_core.geometry.distortion import distort_rays
 from mpsfm_core.optimize.bundle_problem import BundleProblem
 from mpsfm_core.optimize.losses import LOSSES
 from mpsfm_core.optimize.options import BundleOptions, Loss
 
+FOCAL = IntrinsicParameter.FOCAL_LENGTH
 CENTER_STD = 0.02
 """Standard deviation of the principal point from the image center, in longer image sides.
 [tuned: benchmarks.verdicts]"""
@@ -151,11 +154,12 @@ def _prior_offsets(problem: BundleProblem, columns: _Columns) -> Float64:
     """Return the deviations (c,) of the camera parameters from their prior means."""
     offsets = np.zeros(columns.point)
     cameras = np.arange(len(problem.intrinsics))
-    if problem.radial is not None:
-        offsets[columns.radial + cameras] = problem.radial
-    if problem.prior_log_focals is not None:
+    if problem.distortion is not None:
+        offsets[columns.radial + cameras] = problem.distortion[:, 0]
+        offsets[columns.radial + len(cameras) + cameras] = problem.distortion[:, 1]
+    if problem.prior_intrinsics is not None:
         log_focals = np.log(problem.intrinsics[:, 0])
-        offsets[columns.focal + cameras] = log_focals - problem.prior_log_focals
+        offsets[columns.focal + cameras] = log_focals - problem.prior_intrinsics[:, 0]
     return offsets
 
 
@@ -194,7 +198,8 @@ def _prior_stds(
     if problem.variable_scale is not None:
         scale_std = np.broadcast_to(problem.std_log_scales, (num_images,))
         std[columns.scale : columns.focal] = np.where(problem.variable_scale, scale_std, 0.0)
-    focal_std = np.broadcast_to(problem.prior_std_log_focals, (num_cameras,))
+    shape = num_cameras, NUM_INTRINSICS
+    focal_std = np.broadcast_to(problem.prior_std_intrinsics, shape)[:, FOCAL]
     std[columns.focal : columns.radial] = np.where(known, 0.0, focal_std)
     radial_std = np.where(known, 0.0, np.array(RADIAL_STDS)[:, None])
     std[columns.radial : columns.center] = radial_std.ravel()
@@ -365,7 +370,14 @@ def _linearize_reprojection(
         / z[:, :, None]
     )
     radius2 = (slopes**2).sum(axis=1, keepdims=True)
-    by_radial = np.stack([scale * slopes * radius2, scale * slopes * radius2**2], axis=2)
+    direction = slopes
+    if problem.fisheye is not None and problem.fisheye.any():
+        # The coefficients of a fisheye camera multiply powers of the angle.
+        radius = np.maximum(np.sqrt(radius2), STEP)
+        angle, is_fisheye = np.arctan(radius), problem.fisheye[seen.camera, None]
+        direction = np.where(is_fisheye, slopes * angle / radius, slopes)
+        radius2 = np.where(is_fisheye, angle**2, radius2)
+    by_radial = np.stack([scale * direction * radius2, scale * direction * radius2**2], axis=2)
     by_center = np.broadcast_to(inverse_std[:, None, None], (len(z), 2, 1))
     by_focal, by_world_point = errors[:, :, None], by_point @ seen.rotation
     by_camera, by_deviation = (by_focal, by_radial, by_center), (by_focal, by_center)
@@ -421,14 +433,17 @@ def _linearize_depth(
 
 def _distort(problem: BundleProblem, camera: Int64, slopes: Float64) -> tuple[Float64, Float64]:
     """Return distorted normalized coordinates (m, 2), and their derivative (m, 2, 2)."""
-    if problem.radial is None or not problem.radial.any():
+    fisheye = np.zeros(len(problem.intrinsics), np.bool_)
+    fisheye = fisheye if problem.fisheye is None else problem.fisheye
+    if problem.distortion is None or not (problem.distortion.any() or fisheye.any()):
         return slopes, np.broadcast_to(np.eye(2), (len(slopes), 2, 2))
     distorted, derivative = np.empty_like(slopes), np.empty((len(slopes), 2, 2))
-    for row, radial in enumerate(problem.radial.tolist()):
+    for row, coefficients in enumerate(problem.distortion.tolist()):
+        distort = partial(distort_rays, coefficients=coefficients, fisheye=bool(fisheye[row]))
         chosen = camera == row
-        distorted[chosen] = distort_rays(slopes[chosen], radial)
+        distorted[chosen] = distort(slopes[chosen])
         for axis, step in enumerate(STEP * np.eye(2)):
-            above, below = (distort_rays(slopes[chosen] + s, radial) for s in (step, -step))
+            above, below = (distort(slopes[chosen] + s) for s in (step, -step))
             derivative[chosen, :, axis] = (above - below) / (2 * STEP)
     return distorted, derivative
 

@@ -290,11 +290,14 @@ def _distortions(summary: Mapping[str, Any]) -> Iterator[Finding]:
     }
     if refined:
         radials, stds = zip(*refined.values(), strict=True)
+        models = " and ".join(
+            dict.fromkeys(details[name].get("camera_model", "SIMPLE_RADIAL") for name in refined)
+        )
         span = " to ".join(dict.fromkeys(f"{value:+.3f}" for value in (min(radials), max(radials))))
         yield Finding(
             "note",
             f"The radial distortion of {_count(len(refined), 'photo')} was estimated",
-            f"The coefficient k1 of COLMAP's SIMPLE_RADIAL is {span}. Its standard deviation is at "
+            f"The coefficient k1 of COLMAP's {models} is {span}. Its standard deviation is at "
             f"most {max(stds):.3f}.",
             "Give the camera with --intrinsics if you know it.",
             tuple(refined),

@@ -300,6 +300,17 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "SIMPLE_RADIAL does not describe.",
         "Give the camera with --intrinsics.",
     ),
+    CameraReason.PARAMETER_NOT_OBSERVABLE: (
+        "camera parameter not observable",
+        "The photos leave a standard deviation of {std:.3g} of the camera parameter {parameter}.",
+        "Choose a camera model with fewer parameters with --camera-model.",
+    ),
+    CameraReason.PARAMETER_OUT_OF_RANGE: (
+        "implausible camera parameter",
+        "Bundle adjustment ends at the implausible value {value:.3g} of the camera parameter "
+        "{parameter}.",
+        "Choose a camera model with fewer parameters with --camera-model.",
+    ),
 }
 
 

@@ -79,13 +79,13 @@ def build_pinhole_model(
 ) -> pycolmap.Reconstruction:
     """Build a COLMAP model with black points, which needs no images, of the undistorted views.
 
-    Cameras of the model are PINHOLE, or SIMPLE_RADIAL if the mapper estimated radial distortion and
-    the views were not undistorted with the estimate.
+    Cameras of the model are PINHOLE, or have the estimated distortion if the views were not
+    undistorted with the estimate.
     """
     cameras = [
-        _with_distortion(image.camera, image.radial)
-        if image.radial and not problem.images[image.index].radial
-        else colmap_from_pinhole(image.camera)
+        colmap_from_pinhole(image.camera)
+        if any(problem.images[image.index].distortion) or not image.distortion.any()
+        else _with_distortion(image)
         for image in reconstruction.images
     ]
     keypoints = [problem.images[image.index].keypoints for image in reconstruction.images]
@@ -233,10 +233,17 @@ def _check_free_space(path: Path, size: int) -> None:
         path.unlink(missing_ok=True)
 
 
-def _with_distortion(pinhole: PinholeCamera, radial: float) -> pycolmap.Camera:
-    params = [(pinhole.fx * pinhole.fy) ** 0.5, pinhole.cx, pinhole.cy, radial]
+def _with_distortion(image: RegisteredImage) -> pycolmap.Camera:
+    """Return the estimated camera of an image whose view was not undistorted with the estimate."""
+    pinhole, model = image.camera, image.camera_model
+    if model.is_fisheye:
+        return colmap_from_pinhole(pinhole)
+    intrinsics = pinhole.params.copy()
+    if not model.has_aspect:
+        intrinsics[:2] = (pinhole.fx * pinhole.fy) ** 0.5
+    params = model.to_params(intrinsics, image.distortion)
     return pycolmap.Camera(
-        model="SIMPLE_RADIAL", width=pinhole.width, height=pinhole.height, params=params
+        model=model.value, width=pinhole.width, height=pinhole.height, params=params
     )
 
 

@@ -1,7 +1,7 @@
-"""Undistort images again with the radial distortion that the mapper estimated.
+"""Undistort images again with the distortion that the mapper estimated.
 
 Images without given intrinsics are first mapped as pinhole images of a guessed focal length. If the
-mapper estimates radial distortion, keypoints, depth priors and normal priors are transferred to
+mapper estimates distortion, keypoints, depth priors and normal priors are transferred to
 views that are undistorted with the refined cameras. The transfer moves pixels, and keeps values of
 depth along z and of normals in the camera frame.
 """
@@ -24,6 +24,7 @@ from mpsfm_core.data import (
     MappingProblem,
     NormalPrior,
 )
+from mpsfm_core.data.camera_models import CameraModel, Distortion, to_distortion
 from mpsfm_core.geometry import pixel_centers, project, scale_pixels
 from mpsfm_core.geometry.distortion import undistort_rays
 from mpsfm_core.inputs.images import ImageSet, SourceImage
@@ -38,10 +39,11 @@ MIN_VALID_WEIGHT = 0.999
 def undistort_images(
     images: ImageSet, problem: MappingProblem, reconstructions: Sequence[Reconstruction]
 ) -> ImageSet:
-    """Return the images with the SIMPLE_RADIAL cameras that the mapper estimated.
+    """Return the images with the cameras that the mapper estimated, in their camera model.
 
     An image that is not registered gets the camera of a registered image that shares its guessed
-    camera. The images are returned unchanged if no radial distortion was estimated.
+    camera. The images are returned unchanged if neither distortion nor principal point
+    nor aspect ratio was estimated.
 
     Args:
         images: Images whose undistorted views were mapped.
@@ -59,7 +61,7 @@ def undistort_images(
         refined = registered.get(index)
         if refined is None and not image.focal_known:
             refined = shared.get(image.shared_camera)
-        if refined is not None and refined.radial:
+        if refined is not None and refined.changes_view:
             cameras[source.name] = _refined_camera(source, refined)
     return images.with_cameras(cameras) if cameras else images
 
@@ -94,8 +96,8 @@ def undistort_cameras(refined: ImageSet, reconstruction: Reconstruction) -> Reco
 
 
 def take_refined_camera(refined: ImageSet, image: RegisteredImage) -> RegisteredImage:
-    """Replace the camera of an image with estimated distortion by that of its refined view."""
-    return replace(image, camera=refined[image.index].pinhole) if image.radial else image
+    """Replace the camera of an image by that of its refined view, if the view changes."""
+    return replace(image, camera=refined[image.index].pinhole) if image.changes_view else image
 
 
 def refine_reconstructions(
@@ -119,15 +121,23 @@ def refine_reconstructions(
 
 
 def _refined_camera(source: SourceImage, registered: RegisteredImage) -> pycolmap.Camera:
-    """Return the SIMPLE_RADIAL camera that the mapper estimated for an upright original image."""
-    camera = source.camera
-    focal_px = camera.mean_focal_length() * registered.camera.fx / source.pinhole.fx
-    center = camera.principal_point_x, camera.principal_point_y
+    """Return the camera that the mapper estimated for an upright original image."""
+    camera, old, new = source.camera, source.pinhole, registered.camera
+    scale_x, scale_y = camera.focal_length_x / old.fx, camera.focal_length_y / old.fy
+    intrinsics = np.array(
+        [
+            camera.focal_length_x * new.fx / old.fx,
+            camera.focal_length_y * new.fy / old.fy,
+            camera.principal_point_x + (new.cx - old.cx) * scale_x,
+            camera.principal_point_y + (new.cy - old.cy) * scale_y,
+        ]
+    )
+    model = registered.camera_model
     return pycolmap.Camera(
-        model="SIMPLE_RADIAL",
+        model=model.value,
         width=camera.width,
         height=camera.height,
-        params=[focal_px, *center, registered.radial],
+        params=model.to_params(intrinsics, registered.distortion),
         camera_id=camera.camera_id,
     )
 
@@ -145,22 +155,26 @@ class _ViewWarp:
             image,
             camera=self._new.pinhole,
             focal_guess_px=image.focal_prior_px,
-            radial=self._radial,
+            distortion=self._distortion,
             keypoints=self.move_keypoints(image.keypoints),
             depth=self.move_depth(image.depth),
             normals=self.move_normals(image.normals),
         )
 
     @property
-    def _radial(self) -> float:
-        return float(self._new.camera.params[self._new.camera.extra_params_idxs()[0]])
+    def _distortion(self) -> Distortion:
+        camera = self._new.camera
+        _, distortion = CameraModel(camera.model_name).from_params(np.array(camera.params))
+        return to_distortion(distortion)
 
     def move_keypoints(self, xy: Float64) -> Float64:
         """Map keypoints (n, 2) in pixels of the old view to pixels of the new view."""
         camera = self._new.camera
         center = np.array([camera.principal_point_x, camera.principal_point_y])
-        distorted = (self._old.original_pixels(xy) - center) / camera.mean_focal_length()
-        rays = undistort_rays(distorted, self._radial)
+        focal_px = np.array([camera.focal_length_x, camera.focal_length_y])
+        distorted = (self._old.original_pixels(xy) - center) / focal_px
+        fisheye = CameraModel(camera.model_name).is_fisheye
+        rays = undistort_rays(distorted, self._distortion, fisheye=fisheye)
         return project(self._new.pinhole, np.column_stack([rays, np.ones(len(rays))]))
 
     def move_depth(self, prior: DepthPrior) -> DepthPrior:

@@ -18,11 +18,11 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import MappingProblem
+from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.data.decisions import ImageReason, Value
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.extraction.report import ExtractionReport
 from mpsfm_core.inputs.images import ImageSet, SourceImage
-from mpsfm_core.mapping.scene.estimated_intrinsics import IntrinsicParameter
 from mpsfm_core.mapping.scene.reconstruction import (
     MappingResult,
     Reconstruction,
@@ -238,12 +238,16 @@ def _describe_camera(
     focal_px = photos.original_camera(registered).mean_focal_length()
     if focal_px != described["focal_length_px"]:
         described["refined_focal_length_px"] = focal_px
+    if any(result.is_refined for result in registered.calibration.values()):
+        described["camera_model"] = photos.original_camera(registered).model_name
     for parameter, calibrated in registered.calibration.items():
         name = parameter.name.lower()
         if calibrated.std is not None and parameter == IntrinsicParameter.FOCAL_LENGTH:
             described["focal_length_std_px"] = focal_px * calibrated.std
         elif calibrated.std is not None:
-            described[name] = registered.radial
+            is_radial = parameter == IntrinsicParameter.RADIAL_DISTORTION
+            value = registered.distortion[0] if is_radial else calibrated.estimate.value
+            described[name] = float(value)
             described[f"{name}_std"] = calibrated.std
         if calibrated.reason is not None:
             described[f"{name}_reason"] = calibrated.reason.to_json()

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mpsfm_core.data.camera_models import CameraModel
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs import images as module
 from mpsfm_core.inputs.image_search import check_output_folder, find_images
@@ -355,3 +356,19 @@ def test_images_of_shared_scene_are_loaded(shared_data: Path) -> None:
     found = load_images(kitchen / "images", kitchen / "intrinsics.yaml")
     assert len(found) == 6  # PNG data in files named .JPG
     assert found.view(0).image.shape == (793, 1393, 3)
+
+
+def test_camera_model_is_that_of_guessed_cameras_only(folder: Path, tmp_path: Path) -> None:
+    options = InputOptions(camera_model=CameraModel.OPENCV_FISHEYE)
+    guessed = load_images(folder, options=options)
+    for image in guessed:
+        assert image.camera_model == CameraModel.OPENCV_FISHEYE
+        assert image.camera.model_name == "OPENCV_FISHEYE"
+        assert image.pinhole.fx == image.camera.focal_length_x
+        # the view of an equidistant camera is cropped to valid pixels
+        assert image.pinhole.width >= image.camera.width
+    path = tmp_path / "given.yaml"
+    path.write_text(DISTORTED)
+    for image in load_images(folder, path, options=options):
+        assert image.camera_model == CameraModel.SIMPLE_RADIAL
+        assert image.camera.model_name == "SIMPLE_RADIAL"

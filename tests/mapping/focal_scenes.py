@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.data.camera_models import CameraModel
 from mpsfm_core.extraction.matching.verification import verify_matches
 from mpsfm_core.extraction.options import VerificationOptions
 from mpsfm_core.geometry.distortion import distort_rays
@@ -23,9 +24,9 @@ CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
 POSES = arc_poses(5, 14.0)
 
 
-def make_room() -> MappingProblem:
-    """Return five images of a room with true, known focal lengths."""
-    return make_mapping_problem(room_scene(), CAMERA, POSES, noise=SyntheticNoise(keypoints_px=0.5))
+def make_room(camera: PinholeCamera = CAMERA) -> MappingProblem:
+    """Return five images of a room with true, known intrinsics."""
+    return make_mapping_problem(room_scene(), camera, POSES, noise=SyntheticNoise(keypoints_px=0.5))
 
 
 def scale_focal(camera: PinholeCamera, factor: float) -> PinholeCamera:
@@ -33,14 +34,21 @@ def scale_focal(camera: PinholeCamera, factor: float) -> PinholeCamera:
     return replace(camera, fx=camera.fx * factor, fy=camera.fy * factor)
 
 
-def distort(problem: MappingProblem, radial: float) -> MappingProblem:
-    """Return the problem with keypoints of a lens with radial distortion."""
+def distort(
+    problem: MappingProblem, *coefficients: float, model: CameraModel = CameraModel.SIMPLE_RADIAL
+) -> MappingProblem:
+    """Return the problem with keypoints of a lens with distortion, in images of a camera model."""
+    coefficients = coefficients + (0.0,) * (4 - len(coefficients))
     center = np.array([CAMERA.cx, CAMERA.cy])
     images = (
         replace(
             image,
             keypoints=center
-            + CAMERA.fx * distort_rays((image.keypoints - center) / CAMERA.fx, radial),
+            + CAMERA.fx
+            * distort_rays(
+                (image.keypoints - center) / CAMERA.fx, coefficients, fisheye=model.is_fisheye
+            ),
+            camera_model=model,
         )
         for image in problem.images
     )

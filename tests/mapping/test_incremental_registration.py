@@ -145,7 +145,7 @@ def test_undone_jump_restores_focal_lengths(component: Component) -> None:
     component.refiner.integrate([2])
     refined = component.scene.maps[2].depth.copy()
     rotate_camera(component, 2, 25.0)
-    component.scene.set_intrinsics(2, np.array([300.0, 300.0]), 0.0)
+    component.scene.set_intrinsics(2, np.array([300.0, 300.0, 160.0, 120.0]), np.zeros(4))
     component.refiner.integrate([2])
     component.maintenance._undo_jump(before)
     assert component.scene.intrinsics[2].tolist() == [260.0, 260.0, 160.0, 120.0]

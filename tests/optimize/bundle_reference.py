@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +11,12 @@ import pyceres
 import pycolmap
 
 from mpsfm_core.data import Float64
+from mpsfm_core.data.camera_models import (
+    NUM_DISTORTION,
+    NUM_INTRINSICS,
+    CameraModel,
+    intrinsic_parameters,
+)
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem
 from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, BundleOptions
 
@@ -84,22 +91,88 @@ def without_depth(problem: BundleProblem) -> BundleProblem:
     return replace(problem, obs_log_depth=None, scale_anchor=1)
 
 
-def to_pycolmap(problem: BundleProblem) -> pycolmap.Reconstruction:
-    """Convert a bundle problem to a COLMAP reconstruction, whose ids are the indices plus 1.
+def calibrated(
+    problem: BundleProblem,
+    model: CameraModel,
+    *,
+    principal_point: bool = False,
+    prior_std: float = np.inf,
+    **changes: Any,
+) -> BundleProblem:
+    """Make the intrinsic parameters of a camera model variable for all cameras.
 
-    Cameras are SIMPLE_RADIAL if the problem has radial distortions, else PINHOLE if their focal
-    lengths differ, else SIMPLE_PINHOLE.
+    Args:
+        problem: Bundle adjustment problem.
+        model: Camera model.
+        principal_point: Make the principal point variable, too.
+        prior_std: Standard deviation of the zero-mean prior on distortion coefficients, and of the
+            prior on the other intrinsic parameters.
+        changes: Other fields of the problem to replace.
     """
+    cameras = len(problem.intrinsics)
+    free = model.free_parameters(principal_point=principal_point)
+    mean = intrinsic_parameters(problem.intrinsics, None)
+    start = {"distortion": np.zeros((cameras, NUM_DISTORTION))} if model.num_distortion else {}
+    return replace(
+        problem,
+        **{
+            "variable_intrinsics": np.tile(free, (cameras, 1)),
+            "prior_intrinsics": mean,
+            "prior_std_intrinsics": prior_std,
+            "fisheye": np.full(cameras, model.is_fisheye),
+            **start,
+            **changes,
+        },
+    )
+
+
+def distorted(
+    problem: BundleProblem, coefficients: Sequence[float], *, fisheye: bool = False
+) -> BundleProblem:
+    """Replace the observations by those of distorted cameras with the same keypoint noise.
+
+    Args:
+        problem: Bundle adjustment problem.
+        coefficients: First distortion coefficients of all cameras.
+        fisheye: Use OPENCV_FISHEYE.
+    """
+    noise = whitened_residuals(problem, robust=False)[:, :2]
+    distortion = np.zeros((len(problem.intrinsics), NUM_DISTORTION))
+    distortion[:, : len(coefficients)] = coefficients
+    bent = replace(
+        problem, distortion=distortion, fisheye=np.full(len(problem.intrinsics), fisheye)
+    )
+    exact = bent.obs_xy + whitened_residuals(bent, robust=False)[:, :2]
+    return replace(bent, obs_xy=exact - noise)
+
+
+def colmap_model(problem: BundleProblem) -> CameraModel:
+    """Return the COLMAP camera model whose parameters are the intrinsics of a problem."""
+    variable = problem.variable_intrinsics
+    free = np.zeros(NUM_INTRINSICS, bool) if variable is None else variable.any(axis=0)
+    if problem.fisheye is not None and problem.fisheye.any():
+        return CameraModel.OPENCV_FISHEYE
+    if problem.distortion is not None:
+        count = max(np.flatnonzero((problem.distortion != 0).any(axis=0) | free[4:]), default=0)
+        models = CameraModel.SIMPLE_RADIAL, CameraModel.RADIAL, CameraModel.OPENCV
+        return models[min(count, 2)]
+    if (problem.intrinsics[:, 0] != problem.intrinsics[:, 1]).any() or free[1]:
+        return CameraModel.PINHOLE
+    return CameraModel.SIMPLE_PINHOLE
+
+
+def to_pycolmap(problem: BundleProblem) -> pycolmap.Reconstruction:
+    """Convert a problem to a COLMAP reconstruction, whose ids are the indices plus 1."""
     rec = pycolmap.Reconstruction()
-    for number, (fx, fy, *center) in enumerate(problem.intrinsics, start=1):
-        model, params = "PINHOLE", [fx, fy, *center]
-        if problem.radial is not None:
-            model, params = "SIMPLE_RADIAL", [fx, *center, problem.radial[number - 1]]
-        elif fx == fy:
-            model, params = "SIMPLE_PINHOLE", [fx, *center]
+    model = colmap_model(problem)
+    distortion = problem.distortion
+    if distortion is None:
+        distortion = np.zeros((len(problem.intrinsics), NUM_DISTORTION))
+    for number, intrinsics in enumerate(problem.intrinsics, start=1):
+        params = model.to_params(intrinsics, distortion[number - 1])
         rec.add_camera_with_trivial_rig(
             pycolmap.Camera(
-                model=model, width=SIZE[0], height=SIZE[1], params=params, camera_id=number
+                model=model.value, width=SIZE[0], height=SIZE[1], params=params, camera_id=number
             )
         )
     row = np.empty(len(problem.obs_image), dtype=np.int64)
@@ -129,13 +202,15 @@ def ceres_adjuster(
     tolerance: float = 1e-6,
     *,
     refine_focal: bool = False,
-    refine_radial: bool = False,
+    refine_distortion: bool = False,
+    refine_principal_point: bool = False,
     fix_scale: bool = True,
 ) -> Any:
     """Create pycolmap's bundle adjuster with soft-L1 loss and constant first pose (and scale)."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_focal_length = refine_focal
-    options.refine_extra_params = refine_radial
+    options.refine_extra_params = refine_distortion
+    options.refine_principal_point = refine_principal_point
     options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
     options.ceres.loss_function_scale = SOFT_L1_OPTIONS.reprojection_scale
@@ -207,47 +282,49 @@ class ScaleCost(pyceres.CostFunction):  # type: ignore[misc]
         return True
 
 
-class RadialCost(pyceres.CostFunction):  # type: ignore[misc]
-    """Ceres cost k / std of the radial distortion k of a SIMPLE_RADIAL camera."""
+class IntrinsicCost(pyceres.CostFunction):  # type: ignore[misc]
+    """(p[i] - mean) / std, or (log p[0] - mean) / std, of the ``size`` parameters p of a camera."""
 
-    def __init__(self, std: float) -> None:
-        super().__init__()
-        self.set_num_residuals(1)
-        self.set_parameter_block_sizes([4])
-        self.std = std
-
-    def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
-        """Ceres' callback."""
-        residuals[0] = parameters[0][3] / self.std
-        if jacobians is not None and jacobians[0] is not None:
-            jacobians[0][:] = [0, 0, 0, 1 / self.std]
-        return True
-
-
-class LogFocalCost(pyceres.CostFunction):  # type: ignore[misc]
-    """Ceres cost (log f - mean) / std of a camera with ``size`` parameters, where f is the
-    first."""
-
-    def __init__(self, mean: float, std: float, size: int) -> None:
+    def __init__(self, index: int, mean: float, std: float, size: int) -> None:
         super().__init__()
         self.set_num_residuals(1)
         self.set_parameter_block_sizes([size])
-        self.size = size
+        self.index = index
         self.mean = mean
         self.std = std
 
     def Evaluate(self, parameters: Any, residuals: Any, jacobians: Any) -> bool:
         """Ceres' callback."""
-        focal = parameters[0][0]
-        residuals[0] = (np.log(focal) - self.mean) / self.std
+        value = parameters[0][self.index]
+        derivative = 1.0 if self.index else 1 / value
+        residuals[0] = ((value if self.index else np.log(value)) - self.mean) / self.std
         if jacobians is not None and jacobians[0] is not None:
             jacobians[0][:] = 0
-            jacobians[0][0] = 1 / (focal * self.std)
+            jacobians[0][self.index] = derivative / self.std
         return True
 
 
+def prior_costs(problem: BundleProblem, model: CameraModel) -> list[list[IntrinsicCost]]:
+    """Return the priors on log focal length and distortion of each camera as Ceres residuals."""
+    shape = len(problem.intrinsics), NUM_INTRINSICS
+    std = np.broadcast_to(problem.prior_std_intrinsics, shape)
+    means = problem.prior_intrinsics
+    first = 4 if model.has_aspect else 3
+    size = first + model.num_distortion
+    columns = [0, *range(4, 4 + model.num_distortion)]
+    indices = [0, *range(first, size)]
+    return [
+        [
+            IntrinsicCost(index, float(means[camera, column]), float(std[camera, column]), size)
+            for index, column in zip(indices, columns, strict=True)
+            if means is not None and np.isfinite(std[camera, column])
+        ]
+        for camera in range(shape[0])
+    ]
+
+
 def solve_with_ceres(
-    problem: BundleProblem, *, refine_focal: bool = False
+    problem: BundleProblem,
 ) -> tuple[float, float, pycolmap.Reconstruction, Float64]:
     """Solve a problem with Ceres; return initial and final cost, reconstruction and log scales
     (n,).
@@ -259,20 +336,20 @@ def solve_with_ceres(
     count = len(problem.rotations)
     given = np.zeros(count) if problem.log_scales is None else problem.log_scales
     log_scales = [np.array([value]) for value in given]
-    refine_radial = problem.variable_radial is not None
+    variable = problem.variable_intrinsics
+    free = np.zeros(NUM_INTRINSICS, bool) if variable is None else variable.any(axis=0)
     adjuster = ceres_adjuster(
-        rec, 1e-13, refine_focal=refine_focal, refine_radial=refine_radial, fix_scale=plain
+        rec,
+        1e-13,
+        refine_focal=bool(free[0]),
+        refine_distortion=bool(free[4:].any()),
+        refine_principal_point=bool(free[2]),
+        fix_scale=plain,
     )
-    priors: list[Any] = []
-    if problem.prior_log_focals is not None:
-        for k, mean in enumerate(problem.prior_log_focals):
-            params = rec.cameras[k + 1].params
-            priors.append(LogFocalCost(mean, float(problem.prior_std_log_focals), len(params)))
-            adjuster.problem.add_residual_block(priors[-1], None, [params])
-    if problem.radial is not None and np.isfinite(problem.prior_std_radial):
-        for camera in rec.cameras.values():
-            priors.append(RadialCost(float(problem.prior_std_radial)))
-            adjuster.problem.add_residual_block(priors[-1], None, [camera.params])
+    priors = prior_costs(problem, colmap_model(problem)) if variable is not None else []
+    for number, costs in enumerate(priors, start=1):
+        for cost in costs:
+            adjuster.problem.add_residual_block(cost, None, [rec.cameras[number].params])
     if not plain:
         ceres = adjuster.problem
         loss = pyceres.LossFunction({"name": "cauchy", "params": [SOFT_L1_OPTIONS.depth_scale]})
@@ -321,9 +398,10 @@ def whitened_residuals(
     in_camera += problem.translations[image]
     intrinsics = problem.intrinsics[problem.camera_of_image[image]]
     uv = in_camera[:, :2] / in_camera[:, 2:]
-    if problem.radial is not None:
-        radial = problem.radial[problem.camera_of_image[image]]
-        uv = uv * (1 + radial * (uv**2).sum(axis=1))[:, None]
+    if problem.distortion is not None:
+        coefficients = problem.distortion[problem.camera_of_image[image]]
+        is_fisheye = problem.fisheye is not None and bool(problem.fisheye.all())
+        uv = distort_reference(uv, coefficients, fisheye=is_fisheye)
     xy = intrinsics[:, :2] * uv + intrinsics[:, 2:]
     pixel = (xy - problem.obs_xy) / np.broadcast_to(problem.obs_std_px, len(image))[:, None]
     depth = np.zeros(len(image))
@@ -332,31 +410,56 @@ def whitened_residuals(
     return np.column_stack([pixel, np.nan_to_num(depth)])
 
 
-def dense_information(problem: BundleProblem) -> Float64:
-    """Compute J^T J by central differences over poses, points, log focal lengths and distortions.
+def distort_reference(uv: Float64, coefficients: Float64, *, fisheye: bool) -> Float64:
+    """Distort normalized coordinates (m, 2) by coefficients (m, 4), as COLMAP documents."""
+    u, v = uv.T
+    a, b, c, d = coefficients.T
+    r2 = (uv**2).sum(axis=1)
+    if fisheye:
+        r = np.sqrt(r2)
+        t = np.arctan(r)
+        bent = t * (1 + a * t**2 + b * t**4 + c * t**6 + d * t**8)
+        return uv * np.divide(bent, r, out=np.ones_like(r), where=r > 0)[:, None]
+    radial = uv * (1 + a * r2 + b * r2**2)[:, None]
+    tangential = [2 * c * u * v + d * (r2 + 2 * u**2), 2 * d * u * v + c * (r2 + 2 * v**2)]
+    return np.asarray(radial + np.stack(tangential, axis=1))
 
-    The weights of the robust losses are those at the state of ``problem``. Each variable pose has 6
-    parameters, and radial distortions are optional.
+
+def move_intrinsics(problem: BundleProblem, change: Float64) -> BundleProblem:
+    """Return the problem with changes (k, 8) added to its intrinsic parameters."""
+    scale = np.exp(change[:, :1] + change[:, 1:2] * [0, 1])
+    intrinsics = np.hstack([problem.intrinsics[:, :2] * scale, problem.intrinsics[:, 2:]])
+    intrinsics[:, 2:] += change[:, 2:4]
+    bent = None if problem.distortion is None else problem.distortion + change[:, 4:]
+    return replace(problem, intrinsics=intrinsics, distortion=bent)
+
+
+def dense_information(problem: BundleProblem) -> Float64:
+    """J^T J by central differences over free poses (6 each), points and intrinsic parameters.
+
+    The variable intrinsic parameters are sorted by parameter, then by camera. The weights of the
+    robust losses are those at the problem's own state.
     """
-    poses, cameras = np.flatnonzero(problem.variable_pose), len(problem.intrinsics)
-    sizes = 6 * len(poses), problem.points.size, cameras, 0 if problem.radial is None else cameras
+    poses = np.flatnonzero(problem.variable_pose)
+    parameters, cameras = np.nonzero(problem.variable_intrinsics.T)
+    sizes = 6 * len(poses), problem.points.size, len(cameras)
     fixed = whitened_residuals(problem, robust=False)
     robust = whitened_residuals(problem)
     weight = np.divide(robust, fixed, out=np.ones_like(fixed), where=fixed != 0)
 
     def residuals(change: Float64) -> Float64:
-        pose, point, focal, radial = np.split(change, np.cumsum(sizes)[:-1])
+        pose, point, intrinsic = np.split(change, np.cumsum(sizes)[:-1])
         rotations, translations = problem.rotations.copy(), problem.translations.copy()
         for row, step in zip(poses, pose.reshape(-1, 6), strict=True):
             rotations[row] = rotation(step[:3]) @ rotations[row]
             translations[row] += step[3:]
+        by_camera = np.zeros((len(problem.intrinsics), NUM_INTRINSICS))
+        by_camera[cameras, parameters] = intrinsic
         moved = replace(
-            problem,
+            move_intrinsics(problem, by_camera),
             rotations=rotations,
             translations=translations,
             points=problem.points + point.reshape(-1, 3),
-            intrinsics=problem.intrinsics * np.exp(np.outer(focal, [1, 1, 0, 0])),
-            radial=None if problem.radial is None else problem.radial + radial,
         )
         return (weight * whitened_residuals(moved, robust=False)).ravel()
 

@@ -9,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mpsfm_core.data import Float64
+from mpsfm_core.data.camera_models import CameraModel
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.optimize.bundle_adjustment import (
     BundleProblem,
@@ -19,7 +20,10 @@ from mpsfm_core.optimize.bundle_adjustment import (
 from mpsfm_core.optimize.options import Loss
 from tests.optimize.bundle_reference import (
     FOCAL,
+    calibrated,
+    colmap_model,
     dense_information,
+    distorted,
     make_problem,
     perturb,
     rotation,
@@ -30,11 +34,11 @@ from tests.optimize.bundle_reference import (
 )
 
 TIGHT = soft_l1(function_tolerance=1e-13, max_iterations=1000)
-PARAMETERS = ("rotations", "translations", "log_scales", "intrinsics", "radial", "points")
+PARAMETERS = ("rotations", "translations", "log_scales", "intrinsics", "distortion", "points")
 
 
-def assert_same_optimum(start: BundleProblem, *, refine_focal: bool = False) -> None:
-    initial, final, rec, log_scales = solve_with_ceres(start, refine_focal=refine_focal)
+def assert_same_optimum(start: BundleProblem) -> None:
+    initial, final, rec, log_scales = solve_with_ceres(start)
     result = adjust_bundle(start, TIGHT)
     assert result.converged
     assert result.initial_cost == pytest.approx(initial, rel=1e-12)
@@ -52,12 +56,13 @@ def assert_same_optimum(start: BundleProblem, *, refine_focal: bool = False) -> 
         # the scale is a convention: Ceres may hold another coordinate of the second camera
         centers = [(c - c[0]) / np.linalg.norm(c[1] - c[0]) for c in centers]
     np.testing.assert_allclose(*centers, atol=1e-5)
-    if refine_focal:
-        theirs = [rec.cameras[k + 1].params[0] for k in range(len(start.intrinsics))]
-        np.testing.assert_allclose(result.intrinsics[:, 0], theirs, rtol=1e-5)
-    if start.radial is not None:
-        theirs = [rec.cameras[k + 1].params[3] for k in range(len(start.intrinsics))]
-        np.testing.assert_allclose(result.radial, theirs, atol=1e-5)
+    model = colmap_model(start)
+    for k, (intrinsics, distortion) in enumerate(
+        zip(result.intrinsics, result.distortion, strict=True)
+    ):
+        theirs = model.from_params(np.array(rec.cameras[k + 1].params))
+        np.testing.assert_allclose(intrinsics, theirs[0], rtol=1e-5)
+        np.testing.assert_allclose(distortion, theirs[1], atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -129,9 +134,9 @@ def test_same_optimum_as_ceres_without_depth(seed: int) -> None:
 @pytest.mark.parametrize("depth", [True, False])
 def test_same_optimum_as_ceres_with_focal_length(depth: bool) -> None:
     start = perturb(make_problem(8, 80, 5), 0)
-    start = replace(start, variable_focal=np.array([True]))
+    start = calibrated(start, CameraModel.SIMPLE_PINHOLE)
     start = replace(start, intrinsics=start.intrinsics * [1.05, 1.05, 1, 1])
-    assert_same_optimum(start if depth else without_depth(start), refine_focal=True)
+    assert_same_optimum(start if depth else without_depth(start))
 
 
 @pytest.mark.parametrize("depth", [True, False])
@@ -149,9 +154,9 @@ def test_same_optimum_as_ceres_with_two_cameras(depth: bool, aspect: float) -> N
         intrinsics=np.stack([one.intrinsics[0], other]),
         camera_of_image=camera_of_image,
         obs_xy=np.where(seen_by_other, scaled, one.obs_xy),
-        variable_focal=np.full(2, aspect == 1),
     )
-    assert_same_optimum(start if depth else without_depth(start), refine_focal=aspect == 1)
+    start = calibrated(start, CameraModel.SIMPLE_PINHOLE) if aspect == 1 else start
+    assert_same_optimum(start if depth else without_depth(start))
 
 
 def test_exact_measurements_recover_focal_length_per_camera() -> None:
@@ -161,8 +166,8 @@ def test_exact_measurements_recover_focal_length_per_camera() -> None:
         truth,
         intrinsics=np.repeat(truth.intrinsics, 6, axis=0),
         camera_of_image=np.arange(6),
-        variable_focal=np.ones(6, dtype=np.bool_),
     )
+    truth = calibrated(truth, CameraModel.SIMPLE_PINHOLE)
     wrong = truth.intrinsics * np.linspace(0.9, 1.1, 6)[:, None] ** [1, 1, 0, 0]
     result = adjust_bundle(replace(perturb(truth, 0, 0.5), intrinsics=wrong), TIGHT)
     np.testing.assert_allclose(result.intrinsics, truth.intrinsics, rtol=1e-6)
@@ -172,91 +177,110 @@ def test_exact_measurements_recover_focal_length_per_camera() -> None:
 @pytest.mark.parametrize("depth", [True, False])
 def test_adjust_bundle_with_focal_prior_reaches_ceres_optimum(depth: bool) -> None:
     start = perturb(make_problem(8, 80, 5), 0)
-    start = replace(
-        start,
-        variable_focal=np.array([True]),
-        prior_log_focals=np.log([1.05 * FOCAL]),
-        prior_std_log_focals=0.004,
-    )
-    assert_same_optimum(start if depth else without_depth(start), refine_focal=True)
+    start = calibrated(start, CameraModel.SIMPLE_PINHOLE, prior_std=0.004)
+    start.prior_intrinsics[:, 0] = np.log(1.05 * FOCAL)
+    assert_same_optimum(start if depth else without_depth(start))
+
+
+LENSES = {
+    CameraModel.SIMPLE_RADIAL: [-0.25],
+    CameraModel.RADIAL: [-0.2, 0.05],
+    CameraModel.OPENCV: [-0.1, 0.03, 0.004, -0.006],
+    CameraModel.OPENCV_FISHEYE: [0.03, -0.02, 0.01, -0.003],
+}
+"""Distortion coefficients of a camera of each model."""
 
 
 @pytest.mark.parametrize("depth", [True, False])
-@pytest.mark.parametrize("prior_std", [np.inf, 0.02])
-@pytest.mark.parametrize("radial", [-0.25, -0.034, 0.1])
-def test_adjust_bundle_with_radial_distortion_reaches_ceres_optimum(
-    depth: bool, prior_std: float, radial: float
+@pytest.mark.parametrize("prior_std", [0.5, 0.02])
+@pytest.mark.parametrize("model", LENSES)
+def test_adjust_bundle_with_distortion_reaches_ceres_optimum(
+    depth: bool, prior_std: float, model: CameraModel
 ) -> None:
-    """A SIMPLE_RADIAL camera is refined from zero distortion and a wrong focal length."""
-    start = perturb(distorted(make_problem(8, 120, 5), radial), 0)
-    start = replace(
-        start,
-        intrinsics=start.intrinsics * [1.03, 1.03, 1, 1],
-        radial=np.zeros(1),
-        variable_focal=np.array([True]),
-        variable_radial=np.array([True]),
-        prior_std_radial=prior_std,
-    )
-    assert_same_optimum(start if depth else without_depth(start), refine_focal=True)
+    """Start from no distortion and a wrong focal length, with priors on focal and distortion."""
+    start = distorted(make_problem(8, 120, 5), LENSES[model], fisheye=model.is_fisheye)
+    start = calibrated(perturb(start, 0), model)
+    start = replace(start, prior_std_intrinsics=only_distortion(prior_std))
+    start = replace(start, intrinsics=start.intrinsics * [1.03, 1.03, 1, 1])
+    assert_same_optimum(start if depth else without_depth(start))
 
 
-def test_adjust_bundle_with_exact_distorted_observations_recovers_two_cameras() -> None:
-    truth = exact(with_two_cameras(make_problem(6, 200, 5)))
+@pytest.mark.parametrize("model", LENSES)
+def test_adjust_bundle_with_principal_point_reaches_ceres_optimum(model: CameraModel) -> None:
+    start = distorted(make_problem(8, 120, 5), LENSES[model], fisheye=model.is_fisheye)
+    start = calibrated(perturb(start, 0), model, principal_point=True)
+    start = replace(start, prior_std_intrinsics=only_distortion(0.1))
+    assert_same_optimum(replace(start, intrinsics=start.intrinsics + np.array([20, 20, 15, -10])))
+
+
+@pytest.mark.parametrize("model", LENSES)
+@pytest.mark.parametrize("dense_poses", [500, 0])
+def test_adjust_bundle_with_exact_distorted_observations_recovers_two_cameras(
+    model: CameraModel, dense_poses: int
+) -> None:
+    truth = with_two_cameras(make_problem(6, 200, 5), model)
+    truth = exact(calibrated(truth, model, principal_point=True, distortion=truth.distortion))
     start = replace(
         perturb(truth, 0, 0.5),
-        intrinsics=truth.intrinsics * [[1.05, 1.05, 1, 1], [0.97, 0.97, 1, 1]],
-        radial=np.zeros(2),
+        intrinsics=truth.intrinsics * [[1.05, 1.05, 1.01, 1], [0.97, 0.97, 1, 0.99]],
+        distortion=np.zeros((2, 4)),
     )
-    result = adjust_bundle(start, TIGHT)
-    np.testing.assert_allclose(result.intrinsics, truth.intrinsics, rtol=1e-6)
-    np.testing.assert_allclose(result.radial, truth.radial, atol=1e-6)
-    assert (result.std_radial > 0).all() and (result.std_radial < 0.01).all()
+    options = TIGHT.model_copy(update={"dense_poses": dense_poses})
+    result = adjust_bundle(start, options)
+    np.testing.assert_allclose(result.intrinsics, truth.intrinsics, rtol=1e-5)
+    np.testing.assert_allclose(result.distortion, truth.distortion, atol=1e-5)
+    free = truth.variable_intrinsics
+    assert (result.std_intrinsics[free] > 0).all() and np.isnan(result.std_intrinsics[~free]).all()
 
 
-def test_adjust_bundle_with_constant_radial_distortion_keeps_it() -> None:
-    truth = exact(replace(make_problem(6, 100, 5), radial=np.array([-0.1])))
+def test_adjust_bundle_with_constant_distortion_keeps_it() -> None:
+    truth = exact(replace(make_problem(6, 100, 5), distortion=np.array([[-0.1, 0.0, 0.0, 0.0]])))
     result = adjust_bundle(perturb(truth, 0), TIGHT)
-    assert result.radial.tolist() == [-0.1] and np.isnan(result.std_radial).all()
+    assert result.distortion.tolist() == truth.distortion.tolist()
+    assert np.isnan(result.std_intrinsics).all()
     np.testing.assert_allclose(result.points, truth.points, atol=1e-5)
 
 
-def with_two_cameras(problem: BundleProblem) -> BundleProblem:
-    """Return the problem with two alternating cameras of unknown focal length and distortion."""
-    return replace(
+def only_distortion(std: float) -> Float64:
+    """Return standard deviations (1, 8) of a prior on the distortion coefficients only."""
+    return np.where(np.arange(8) < 4, np.inf, std)[None]
+
+
+def with_two_cameras(
+    problem: BundleProblem, model: CameraModel = CameraModel.SIMPLE_RADIAL
+) -> BundleProblem:
+    """Return the problem with two alternating cameras of opposite distortion."""
+    two = replace(
         problem,
         intrinsics=np.repeat(problem.intrinsics, 2, axis=0),
         camera_of_image=np.arange(len(problem.rotations)) % 2,
-        radial=np.array([-0.1, 0.05]),
-        variable_focal=np.ones(2, dtype=np.bool_),
-        variable_radial=np.ones(2, dtype=np.bool_),
     )
-
-
-def distorted(problem: BundleProblem, radial: float) -> BundleProblem:
-    """Return the problem with radially distorted observations and unchanged noise."""
-    noise = whitened_residuals(problem, robust=False)[:, :2]
-    bent = replace(problem, radial=np.full(len(problem.intrinsics), radial))
-    return replace(bent, obs_xy=exact(bent).obs_xy - noise)
+    coefficients = np.zeros((2, 4))
+    coefficients[:, : model.num_distortion] = LENSES[model]
+    coefficients[1] /= -2
+    return calibrated(two, model, distortion=coefficients)
 
 
 @pytest.mark.parametrize("dense_poses", [500, 0])
-@pytest.mark.parametrize("prior_std", [np.inf, 0.01])
+@pytest.mark.parametrize("model", LENSES)
 def test_adjust_bundle_intrinsic_stds_match_the_dense_hessian(
-    dense_poses: int, prior_std: float
+    dense_poses: int, model: CameraModel
 ) -> None:
-    """The stds equal those of the inverse of J^T J by finite differences over all parameters."""
+    """The inverse of J^T J by finite differences over poses, points and two cameras."""
+    problem = with_two_cameras(make_problem(4, 40, 4), model)
     problem = replace(
-        with_two_cameras(make_problem(4, 40, 4)),
-        prior_std_log_focals=prior_std,
-        prior_std_radial=prior_std,
+        calibrated(problem, model, principal_point=True, distortion=problem.distortion),
+        prior_std_intrinsics=np.tile([0.1, 0.05, 10, 10, 0.1, 0.1, 0.1, 0.1], (2, 1)),
     )
     options = TIGHT.model_copy(update={"dense_poses": dense_poses})
     result = adjust_bundle(problem, options)
     information = dense_information(start_at(problem, result))
-    information[-4:, -4:] += np.eye(4) / prior_std**2
-    expected = np.sqrt(np.diagonal(np.linalg.inv(information))[-4:])
-    np.testing.assert_allclose(result.std_log_focals, expected[:2], rtol=0.01)
-    np.testing.assert_allclose(result.std_radial, expected[2:], rtol=0.01)
+    free = problem.variable_intrinsics.T
+    weights = 1 / problem.prior_std_intrinsics.T[free] ** 2
+    rows = np.arange(-len(weights), 0)
+    information[rows, rows] += weights
+    expected = np.sqrt(np.diagonal(np.linalg.inv(information))[rows])
+    np.testing.assert_allclose(result.std_intrinsics.T[free], expected, rtol=0.01)
 
 
 def test_adjust_bundle_focal_std_is_nan_if_constant_and_infinite_if_unobserved() -> None:
@@ -265,9 +289,9 @@ def test_adjust_bundle_focal_std_is_nan_if_constant_and_infinite_if_unobserved()
         problem,
         intrinsics=np.repeat(problem.intrinsics, 3, axis=0),
         camera_of_image=np.zeros(4, dtype=np.int64),
-        variable_focal=np.array([True, True, False]),
+        variable_intrinsics=np.outer([True, True, False], np.arange(8) == 0),
     )
-    stds = adjust_bundle(problem).std_log_focals
+    stds = adjust_bundle(problem).std_intrinsics[:, 0]
     assert 0 < stds[0] < 0.1 and np.isinf(stds[1]) and np.isnan(stds[2])
 
 
@@ -285,7 +309,7 @@ def assert_fixed(problem: BundleProblem, result: BundleResult, names: tuple[str,
     given = replace(
         problem,
         log_scales=np.zeros(len(problem.rotations)),
-        radial=np.zeros(len(problem.intrinsics)),
+        distortion=np.zeros((len(problem.intrinsics), 4)),
     )
     for name in names:
         np.testing.assert_array_equal(getattr(result, name), getattr(given, name))
@@ -355,7 +379,7 @@ def test_scale_anchor_keeps_one_coordinate_without_cost() -> None:
 @pytest.mark.parametrize("plain", [False, True])
 def test_conjugate_gradients_reach_the_dense_optimum(plain: bool) -> None:
     start = perturb(make_problem(30, 800, 5), 0)
-    start = replace(start, variable_focal=np.array([True]))
+    start = calibrated(start, CameraModel.SIMPLE_PINHOLE)
     start = without_depth(start) if plain else start
     dense = adjust_bundle(start, TIGHT)
     sparse = adjust_bundle(start, TIGHT.model_copy(update={"dense_poses": 0}))
@@ -511,7 +535,7 @@ def test_problem_without_observations_is_unchanged(points: int) -> None:
         obs_point=none,
         obs_xy=np.zeros((0, 2)),
         variable_pose=np.array([True]),
-        variable_focal=np.array([True]),
+        variable_intrinsics=np.ones((1, 8), dtype=np.bool_),
     )
     result = adjust_bundle(start, soft_l1())
     assert_fixed(start, result, PARAMETERS)
@@ -541,12 +565,12 @@ def test_iteration_limit_is_reported() -> None:
         ("obs_std_log_depth", -1.0),
         ("variable_pose", np.ones(5)),
         ("variable_point", np.ones(3, dtype=np.bool_)),
-        ("variable_focal", np.ones(2, dtype=np.bool_)),
-        ("prior_std_log_focals", 0.0),
-        ("prior_log_focals", np.zeros(2)),
-        ("radial", np.zeros(2)),
-        ("variable_radial", np.ones(2, dtype=np.bool_)),
-        ("prior_std_radial", 0.0),
+        ("distortion", np.zeros((1, 3))),
+        ("fisheye", np.ones(2, dtype=np.bool_)),
+        ("variable_intrinsics", np.ones((1, 7), dtype=np.bool_)),
+        ("prior_intrinsics", np.zeros((2, 8))),
+        ("prior_std_intrinsics", 0.0),
+        ("prior_std_intrinsics", np.ones(8)),
         ("log_scales", np.zeros(4)),
         ("expected_log_scales", np.full(5, np.nan)),
         ("std_log_scales", 0.0),
@@ -593,6 +617,8 @@ def degenerate_problems(draw: st.DrawFn) -> BundleProblem:
     elif shape == "on the cameras":
         xyz = centers[rng.integers(0, images, points)]
     far = 10.0 ** draw(st.integers(0, 8))
+    model = draw(st.sampled_from(CameraModel))
+    free = model.free_parameters(principal_point=draw(st.booleans()))
     return BundleProblem(
         rotations=rotations,
         translations=-np.einsum("nij,nj->ni", rotations, centers) * scale,
@@ -607,7 +633,9 @@ def degenerate_problems(draw: st.DrawFn) -> BundleProblem:
         obs_std_log_depth=10.0 ** rng.uniform(-6, 2, count),
         variable_pose=rng.random(images) < draw(st.sampled_from([0.0, 0.5, 1.0])),
         variable_point=rng.random(points) < draw(st.sampled_from([0.0, 0.5, 1.0])),
-        variable_focal=rng.random(images) < draw(st.sampled_from([0.0, 0.5])),
+        distortion=rng.normal(0, 0.1, (images, 4)) * (np.arange(4) < model.num_distortion),
+        fisheye=np.full(images, model.is_fisheye),
+        variable_intrinsics=np.outer(rng.random(images) < draw(st.sampled_from([0.0, 0.5])), free),
     )
 
 

@@ -10,15 +10,24 @@ from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, SchurComplementSolver
 from mpsfm_core.optimize.bundle_problem import PreparedBundle, prepare_bundle, range_executor
 from mpsfm_core.optimize.options import Loss
-from tests.optimize.bundle_reference import make_problem, perturb, rotation, soft_l1
+from tests.optimize.bundle_reference import (
+    distort_reference,
+    make_problem,
+    perturb,
+    rotation,
+    soft_l1,
+)
 
 STEP = 1e-6
 
 
 def small_problem() -> BundleProblem:
-    """Everything at once: two cameras with focal lengths to refine, a constant and variable
-    poses, scales of depth and points, a track that sees an image twice, missing depth, a single
-    view."""
+    """Return a small problem with every kind of variable and observation.
+
+    The problem has an OPENCV and a fisheye camera with variable intrinsics, a constant pose,
+    variable depth scales, a track that observes an image twice, missing depth, and a point in a
+    single view.
+    """
     problem = perturb(make_problem(5, 12, 3), seed=3)
     # the longest track has two observations in its last image
     point = np.bincount(problem.obs_point).argmax()
@@ -40,7 +49,10 @@ def small_problem() -> BundleProblem:
         obs_log_depth=log_depth,
         obs_std_log_depth=rng.uniform(0.02, 0.1, len(keep)),
         variable_point=np.arange(12) != 5,
-        variable_focal=np.array([True, True]),
+        distortion=np.array([[-0.1, 0.02, 0.004, -0.003], [0.05, -0.03, 0.01, 0.002]]),
+        fisheye=np.array([False, True]),
+        variable_intrinsics=np.ones((2, 8), dtype=np.bool_),
+        prior_std_intrinsics=np.tile([0.05, 0.01, 5, 5, 0.01, 0.01, 0.01, 0.01], (2, 1)),
         log_scales=rng.normal(0, 0.05, 5),
         expected_log_scales=rng.normal(0, 0.05, 5),
         std_log_scales=rng.uniform(0.05, 0.1, 5),
@@ -70,24 +82,33 @@ def sights(
 
 
 def residuals(p: PreparedBundle, state: kernels.BundleParameters) -> Float64:
-    """Compute whitened residuals (3 m + s,) with numpy, those of scales last."""
+    """(3 m + s,) whitened residuals in plain numpy, those of scales and intrinsics last."""
     obs, layout = p.bundle.obs, p.bundle.layout
     points = np.repeat(np.arange(len(state.points)), np.diff(obs.start))
     camera = np.einsum("mij,mj->mi", state.rotations[obs.image], state.points[points])
     camera += state.translations[obs.image]
     k = state.intrinsics[layout.camera_of_image[obs.image]]
-    xy = k[:, :2] * camera[:, :2] / camera[:, 2:] + k[:, 2:]
+    uv = camera[:, :2] / camera[:, 2:]
+    coefficients = state.distortion[layout.camera_of_image[obs.image]]
+    is_fisheye = layout.fisheye[layout.camera_of_image[obs.image], None]
+    uv = np.where(
+        is_fisheye,
+        distort_reference(uv, coefficients, fisheye=True),
+        distort_reference(uv, coefficients, fisheye=False),
+    )
+    xy = k[:, :2] * uv + k[:, 2:]
     pixel = (xy - obs.xy) * obs.weight[:, None]
     scaled = obs.log_depth + state.log_scales[obs.image]
     depth = (np.log(camera[:, 2]) - scaled) * obs.depth_weight
     prior = p.scale_prior
     scales = (state.log_scales[prior.image] - prior.log_scale) * np.sqrt(prior.weight)
-    return np.concatenate([np.column_stack([pixel, depth]).ravel(), scales])
+    priors = [prior.residuals(state) * np.sqrt(prior.weight) for prior in p.intrinsic_priors]
+    return np.concatenate([np.column_stack([pixel, depth]).ravel(), scales, *priors])
 
 
 def numeric_jacobian(p: PreparedBundle) -> Float64:
-    """Compute the Jacobian (3 m + s, d + 3 v) of camera parameters, then of variable points."""
-    poses, focals = len(p.bundle.layout.pair), int(p.bundle.layout.focal_slot.max()) + 1
+    """Jacobian (3 m + s, d + 3 v) of the residuals: camera side, then variable points."""
+    poses, focals = len(p.bundle.layout.pair), int(p.bundle.layout.intrinsic_slot.max()) + 1
     size = kernels.NUM_IMAGE_PARAMS * poses + focals
     variable = np.flatnonzero(p.bundle.layout.variable_point)
     columns = []
@@ -122,7 +143,9 @@ def test_gradient_of_every_loss_equals_finite_differences(
 
     def cost(delta: Float64, points: Float64) -> float:
         state = moved(p, delta, points)
-        return p.scale_prior.cost(state) + sum(sight.cost for sight in sights(p, state))
+        priors = [p.scale_prior, *p.intrinsic_priors]
+        total = sum(prior.cost(state) for prior in priors)
+        return total + sum(sight.cost for sight in sights(p, state))
 
     size = len(normal.total.gradient)
     numeric = np.empty_like(gradient)

@@ -70,7 +70,7 @@ def make_scene(
         rotations=np.array(poses)[:, :, :3],
         translations=np.array(poses)[:, :, 3],
         intrinsics=np.array([[FOCAL_PX, FOCAL_PX, *CENTER]]),
-        radial=np.zeros(1),
+        distortion=np.zeros((1, 4)),
         camera_of_image=np.zeros(NUM_IMAGES, dtype=np.int64),
         points=points[used],
         obs_image=np.concatenate(images)[shared],
@@ -79,9 +79,9 @@ def make_scene(
         obs_std_px=np.ones(len(observed)),
         variable_pose=np.arange(NUM_IMAGES) > 0,
         scale_anchor=NUM_IMAGES - 1,
-        variable_focal=UNKNOWN ^ True,
-        prior_log_focals=np.log([FOCAL_PX]),
-        prior_std_log_focals=0.7,
+        variable_intrinsics=np.arange(8)[None] == 0,
+        prior_intrinsics=np.array([[np.log(FOCAL_PX), 0.0, *CENTER, 0.0, 0.0, 0.0, 0.0]]),
+        prior_std_intrinsics=0.7,
     )
 
 
@@ -122,7 +122,7 @@ def focal_errors(num_scenes: int, **changes: float) -> tuple[Float64, Float64, F
         assert errors is not None
         true.append(np.log(result.intrinsics[0, 0] / FOCAL_PX))
         predicted.append(errors.log_focal[0])
-        stated.append(result.std_log_focals[0])
+        stated.append(result.std_intrinsics[0, 0])
     return np.array(true), np.array(predicted), np.array(stated)
 
 
@@ -171,7 +171,7 @@ def test_predict_calibration_errors_of_a_right_camera_are_small() -> None:
 
 
 def test_predict_calibration_errors_of_a_known_camera_come_from_noise_only() -> None:
-    scene = replace(make_scene(0, center_px=30.0), variable_focal=None)
+    scene = replace(make_scene(0, center_px=30.0), variable_intrinsics=None)
     solved = start_at(scene, adjust_bundle(scene, OPTIONS))
     errors = predict_calibration_errors(solved, OPTIONS, KNOWN, np.array([WIDTH]))
     assert errors is not None

@@ -12,7 +12,8 @@ import pycolmap
 import pytest
 
 import mpsfm_core as mpsfm
-from mpsfm_core.data import MappingProblem
+from mpsfm_core.data import Float64, MappingProblem
+from mpsfm_core.data.camera_models import CameraModel, IntrinsicParameter
 from mpsfm_core.data.options import SettingsError
 from mpsfm_core.geometry import pixel_centers, project, sample_nearest, scale_pixels, transform
 from mpsfm_core.inputs.images import ImageSet, SourceImage
@@ -22,7 +23,6 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     CalibrationOutcome,
     IntrinsicEstimate,
-    IntrinsicParameter,
 )
 from mpsfm_core.mapping.scene.reconstruction import CalibratedParameter, MappingResult
 from mpsfm_core.results.original_images import OriginalImages
@@ -41,6 +41,11 @@ FOCAL_PX, RADIAL = 140.0, -0.12
 TRUE = pycolmap.Camera(
     model="SIMPLE_RADIAL", width=160, height=120, params=[FOCAL_PX, 80, 60, RADIAL], camera_id=1
 )
+
+
+def coefficients(radial: float) -> Float64:
+    """Return the distortion coefficients of a SIMPLE_RADIAL camera."""
+    return np.array([radial, 0.0, 0.0, 0.0])
 
 
 @pytest.fixture
@@ -69,7 +74,9 @@ def mapped(solved, images: ImageSet) -> tuple[MappingProblem, MappingResult]:
         keypoints = solved.problem.images[image.index].keypoints.copy()
         keypoints[seen] = TRUE.img_from_cam(local[image.point_ids[seen]])
         views[image.index] = replace(views[image.index], keypoints=keypoints)
-        registered.append(replace(image, camera=pinhole, radial=RADIAL, calibration=calibration))
+        registered.append(
+            replace(image, camera=pinhole, distortion=coefficients(RADIAL), calibration=calibration)
+        )
     model = replace(solved.best, images=tuple(registered))
     return replace(solved.problem, images=tuple(views)), MappingResult(
         (model,), solved.result.report
@@ -84,7 +91,7 @@ def test_undistort_problem_moves_keypoints_to_the_refined_pinhole_camera(images,
     for image in model.images:
         view = moved.images[image.index]
         assert image.camera == refined[image.index].pinhole == view.camera
-        assert view.radial == image.radial == RADIAL
+        assert view.distortion[0] == image.distortion[0] == RADIAL
         assert view.focal_prior_px == problem.images[image.index].focal_prior_px
         seen = image.point_ids >= 0
         points = model.points[image.point_ids[seen]]
@@ -102,15 +109,83 @@ def test_undistort_images_gives_unregistered_images_the_shared_camera(images, ma
 def test_undistort_images_again_replaces_the_coefficient(images, mapped) -> None:
     """A second mapping of undistorted views refines the camera of the original images."""
     problem, mapping = mapped
-    first = replace(mapping.reconstructions[0].images[0], radial=-0.1)
+    first = replace(mapping.reconstructions[0].images[0], distortion=coefficients(-0.1))
     other = replace(mapping.reconstructions[0], images=(first,))
     views = undistort_images(images, problem, [other])
-    refined = undistort_images(views, problem, mapping.reconstructions)
+    camera = replace(views[0].pinhole, fx=FOCAL_PX, fy=FOCAL_PX)
+    second = replace(mapping.reconstructions[0].images[0], camera=camera)
+    refined = undistort_images(
+        views, problem, [replace(mapping.reconstructions[0], images=(second,))]
+    )
     np.testing.assert_allclose(refined[0].camera.params, TRUE.params)
     xy = np.array([[30.0, 20.0], [80.0, 60.0]])
     np.testing.assert_allclose(
         refined[0].original_pixels(refined[0].view_pixels(xy)), xy, atol=1e-6
     )
+
+
+@pytest.mark.parametrize(
+    ("guess", "true"),
+    [
+        (
+            GUESS,
+            pycolmap.Camera(
+                model="OPENCV",
+                width=160,
+                height=120,
+                params=[140, 141, 82, 59, -0.1, 0.03, 0.004, -0.006],
+                camera_id=1,
+            ),
+        ),
+        (
+            pycolmap.Camera(
+                model="OPENCV_FISHEYE",
+                width=160,
+                height=120,
+                params=[150, 150, 80, 60, 0, 0, 0, 0],
+                camera_id=1,
+            ),
+            pycolmap.Camera(
+                model="OPENCV_FISHEYE",
+                width=160,
+                height=120,
+                params=[140, 141, 82, 59, 0.05, -0.02, 0.01, 0.001],
+                camera_id=1,
+            ),
+        ),
+    ],
+    ids=["OPENCV", "OPENCV_FISHEYE"],
+)
+def test_undistort_images_takes_all_parameters_of_the_camera_model(
+    solved, images: ImageSet, guess: pycolmap.Camera, true: pycolmap.Camera
+) -> None:
+    model = CameraModel(true.model_name)
+    views = images.with_cameras(dict.fromkeys(images.names, guess))
+    view = views[0].pinhole
+    intrinsics, distortion = model.from_params(np.array(true.params))
+    shift = np.array([view.cx, view.cy]) - guess.params[-6:-4] if model.is_fisheye else np.zeros(2)
+    center = intrinsics[2:] + (shift if model.is_fisheye else 0.0)
+    pinhole = replace(view, fx=140.0, fy=141.0, cx=center[0], cy=center[1])
+    registered = replace(
+        solved.best.images[0], camera=pinhole, camera_model=model, distortion=distortion
+    )
+    problem = replace(
+        solved.problem,
+        images=tuple(
+            replace(i, camera=view, focal_known=False, camera_model=model)
+            for i in solved.problem.images
+        ),
+    )
+    refined = undistort_images(views, problem, [replace(solved.best, images=(registered,))])
+    assert refined[0].camera.model_name == true.model_name
+    np.testing.assert_allclose(refined[0].camera.params, true.params, atol=1e-9)
+    moved = undistort_problem(views, refined, problem).images[0]
+    pixels = [views[0].original_pixels(problem.images[0].keypoints)]
+    pixels += [refined[0].original_pixels(moved.keypoints)]
+    inside = ((pixels[0] > 0) & (pixels[0] < [160, 120])).all(axis=1)
+    assert inside.sum() > 20
+    np.testing.assert_allclose(pixels[1][inside], pixels[0][inside], atol=1e-5)
+    assert moved.distortion == pytest.approx(tuple(distortion))
 
 
 def test_undistort_problem_moves_depth_along_its_rays(images, mapped) -> None:

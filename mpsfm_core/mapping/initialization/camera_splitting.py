@@ -16,6 +16,7 @@ from dataclasses import replace
 import numpy as np
 
 from mpsfm_core.data import Float64, Int64, MappingImage, MappingProblem, PinholeCamera, Pose
+from mpsfm_core.data.camera_models import to_distortion
 from mpsfm_core.geometry.distortion import change_distortion
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration.pose_hypotheses import (
@@ -58,20 +59,26 @@ def find_deviating_focals(
     guessed = [image.shared_camera for image in problem.images if not image.focal_known]
     num_images = Counter(guessed)
     cameras = {problem.images[i.index].shared_camera: i.camera for i in model.images}
-    radials = {problem.images[i.index].shared_camera: i.radial for i in model.images}
+    distortions = {
+        problem.images[i.index].shared_camera: to_distortion(i.distortion) for i in model.images
+    }
     correspondences = _collect_correspondences(problem, model)
     focals = {}
     for index, (keypoints, points) in correspondences.items():
         image = problem.images[index]
         camera = cameras.get(image.shared_camera, image.camera)
-        if image.focal_known or num_images[image.shared_camera] < 2:
+        if (
+            image.focal_known
+            or image.camera_model.is_fisheye
+            or num_images[image.shared_camera] < 2
+        ):
             continue
         if len(keypoints) < options.min_inliers:
             continue
         step = max(1, len(keypoints) // MAX_FOCAL_CORRESPONDENCES)
         xy, xyz = image.keypoints[keypoints[::step]], model.points[points[::step]]
-        radial = radials.get(image.shared_camera, image.radial)
-        xy = change_distortion(xy, (image.camera, image.radial), (camera, radial))
+        distortion = distortions.get(image.shared_camera, image.distortion)
+        xy = change_distortion(xy, (image.camera, image.distortion), (camera, distortion))
         max_error_px = MAX_ERROR_PX * image.keypoint_std_px
         shared = estimate_absolute_pose(camera, xy, xyz, options, seed)
         support = _measure_support(camera, shared[:2], xy, xyz, max_error_px) if shared else 0.0

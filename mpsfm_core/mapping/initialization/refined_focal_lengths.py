@@ -8,13 +8,13 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Bool, MappingImage, MappingProblem, VerifiedPair
+from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.mapping.initialization.camera_splitting import (
     find_deviating_focals,
     split_cameras,
 )
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.scene.estimated_intrinsics import IntrinsicParameter
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 
 MIN_FOCAL_CHANGE = 1.1

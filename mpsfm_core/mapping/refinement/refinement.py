@@ -14,14 +14,18 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.depth_noise import DepthNoise, measure_depth_noise
 from mpsfm_core.mapping.refinement.filtering import filter_points
 from mpsfm_core.mapping.refinement.keypoint_noise import measure_loss_scale
-from mpsfm_core.mapping.refinement.self_calibration import calibrate_cameras, has_guessed_camera
+from mpsfm_core.mapping.refinement.self_calibration import (
+    calibrate_cameras,
+    compute_intrinsic_priors,
+    has_guessed_camera,
+)
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     MIN_FOCAL_IMAGES,
-    IntrinsicParameter,
     PredictedErrors,
 )
 from mpsfm_core.mapping.scene.local_bundle import find_local_bundle
@@ -246,6 +250,7 @@ class Refiner:
                 options,
                 bundle.representatives,
                 refine_distortion=self.options.refine_distortion,
+                refine_principal_point=self.options.refine_principal_point,
             )
         else:
             result = adjust_bundle(bundle.problem, options)
@@ -265,11 +270,8 @@ class Refiner:
         if bundle is None:
             return predicted
         cameras = [scene.problem.images[image] for image in bundle.representatives]
-        problem = replace(
-            bundle.problem,
-            prior_log_focals=np.log([image.focal_prior_px for image in cameras]),
-            prior_std_log_focals=np.array([image.focal_log_std for image in cameras]),
-        )
+        means, stds = compute_intrinsic_priors(cameras)
+        problem = replace(bundle.problem, prior_intrinsics=means, prior_std_intrinsics=stds)
         errors = predict_calibration_errors(
             problem,
             self._scale_losses(),
@@ -331,7 +333,8 @@ class Refiner:
             rotations=scene.rotations[images],
             translations=scene.translations[images],
             intrinsics=scene.intrinsics[images][first],
-            radial=scene.radial[images][first],
+            distortion=scene.distortion[images][first],
+            fisheye=scene.fisheye[images][first],
             camera_of_image=camera_rows,
             points=tracks.xyz[points],
             obs_image=image_rows,

@@ -4,23 +4,25 @@ Bundle adjustment estimates log focal lengths with a normal prior, whose standar
 on the source of the guess (EXIF, a network, or a default). A camera takes the estimated focal
 length if the observations determine the focal length better than the prior, and if a lens of this
 focal length exists. Guessed focal lengths that a camera keeps are fixed, and the remaining focal
-lengths are estimated again. The radial distortion of a camera with a refined focal length also
-takes an estimate that is well determined and plausible.
+lengths are estimated again. A camera with a refined focal length also takes the other parameters of
+its camera model (distortion, aspect ratio and, on request, principal point) that are well
+determined and plausible.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Int64, MappingImage
+from mpsfm_core.data import Bool, Float64, Int64, MappingImage
+from mpsfm_core.data.camera_models import IntrinsicParameter, intrinsic_parameters
 from mpsfm_core.geometry.focal_length import compute_equivalent_mm, is_plausible_equivalent
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     MIN_FOCAL_IMAGES,
     CalibrationOutcome,
     IntrinsicEstimate,
-    IntrinsicParameter,
 )
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.optimize.bundle_adjustment import (
@@ -34,12 +36,21 @@ from mpsfm_core.optimize.options import BundleOptions
 MAX_STD_RATIO = 0.5
 """Ratio of posterior and prior standard deviation above which an intrinsic parameter keeps its
 guess. At a ratio of 0.5, the observations add three times the information of the prior. [ours]"""
-RADIAL_PRIOR_STD = 0.1
-"""Standard deviation of the zero-mean prior on the radial distortion. The radial distortion of
-phones and zoom lenses stays below 0.05 in magnitude, that of action cameras below 0.3. [ours]"""
-MAX_RADIAL = 0.6
-"""Largest plausible magnitude of the radial distortion, because SIMPLE_RADIAL does not describe
-stronger distortion. [ours]"""
+DISTORTION_PRIOR_STD = 0.1
+"""Standard deviation of the zero-mean prior on radial distortion coefficients. The coefficient k1
+of phones and zoom lenses stays below 0.05 in magnitude, that of action cameras below 0.3. [ours]"""
+TANGENTIAL_PRIOR_STD = 0.01
+"""Standard deviation of the zero-mean prior on tangential distortion coefficients. [ours]"""
+ASPECT_PRIOR_STD = 0.01
+"""Standard deviation of the prior on ``log(fy / fx)``. [ours]"""
+PRINCIPAL_POINT_PRIOR_STD = 0.02
+"""Standard deviation of the prior on the principal point, relative to the longer image side. The
+mean of the prior is the image center. [ours]"""
+MAX_PRIOR_DEVIATION = 6.0
+"""Largest plausible deviation of an intrinsic parameter from the mean of its prior, in standard
+deviations of the prior. The coefficient of SIMPLE_RADIAL may be up to 0.6. [ours]"""
+FOCAL = IntrinsicParameter.FOCAL_LENGTH
+CENTER = [IntrinsicParameter.PRINCIPAL_POINT_X, IntrinsicParameter.PRINCIPAL_POINT_Y]
 
 
 def has_guessed_camera(scene: Scene, images: Int64) -> Bool:
@@ -55,94 +66,141 @@ def calibrate_cameras(
     representatives: Int64,
     *,
     refine_distortion: bool,
+    refine_principal_point: bool,
 ) -> BundleResult:
     """Run bundle adjustment with guessed intrinsics, and apply well-determined estimates.
 
-    The radial distortion of a camera becomes variable after its focal length is refined, because
-    radial distortion would otherwise compensate a wrong focal length. A camera of fewer than
-    ``MIN_FOCAL_IMAGES`` images keeps its radial distortion, because systematic errors of few images
-    resemble distortion. An intrinsic parameter whose estimate is implausible or undetermined keeps
-    the guess, and bundle adjustment is repeated with this parameter fixed. The outcome of each
-    camera is recorded in the scene.
+    The other intrinsic parameters of a camera become variable after its focal length is refined,
+    because they would otherwise compensate a wrong focal length. A camera of fewer than
+    ``MIN_FOCAL_IMAGES`` images only estimates its focal length, because systematic errors of few
+    images resemble distortion. An intrinsic parameter whose estimate is implausible or undetermined
+    keeps the guess, and bundle adjustment is repeated with this parameter fixed. The outcome of
+    each camera is recorded in the scene.
 
     Args:
         scene: The scene, which receives the refined intrinsics.
         problem: The bundle adjustment problem with constant intrinsics.
         options: Options of bundle adjustment.
         representatives: (k,) index of one image of each camera of the problem.
-        refine_distortion: Refine radial distortions in addition to focal lengths.
+        refine_distortion: Refine the distortion of the camera models.
+        refine_principal_point: Refine principal points.
     """
     images = [scene.problem.images[image] for image in representatives]
-    guessed_radials = np.array([image.radial for image in images])
-    focal = has_guessed_camera(scene, representatives)
-    num_images = np.bincount(problem.camera_of_image, minlength=len(images))
-    may_distort = focal & refine_distortion & (num_images >= MIN_FOCAL_IMAGES)
-    is_refined = scene.estimated_intrinsics.is_refined(IntrinsicParameter.FOCAL_LENGTH)
-    radial = may_distort & is_refined[representatives]
-    problem = replace(
-        problem,
-        prior_log_focals=np.log([image.focal_prior_px for image in images]),
-        prior_std_log_focals=np.array([image.focal_log_std for image in images]),
-        prior_std_radial=RADIAL_PRIOR_STD,
+    free = np.array(
+        [i.camera_model.free_parameters(principal_point=refine_principal_point) for i in images]
     )
+    free[:, IntrinsicParameter.RADIAL_DISTORTION :] &= refine_distortion
+    free &= has_guessed_camera(scene, representatives)[:, None]
+    num_images = np.bincount(problem.camera_of_image, minlength=len(images))
+    free[:, 1:] &= (num_images >= MIN_FOCAL_IMAGES)[:, None]
+    estimated = free.copy()
+    active = free.copy()
+    active[:, 1:] &= scene.estimated_intrinsics.is_refined(FOCAL)[representatives][:, None]
+    means, stds = compute_intrinsic_priors(images)
+    problem = replace(problem, prior_intrinsics=means, prior_std_intrinsics=stds)
     while True:
-        problem = replace(problem, variable_focal=focal, variable_radial=radial)
+        problem = replace(problem, variable_intrinsics=active)
         result = adjust_bundle(problem, options)
-        refuses_focal, refuses_radial = _decide(scene, result, images, representatives, problem)
-        may_distort &= ~refuses_radial & (focal & ~refuses_focal)
-        if refuses_focal.any() or refuses_radial.any():
-            radials = np.where(may_distort, scene.radial[representatives], guessed_radials)
-            problem = replace(problem, radial=radials)
-            focal, radial = focal & ~refuses_focal, radial & may_distort
-        elif (may_distort & ~radial).any():
+        refused = _decide(scene, result, images, representatives, problem)
+        free &= ~refused
+        free[:, 1:] &= free[:, :1]
+        if refused.any():
+            problem = _reset_intrinsics(scene, problem, images, representatives, estimated & ~free)
+            active = active & free
+        elif (free & ~active).any():
             problem = start_at(problem, result)
-            radial = may_distort
+            active = free.copy()
         else:
             break
-    for row, image in enumerate(map(int, representatives)):
-        if focal[row]:
-            scene.set_shared_intrinsics(image, result.intrinsics[row, :2], result.radial[row])
+    for row in map(int, np.flatnonzero(active[:, FOCAL])):
+        image = int(representatives[row])
+        scene.set_shared_intrinsics(image, result.intrinsics[row], result.distortion[row])
     return result
+
+
+def compute_intrinsic_priors(images: Sequence[MappingImage]) -> tuple[Float64, Float64]:
+    """Compute means and standard deviations (k, 8) of the priors on intrinsic parameters."""
+    means = intrinsic_parameters(np.array([image.camera.params for image in images]), None)
+    means[:, FOCAL] = np.log([image.focal_prior_px for image in images])
+    stds = np.full(means.shape, DISTORTION_PRIOR_STD)
+    for row, image in enumerate(images):
+        center_std = PRINCIPAL_POINT_PRIOR_STD * max(image.camera.size)
+        stds[row, :4] = image.focal_log_std, ASPECT_PRIOR_STD, center_std, center_std
+        if not image.camera_model.is_fisheye:
+            stds[row, 6:] = TANGENTIAL_PRIOR_STD
+    return means, stds
+
+
+def _reset_intrinsics(
+    scene: Scene,
+    problem: BundleProblem,
+    images: Sequence[MappingImage],
+    representatives: Int64,
+    refused: Bool,
+) -> BundleProblem:
+    """Return the problem with the intrinsics of the scene, and guesses for refused parameters.
+
+    Refused focal lengths keep the value of the problem.
+    """
+    intrinsics = problem.intrinsics.copy()
+    for row, image in enumerate(images):
+        fx, fy, *center = image.camera.params
+        if refused[row, IntrinsicParameter.ASPECT_RATIO]:
+            intrinsics[row, 1] = intrinsics[row, 0] * fy / fx
+        current = scene.intrinsics[representatives[row], 2:]
+        intrinsics[row, 2:] = np.where(refused[row, CENTER], center, current)
+    distortion = np.where(
+        refused[:, IntrinsicParameter.RADIAL_DISTORTION :],
+        [image.distortion for image in images],
+        scene.distortion[representatives],
+    )
+    return replace(problem, intrinsics=intrinsics, distortion=distortion)
 
 
 def _decide(
     scene: Scene,
     result: BundleResult,
-    images: list[MappingImage],
+    images: Sequence[MappingImage],
     representatives: Int64,
     problem: BundleProblem,
-) -> tuple[Bool, Bool]:
+) -> Bool:
     """Record the outcome of each variable intrinsic parameter, and return those refused.
 
-    If the focal length of a camera with variable radial distortion is refused, only the radial
-    distortion is fixed at first, because the focal length may be determined without distortion.
+    If the focal length of a camera is refused, only its other variable parameters are fixed at
+    first, because the focal length may be determined without them. If only other parameters are
+    refused, the last one is fixed first, because the others may be determined without it.
 
     Returns:
-        Masks (k,) of the cameras whose focal length, and whose radial distortion is refused.
+        Mask (k, 8) of the refused intrinsic parameters.
     """
-    assert problem.variable_focal is not None and problem.variable_radial is not None
-    refuses_focal, refuses_radial = np.zeros((2, len(images)), dtype=np.bool_)
-    for row in map(int, np.flatnonzero(problem.variable_focal)):
-        image, focal_px = images[row], float(result.intrinsics[row, 0])
+    variable, means = problem.variable_intrinsics, problem.prior_intrinsics
+    assert variable is not None and means is not None
+    values = intrinsic_parameters(result.intrinsics, result.distortion)
+    stds = np.asarray(problem.prior_std_intrinsics)
+    refused = np.zeros_like(variable)
+    for row in map(int, np.flatnonzero(variable[:, FOCAL])):
         sharing = scene.shares_camera(int(representatives[row]))
-        focal = judge_estimate(
-            focal_px,
-            float(result.std_log_focals[row]),
-            image.focal_log_std,
-            is_plausible_equivalent(compute_equivalent_mm(focal_px, *image.camera.size)),
-        )
-        scene.estimated_intrinsics.set(sharing, IntrinsicParameter.FOCAL_LENGTH, focal)
-        refuses_focal[row] = focal.outcome != CalibrationOutcome.REFINED
-        if problem.variable_radial[row]:
-            value = float(result.radial[row])
-            std = float(result.std_radial[row])
-            radial = judge_estimate(value, std, RADIAL_PRIOR_STD, abs(value) <= MAX_RADIAL)
-            if refuses_focal[row]:
-                radial = radial._replace(outcome=CalibrationOutcome.NOT_OBSERVABLE)
-            scene.estimated_intrinsics.set(sharing, IntrinsicParameter.RADIAL_DISTORTION, radial)
-            refuses_radial[row] = radial.outcome != CalibrationOutcome.REFINED
-            refuses_focal[row] = False
-    return refuses_focal, refuses_radial
+        for column in map(int, np.flatnonzero(variable[row])):
+            parameter, value = IntrinsicParameter(column), float(values[row, column])
+            if parameter == FOCAL:
+                value = float(result.intrinsics[row, 0])
+                size = images[row].camera.size
+                is_plausible = is_plausible_equivalent(compute_equivalent_mm(value, *size))
+            else:
+                deviation = abs(value - means[row, column])
+                is_plausible = bool(deviation <= MAX_PRIOR_DEVIATION * stds[row, column])
+            std = float(result.std_intrinsics[row, column])
+            estimate = judge_estimate(value, std, float(stds[row, column]), is_plausible)
+            if parameter != FOCAL and refused[row, FOCAL]:
+                estimate = estimate._replace(outcome=CalibrationOutcome.NOT_OBSERVABLE)
+            scene.estimated_intrinsics.set(sharing, parameter, estimate)
+            refused[row, column] = estimate.outcome != CalibrationOutcome.REFINED
+        others = np.flatnonzero(refused[row, 1:]) + 1
+        if refused[row, FOCAL] and len(others):
+            refused[row, FOCAL] = False
+        elif len(others):
+            refused[row, others[:-1]] = False
+    return refused
 
 
 def judge_estimate(

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, PosedImage, SceneState
+from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.data.decisions import CameraReason, Reason
 from mpsfm_core.geometry.focal_length import compute_equivalent_mm
 from mpsfm_core.geometry.statistics import MAD_TO_STD
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     MIN_FOCAL_IMAGES,
     CalibrationOutcome,
-    IntrinsicParameter,
+    IntrinsicEstimate,
     PredictedErrors,
 )
 from mpsfm_core.mapping.scene.reconstruction import (
@@ -122,7 +123,8 @@ def convert_image(
         point_ids=scene.tracks.point_of[scene.graph.keypoints_of(index)].copy(),
         depth=DepthPrior.from_arrays(depth, variance, depth_map.valid, metric=in_metres),
         scale=depth_map.scale * factor,
-        radial=float(scene.radial[index]),
+        camera_model=image.camera_model,
+        distortion=scene.distortion[index].copy(),
         pose_error_deg=pose_error_deg if np.isfinite(pose_error_deg) else None,
         calibration={
             p: _describe_calibration(scene, index, p, float(errors.stds[index, p]))
@@ -140,15 +142,26 @@ def _describe_calibration(
     the posterior standard deviation of bundle adjustment. The focal length also has a predicted
     standard deviation if bundle adjustment did not estimate the focal length.
     """
-    get_reason = {
-        IntrinsicParameter.FOCAL_LENGTH: _get_focal_reason,
-        IntrinsicParameter.RADIAL_DISTORTION: _get_radial_reason,
-    }[parameter]
     estimate = scene.estimated_intrinsics.get(index, parameter)
     is_stated = parameter == IntrinsicParameter.FOCAL_LENGTH or np.isfinite(estimate.std)
     if is_stated and np.isfinite(predicted_std) and not scene.problem.images[index].focal_known:
         estimate = estimate._replace(std=predicted_std)
-    return CalibratedParameter(estimate, get_reason(scene, index))
+    if parameter == IntrinsicParameter.FOCAL_LENGTH:
+        return CalibratedParameter(estimate, _get_focal_reason(scene, index))
+    if parameter == IntrinsicParameter.RADIAL_DISTORTION:
+        return CalibratedParameter(estimate, _get_radial_reason(scene, index))
+    return CalibratedParameter(estimate, _get_reason(parameter, estimate))
+
+
+def _get_reason(parameter: IntrinsicParameter, estimate: IntrinsicEstimate) -> Reason | None:
+    """Return why an estimated parameter is not refined, or None if refined or not estimated."""
+    outcome, value, std = estimate
+    name = parameter.name.lower()
+    if outcome == CalibrationOutcome.NOT_OBSERVABLE:
+        return CameraReason.PARAMETER_NOT_OBSERVABLE.because(parameter=name, std=round(std, 4))
+    if outcome == CalibrationOutcome.OUT_OF_RANGE:
+        return CameraReason.PARAMETER_OUT_OF_RANGE.because(parameter=name, value=round(value, 4))
+    return None
 
 
 def _get_focal_reason(scene: Scene, index: int) -> Reason | None:

@@ -8,23 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.mapping.state import StateDict
 
 MIN_FOCAL_IMAGES = 3
 """Minimum number of registered images for the refinement of guessed intrinsics. [ours]"""
-
-
-class IntrinsicParameter(IntEnum):
-    """Intrinsic parameter of a camera that bundle adjustment estimates.
-
-    The integer of a parameter is its column in the arrays of :class:`EstimatedIntrinsics`. The
-    lower-case name of a parameter is the prefix of its keys in ``summary.json``.
-    """
-
-    FOCAL_LENGTH = 0
-    """Focal length ``fx`` in pixels, with the standard deviation of its logarithm."""
-    RADIAL_DISTORTION = 1
-    """Coefficient of the radial distortion (SIMPLE_RADIAL)."""
 
 
 class CalibrationOutcome(IntEnum):

@@ -17,15 +17,21 @@ from mpsfm_core.data import (
     Pose,
     VerifiedPair,
 )
+from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel, IntrinsicParameter
 from mpsfm_core.data.decisions import CameraReason, Reason, reason_from_json
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     CalibrationOutcome,
     IntrinsicEstimate,
-    IntrinsicParameter,
 )
 from mpsfm_core.mapping.state import StateDict, reasons_from_json, reasons_to_json
 
 _NO_ROWS = np.zeros(0, np.int64)
+VIEW_PARAMETERS = (
+    IntrinsicParameter.ASPECT_RATIO,
+    IntrinsicParameter.PRINCIPAL_POINT_X,
+    IntrinsicParameter.PRINCIPAL_POINT_Y,
+)
+"""Intrinsic parameters without distortion whose refinement changes the undistorted view."""
 _REASON_FIELDS = ("image_reasons", "pair_reasons")
 
 
@@ -89,9 +95,12 @@ class RegisteredImage:
     pose_error_deg: float | None = None
     """Predicted root mean square of the relative pose error with other images in degrees, or None
     without a prediction."""
-    radial: float = 0.0
-    """Radial distortion coefficient (SIMPLE_RADIAL) of the original image. The keypoints were
-    undistorted with an initial coefficient, which the mapper refines."""
+    camera_model: CameraModel = CameraModel.SIMPLE_RADIAL
+    """COLMAP camera model whose parameters self-calibration estimates."""
+    distortion: Float64 = field(default_factory=lambda: np.zeros(NUM_DISTORTION))
+    """(4,) float64 distortion coefficients of the original image, as in
+    :attr:`mpsfm_core.data.MappingImage.distortion`. The keypoints were undistorted with initial
+    coefficients, which the mapper refines."""
     calibration: Mapping[IntrinsicParameter, CalibratedParameter] = field(
         default_factory=lambda: dict.fromkeys(
             IntrinsicParameter, CalibratedParameter(IntrinsicEstimate())
@@ -99,16 +108,29 @@ class RegisteredImage:
     )
     """Result of self-calibration for each intrinsic parameter."""
 
+    @property
+    def changes_view(self) -> bool:
+        """True if the undistorted view differs with the refined camera by more than its scale."""
+        refined = any(
+            self.calibration[p].is_refined for p in VIEW_PARAMETERS if p in self.calibration
+        )
+        return self.camera_model.is_fisheye or bool(self.distortion.any()) or refined
+
     def state_dict(self) -> StateDict:
         """Return the state of the registered image for a checkpoint."""
-        parts = {"camera": {**vars(self.camera)}, "depth": {**vars(self.depth)}}
+        parts: StateDict = {"camera": {**vars(self.camera)}, "depth": {**vars(self.depth)}}
+        parts["camera_model"] = self.camera_model.value
         calibration = {p.name: result.state_dict() for p, result in self.calibration.items()}
         return {**vars(self), **parts, "calibration": calibration}
 
     @classmethod
     def from_state_dict(cls, state: StateDict) -> RegisteredImage:
         """Restore a registered image from a checkpoint."""
-        parts = {"camera": PinholeCamera(**state["camera"]), "depth": DepthPrior(**state["depth"])}
+        parts: StateDict = {
+            "camera": PinholeCamera(**state["camera"]),
+            "depth": DepthPrior(**state["depth"]),
+            "camera_model": CameraModel(state["camera_model"]),
+        }
         calibration = {
             IntrinsicParameter[name]: CalibratedParameter.from_state_dict(result)
             for name, result in state["calibration"].items()

@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, PinholeCamera
+from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.geometry.distortion import distort_rays, undistort_rays
 from mpsfm_core.mapping.scene.depth_map import DepthMap
-from mpsfm_core.mapping.scene.estimated_intrinsics import EstimatedIntrinsics, IntrinsicParameter
+from mpsfm_core.mapping.scene.estimated_intrinsics import EstimatedIntrinsics
 from mpsfm_core.mapping.scene.graph import CorrespondenceGraph
 from mpsfm_core.mapping.scene.kernels import compute_max_triangulation_angles
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
@@ -30,7 +31,7 @@ class Snapshot(NamedTuple):
     xyz: Float64
     point_of: Int64
     maps: Sequence[tuple[float, bool, RefinedDepth | None]]
-    radial: Float64
+    distortion: Float64
     estimated_intrinsics: StateDict
 
 
@@ -48,7 +49,9 @@ class Scene:
         translations: (n, 3) float64 translation of ``cam_from_world`` of each image.
         registered: (n,) bool mask of the registered images.
         intrinsics: (n, 4) float64 intrinsics fx, fy, cx, cy of each image in pixels.
-        radial: (n,) float64 coefficient of the radial distortion (SIMPLE_RADIAL) of each image.
+        distortion: (n, 4) float64 distortion coefficients k1, k2, p1, p2 of OPENCV of each image,
+            or k1, k2, k3, k4 of OPENCV_FISHEYE.
+        fisheye: (n,) bool mask of the images with the camera model OPENCV_FISHEYE.
         camera_of: (n,) int64 camera index of each image. Images with the same camera index share
             estimated intrinsics.
         estimated_intrinsics: Estimates of self-calibration for the camera of each image.
@@ -75,7 +78,8 @@ class Scene:
         self.distorted_keypoints: Float64 = self.keypoints.copy()
         self.keypoint_std_px: Float64 = np.array([i.keypoint_std_px for i in problem.images])
         self.intrinsics: Float64 = np.array([image.camera.params for image in problem.images])
-        self.radial: Float64 = np.array([image.radial for image in problem.images])
+        self.distortion: Float64 = np.array([image.distortion for image in problem.images])
+        self.fisheye: Bool = np.array([i.camera_model.is_fisheye for i in problem.images], np.bool_)
         self.camera_of: Int64 = _shared_cameras(problem)
         self.depth_group_of: Int64 = _depth_groups(problem)
         self.maps = [DepthMap(image) for image in problem.images]
@@ -127,8 +131,8 @@ class Scene:
                 present focal length.
         """
         if focal_px is not None:
-            focal = self.intrinsics_with_focal(image, focal_px)[:2]
-            self.set_shared_intrinsics(image, focal, self.radial[image])
+            intrinsics = self.intrinsics_with_focal(image, focal_px)
+            self.set_shared_intrinsics(image, intrinsics, self.distortion[image])
         self.rotations[image], self.translations[image] = rotation, translation
         self.registered[image] = True
 
@@ -168,40 +172,44 @@ class Scene:
         determined: Bool = (known | refined)[images]
         return determined
 
-    def set_intrinsics(self, image: int, focal: Float64, radial: float) -> None:
-        """Set focal length and radial distortion of one image, and undistort its keypoints.
+    def set_intrinsics(self, image: int, intrinsics: Float64, distortion: Float64) -> None:
+        """Set intrinsics and distortion of one image, and undistort its keypoints.
 
         Args:
             image: The image.
-            focal: (2,) focal lengths fx, fy in pixels.
-            radial: Coefficient of the radial distortion (SIMPLE_RADIAL).
+            intrinsics: (4,) camera parameters fx, fy, cx, cy in pixels.
+            distortion: (4,) distortion coefficients.
         """
-        self.intrinsics[image, :2] = focal
-        self.radial[image] = radial
+        self.intrinsics[image], self.distortion[image] = intrinsics, distortion
         self.maps[image].set_camera(self.camera(image))
         rows = self.graph.keypoints_of(image)
         given = self.problem.images[image]
         focal_px, center = self.intrinsics[image, :2], self.intrinsics[image, 2:]
         # copy the keypoints of the problem exactly, because a resumed mapper starts from them
-        if radial == given.radial and (self.intrinsics[image] == given.camera.params).all():
+        is_given = (self.intrinsics[image] == given.camera.params).all()
+        fisheye = bool(self.fisheye[image])
+        if is_given and (distortion == given.distortion).all():
             self.keypoints[rows] = given.keypoints
-        elif radial == 0.0:
+        elif not fisheye and not np.any(distortion):
             self.keypoints[rows] = self.distorted_keypoints[rows]
         else:
             distorted = (self.distorted_keypoints[rows] - center) / focal_px
-            self.keypoints[rows] = center + focal_px * undistort_rays(distorted, radial)
+            rays = undistort_rays(distorted, distortion.tolist(), fisheye=fisheye)
+            self.keypoints[rows] = center + focal_px * rays
 
-    def set_shared_intrinsics(self, image: int, focal: Float64, radial: float) -> None:
-        """Set focal length and radial distortion of all images that share the camera of an image.
+    def set_shared_intrinsics(self, image: int, intrinsics: Float64, distortion: Float64) -> None:
+        """Set intrinsics and distortion of all images that share the camera of an image.
 
         Args:
             image: Index of an image that was taken by the camera.
-            focal: (2,) focal lengths fx, fy in pixels.
-            radial: Coefficient of the radial distortion (SIMPLE_RADIAL).
+            intrinsics: (4,) camera parameters fx, fy, cx, cy in pixels.
+            distortion: (4,) distortion coefficients.
         """
-        changed = (self.intrinsics[:, :2] != focal).any(axis=1) | (self.radial != radial)
+        changed = (self.intrinsics != intrinsics).any(axis=1)
+        changed |= (self.distortion != distortion).any(axis=1)
+        intrinsics, distortion = intrinsics.copy(), distortion.copy()
         for other in np.flatnonzero(self.shares_camera(image) & changed):
-            self.set_intrinsics(int(other), focal, radial)
+            self.set_intrinsics(int(other), intrinsics, distortion)
 
     def shares_camera(self, image: int) -> Bool:
         """Return a bool mask (n,) of the images that share the camera of an image."""
@@ -303,7 +311,7 @@ class Scene:
             self.register(image.index, image.rotation, image.translation)
             self.maps[image.index].set_scale(image.scale)
             self.tracks.point_of[self.graph.keypoints_of(image.index)] = image.point_ids
-            self.set_shared_intrinsics(image.index, image.camera.params[:2], image.radial)
+            self.set_shared_intrinsics(image.index, image.camera.params, image.distortion)
             for parameter, calibrated in image.calibration.items():
                 if calibrated.is_refined:
                     self.estimated_intrinsics.set(
@@ -311,12 +319,13 @@ class Scene:
                     )
 
     def _distort_keypoints(self) -> None:
-        """Distort the keypoints by the radial distortion that was removed from them."""
-        for image in map(int, np.flatnonzero(self.radial)):
+        """Distort the keypoints by the distortion that was removed from them."""
+        for image in map(int, np.flatnonzero(self.distortion.any(axis=1) | self.fisheye)):
             rows = self.graph.keypoints_of(image)
             focal_px, center = self.intrinsics[image, :2], self.intrinsics[image, 2:]
             rays = (self.keypoints[rows] - center) / focal_px
-            distorted = distort_rays(rays, float(self.radial[image]))
+            distortion, fisheye = self.distortion[image].tolist(), bool(self.fisheye[image])
+            distorted = distort_rays(rays, distortion, fisheye=fisheye)
             self.distorted_keypoints[rows] = center + focal_px * distorted
 
     def snapshot(self) -> Snapshot:
@@ -330,7 +339,7 @@ class Scene:
             self.tracks.xyz.copy(),
             self.tracks.point_of.copy(),
             maps,
-            self.radial.copy(),
+            self.distortion.copy(),
             self.estimated_intrinsics.state_dict(),
         )
 
@@ -340,8 +349,11 @@ class Scene:
         self.translations = snapshot.translations.copy()
         self.registered = snapshot.registered.copy()
         changed = (self.intrinsics != snapshot.intrinsics).any(axis=1)
-        for image in np.flatnonzero(changed | (self.radial != snapshot.radial)):
-            self.set_intrinsics(int(image), snapshot.intrinsics[image, :2], snapshot.radial[image])
+        changed |= (self.distortion != snapshot.distortion).any(axis=1)
+        for image in np.flatnonzero(changed):
+            self.set_intrinsics(
+                int(image), snapshot.intrinsics[image], snapshot.distortion[image].copy()
+            )
         self.estimated_intrinsics.load_state_dict(snapshot.estimated_intrinsics)
         self.tracks.xyz = snapshot.xyz.copy()
         self.tracks.point_of = snapshot.point_of.copy()

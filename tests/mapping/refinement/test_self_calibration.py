@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import MappingProblem
+from mpsfm_core.data.camera_models import CameraModel, IntrinsicParameter
 from mpsfm_core.data.decisions import CameraReason
 from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.geometry.distortion import undistort_rays
+from mpsfm_core.geometry.distortion import distort_rays, undistort_rays
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.self_calibration import judge_estimate
 from mpsfm_core.mapping.scene.conversion import convert_scene
-from mpsfm_core.mapping.scene.estimated_intrinsics import CalibrationOutcome, IntrinsicParameter
+from mpsfm_core.mapping.scene.estimated_intrinsics import CalibrationOutcome
+from mpsfm_core.mapping.scene.reconstruction import VIEW_PARAMETERS
 from tests.mapping.focal_scenes import (
     CAMERA,
     POSES,
@@ -28,6 +30,8 @@ from tests.mapping.focal_scenes import (
 )
 
 FOCAL = IntrinsicParameter.FOCAL_LENGTH
+REMOVED = (-0.08, 0.0, 0.0, 0.0)
+"""Distortion coefficients that were removed from views before mapping."""
 RADIAL = IntrinsicParameter.RADIAL_DISTORTION
 
 
@@ -67,7 +71,7 @@ def test_reconstruct_with_radial_distortion_refines_shared_camera(
     assert len(model.images) == 5
     for image in model.images:
         assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
-        assert image.radial == pytest.approx(radial, abs=0.01)
+        assert image.distortion[0] == pytest.approx(radial, abs=0.01)
         radial_std = image.calibration[RADIAL].std
         assert radial_std is not None and 0 < radial_std < 0.01
         assert image.calibration[RADIAL].is_refined
@@ -76,10 +80,66 @@ def test_reconstruct_with_radial_distortion_refines_shared_camera(
         assert rotation_angle_deg(relative @ true_relative.T) < 0.3
 
 
+@pytest.mark.parametrize(
+    ("model", "coefficients"),
+    [
+        (CameraModel.RADIAL, (-0.2, 0.08)),
+        (CameraModel.OPENCV, (-0.1, 0.03, 0.004, -0.006)),
+        (CameraModel.OPENCV_FISHEYE, (0.05, -0.03)),
+    ],
+)
+def test_reconstruct_with_camera_model_refines_its_parameters(
+    room: MappingProblem, model: CameraModel, coefficients: tuple[float, ...]
+) -> None:
+    problem = guess_focals(distort(room, *coefficients, model=model), [1.1] * 5)
+    if model.is_fisheye:
+        problem = undistort_equidistantly(problem)
+    options = MapperOptions.model_validate({"max_runs": 1})
+    reconstruction = reconstruct(problem, options).reconstructions[0]
+    assert len(reconstruction.images) == 5
+    grid = np.mgrid[-0.5:0.6:0.1, -0.4:0.5:0.1].reshape(2, -1).T
+    padded = [*coefficients, 0.0, 0.0, 0.0, 0.0][:4]
+    expected = CAMERA.fx * distort_rays(grid, padded, fisheye=model.is_fisheye)
+    for image in reconstruction.images:
+        assert image.camera_model == model
+        assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
+        refined = distort_rays(grid, image.distortion.tolist(), fisheye=model.is_fisheye)
+        error_px = image.camera.params[:2] * refined - expected
+        assert np.abs(error_px).mean() < 1.5
+        k1 = image.calibration[RADIAL]
+        assert k1.is_refined and k1.std is not None and 0 < k1.std < 0.05
+
+
+def undistort_equidistantly(problem: MappingProblem) -> MappingProblem:
+    """Return the problem with keypoints undistorted by fisheye cameras without coefficients."""
+    images = []
+    for image in problem.images:
+        focal, center = image.camera.params[:2], image.camera.params[2:]
+        rays = undistort_rays((image.keypoints - center) / focal, [0.0] * 4, fisheye=True)
+        images.append(replace(image, keypoints=center + focal * rays))
+    return replace(problem, images=tuple(images))
+
+
+def test_reconstruct_with_principal_point_refines_it() -> None:
+    room = make_room(replace(CAMERA, cx=CAMERA.cx + 9, cy=CAMERA.cy - 6))
+    images = tuple(replace(image, camera=CAMERA) for image in room.images)
+    problem = guess_focals(replace(room, images=images), [1.05] * 5)
+    options = MapperOptions.model_validate(
+        {"max_runs": 1, "refinement": {"refine_principal_point": True}}
+    )
+    for image in reconstruct(problem, options).reconstructions[0].images:
+        errors = image.camera.params[2:] - room.images[0].camera.params[2:]
+        for parameter, error in zip(VIEW_PARAMETERS[1:], errors, strict=True):
+            std = image.calibration[parameter].std
+            assert std is not None and abs(error) < 3 * std
+        assert np.abs(errors).max() < 2.0
+        assert image.changes_view
+
+
 def test_reconstruct_with_one_image_per_camera_keeps_pinhole_cameras(room: MappingProblem) -> None:
     problem = guess_focals(distort(room, -0.05), [0.9, 0.95, 1.0, 1.05, 1.1])
     for image in reconstruct(problem).reconstructions[0].images:
-        assert image.radial == 0 and image.calibration[FOCAL].reason is None
+        assert image.distortion[0] == 0 and image.calibration[FOCAL].reason is None
         assert image.calibration[RADIAL].reason == CameraReason.DISTORTION_NOT_ESTIMATED.because()
 
 
@@ -91,10 +151,10 @@ def test_reconstruct_of_partly_undistorted_views_refines_the_original_distortion
     center = np.array([CAMERA.cx, CAMERA.cy])
     images = []
     for image in distorted.images:
-        rays = undistort_rays((image.keypoints - center) / CAMERA.fx, -0.08)
-        images.append(replace(image, keypoints=center + CAMERA.fx * rays, radial=-0.08))
+        rays = undistort_rays((image.keypoints - center) / CAMERA.fx, REMOVED)
+        images.append(replace(image, keypoints=center + CAMERA.fx * rays, distortion=REMOVED))
     for image in reconstruct(replace(distorted, images=tuple(images))).reconstructions[0].images:
-        assert image.radial == pytest.approx(-0.1, abs=0.005)
+        assert image.distortion[0] == pytest.approx(-0.1, abs=0.005)
         assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
 
 
@@ -106,7 +166,7 @@ def test_reconstruct_without_refinement_of_distortion_keeps_pinhole_cameras(
     )
     problem = guess_focals(distort(room, -0.05), [1.0] * 5)
     for image in reconstruct(problem, options).reconstructions[0].images:
-        assert image.radial == 0 and image.calibration[RADIAL].std is None
+        assert image.distortion[0] == 0 and image.calibration[RADIAL].std is None
         assert image.calibration[RADIAL].reason == CameraReason.DISTORTION_NOT_ESTIMATED.because()
 
 
@@ -115,7 +175,7 @@ def test_reconstruct_with_known_focal_lengths_keeps_them(room: MappingProblem) -
         assert image.camera == CAMERA
         assert image.calibration[FOCAL].reason == CameraReason.KNOWN.because()
         assert image.calibration[FOCAL].std is None
-        assert image.radial == 0
+        assert image.distortion[0] == 0
         assert image.calibration[RADIAL].std is image.calibration[RADIAL].reason is None
 
 

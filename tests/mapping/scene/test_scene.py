@@ -7,20 +7,29 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mpsfm_core.data import Float64
+from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     CalibrationOutcome,
     IntrinsicEstimate,
-    IntrinsicParameter,
 )
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import flatten_state, unflatten_state
 from tests.mapping.focal_scenes import CAMERA, guess_focals, make_room
 
+FIRST = np.array([1.0, 0.0, 0.0, 0.0])
+"""Distortion coefficients with k1 = 1."""
+
+
+def with_focal(focal_px: float) -> Float64:
+    """Return the intrinsics of the test camera with another focal length."""
+    return np.array([focal_px, focal_px * CAMERA.fy / CAMERA.fx, CAMERA.cx, CAMERA.cy])
+
 
 def test_restore_undoes_focal_lengths_and_outcomes() -> None:
     scene = Scene(guess_focals(make_room(), [1.1] * 5))
     before = scene.snapshot()
-    scene.set_shared_intrinsics(0, np.array([400.0, 400.0]), 0.0)
+    scene.set_shared_intrinsics(0, with_focal(400.0), np.zeros(4))
     estimate = IntrinsicEstimate(CalibrationOutcome.REFINED, 400.0, 0.02)
     focal_length = IntrinsicParameter.FOCAL_LENGTH
     scene.estimated_intrinsics.set(scene.shares_camera(0), focal_length, estimate)
@@ -40,15 +49,18 @@ def test_scene_restored_from_checkpoint_has_identical_keypoints(
 ) -> None:
     """The distortion of the first scene changed and was rolled back before the checkpoint."""
     problem = guess_focals(make_room(), [1.1] * 5)
-    problem = replace(problem, images=tuple(replace(i, radial=radial) for i in problem.images))
+    problem = replace(
+        problem,
+        images=tuple(replace(i, distortion=(radial, 0.0, 0.0, 0.0)) for i in problem.images),
+    )
     scene, restored = Scene(problem), Scene(problem)
-    scene.set_shared_intrinsics(0, focal * CAMERA.params[:2], radial)
+    scene.set_shared_intrinsics(0, with_focal(focal * CAMERA.fx), radial * FIRST)
     before = scene.snapshot()
-    scene.set_shared_intrinsics(0, np.array([400.0, 400.0]), -0.1)
+    scene.set_shared_intrinsics(0, with_focal(400.0), -0.1 * FIRST)
     scene.restore(before)
     restored.load_state_dict(unflatten_state(flatten_state(scene.state_dict())))
     assert restored.keypoints.tobytes() == scene.keypoints.tobytes()
     assert restored.intrinsics.tobytes() == scene.intrinsics.tobytes()
-    scene.set_shared_intrinsics(0, scene.intrinsics[0, :2], 0.02)
+    scene.set_shared_intrinsics(0, scene.intrinsics[0], 0.02 * FIRST)
     restored.load_state_dict(unflatten_state(flatten_state(scene.state_dict())))
     assert restored.keypoints.tobytes() == scene.keypoints.tobytes()
