@@ -12,7 +12,9 @@ import pytest
 
 from mpsfm_core import DepthPrior, NormalPrior, View
 from mpsfm_core.geometry import pixel_centers, rays
-from mpsfm_core.testing import ContractSetup
+from mpsfm_core.providers import ProviderSpec
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.testing import ContractSetup, run_checks
 from mpsfm_core.testing.examples import outdoor_example
 from mpsfm_core.testing.painted_views import RELATIVE_STD, read_depth, read_normals
 from tests.support.reference_providers import (
@@ -192,9 +194,33 @@ class FocalRatio(PaintedDepth):
         return 0.75
 
 
+class InvertedMask(PaintedDepth):
+    """Fault: depth is valid where the mask of the view is False."""
+
+    def predict(self, view: View) -> DepthPrior:
+        prior = super().predict(view)
+        return prior if view.mask is None else replace(prior, valid=prior.valid & ~view.mask)
+
+
+class DistantIsInvalid(PaintedDepth):
+    """Correct: depth beyond 6 m is invalid, as of a cautious network."""
+
+    def predict(self, view: View) -> DepthPrior:
+        prior = super().predict(view)
+        return replace(prior, valid=prior.valid & (prior.depth < 6))
+
+
+def test_depth_provider_may_reject_distant_pixels() -> None:
+    registry = Registry()
+    registry.add(ProviderSpec("depth", "cautious", DistantIsInvalid))
+    (result,) = run_checks(registry, "depth", "cautious", PAINTED, only={"depth-validity"})
+    assert result.status == "pass" and "lost" in result.message
+
+
 @pytest.mark.parametrize(
     ("factory", "check", "message", "capabilities"),
     [
+        (InvertedMask, "masked", "invalid at pixels where the mask is True", ()),
         (RayLength, "depth-is-z", "is the length of the ray", ()),
         (Millimetres, "depth-scale", r"declared metric and is 1e\+03 times the true", ()),
         (Disparity, "depth-scale", "not proportional to z", ()),
