@@ -81,8 +81,9 @@ def solve_depth_correction(
 
     Args:
         field: Three precision maps (h, w) of the Gaussian Markov random field of the ratio of input
-            to true depth. The three maps are the precisions of the ratio's difference to the right
-            neighbor, of the difference to the lower neighbor, and of the deviation from 1.
+            to true depth. The maps are the precisions of three quantities: the difference between
+            a pixel's depth ratio and the ratio at its right neighbor, the difference to the ratio
+            at its lower neighbor, and the deviation of the depth ratio from 1.
         planarity: Planarity prior of the image from :func:`estimate_planarity`.
         measured: Corrections of log depth by stereo.
 

@@ -116,9 +116,9 @@ class SourceImage:
     def refined_camera(self, pinhole: PinholeCamera) -> pycolmap.Camera:
         """Scale the original camera to the refined focal length of its undistorted view.
 
-        If the distortion of the original camera was refined too, ``self`` already has the refined
-        camera and a view that is undistorted with the refined camera, so that the scale factor is
-        1.
+        The original focal length is multiplied by the ratio of the refined to the previous focal
+        length of the view. The ratio is 1 if the view was already undistorted with the refined
+        camera.
         """
         camera = pycolmap.Camera(self.camera.todict())
         params = np.array(camera.params)

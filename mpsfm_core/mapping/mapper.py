@@ -282,8 +282,10 @@ class Mapper:
 
         A bad initialization leads to a small component, whose images fit a later component better.
         Completed components that lose an image are dissolved, and their images become unregistered.
-        Images with a known pose are not absorbed. Returns: True if the current component took
-        images of completed components and was finalized.
+        Images with a known pose are not absorbed.
+
+        Returns:
+            True if the current component took images of completed components and was finalized.
         """
         component = self.component
         max_size = max((len(model.images) for model in self.models), default=0)

@@ -450,7 +450,7 @@ def _distort(problem: BundleProblem, camera: Int64, slopes: Float64) -> tuple[Fl
 
 def _by_pose(by_point: Float64, seen: _Observations) -> Float64:
     """Convert derivatives (m, r, 3) by the camera-frame point to those (m, r, 6) by the pose."""
-    # A rotation ``exp(w) R`` moves the camera-frame point by ``w x q``.
+    # To first order, a rotation by the small vector w moves a rotated point q by ``w x q``.
     by_rotation = np.cross(seen.rotated[:, None], by_point)
     return np.concatenate([by_rotation, by_point], axis=2)
 

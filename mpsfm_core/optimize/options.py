@@ -71,8 +71,8 @@ class IntegrationOptions(Options):
     the soft minimum closer to the smaller residual. [bilateral normal integration: 2; reference:
     1]"""
     normal_limit: float = expert(6.0, gt=0)
-    """Squared normal residual above which depth may be discontinuous between two pixels. A larger
-    limit of the normal residual smooths depth discontinuities. [tuned:
+    """Squared residual of the surface normal above which depth may be discontinuous between two
+    pixels. A larger ``normal_limit`` smooths depth discontinuities. [tuned:
     benchmarks.depth_integration]"""
     prior_scale: float = expert(1.0, gt=0)
     """Scale of the Charbonnier loss of the depth prior, in standard deviations. Raising the scale

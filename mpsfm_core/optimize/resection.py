@@ -69,7 +69,9 @@ _kernel, _helper = jit.kernel(), jit.helper()
 def measure_segments(
     pose: Pose, intrinsics: Float64, segments: RaySegments
 ) -> tuple[Float64, Float64]:
-    """Measure distances between keypoints and projected segments.
+    """Measure distances between keypoints and projected ray segments.
+
+    A ray segment is the part of a keypoint's ray in another image within its depth interval.
 
     Args:
         pose: ``cam_from_world``.

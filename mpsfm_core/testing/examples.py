@@ -254,7 +254,8 @@ def indoor_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Exam
     """Return a synthetic view of a furnished room with texture everywhere.
 
     Args:
-        look: Colors of the view, painted or textured.
+        look: Colors that encode depth and normals (``painted``), or a random texture
+            (``textured``).
         size: Width and height of the view in pixels.
     """
     scene = replace(room_scene(), texture=Texture(waves_per_octave=8))

@@ -233,7 +233,7 @@ def find_contradicted_cuts(
 
 
 def _count_separating_matches(registered: Bool, contradicting: Int64) -> Int64:
-    """Count the matches (n, n) of each two registered images that contradict their poses.
+    """Count the matches that contradict the poses of two images, as a table (n, n) of pairs.
 
     A pair has at least the number of its unexplained matches. If an unregistered image matches both
     images of the pair, the pair has at least the smaller of these two numbers of matches.

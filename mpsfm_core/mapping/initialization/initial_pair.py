@@ -1,8 +1,8 @@
 """Selection and relative pose of the initial image pair (paper section 3.1).
 
-If points are lifted from depth, the second image is registered by the points of the first image.
-Without lifted points, the relative pose of the pair is that of geometric verification, and the
-baseline length is measured by depth.
+If keypoints of the first image are lifted to 3D points by the depth prior, the second image is
+registered to these points by PnP. Otherwise, the relative pose is that of geometric verification,
+and the length of its baseline follows from the depth priors at the matches.
 """
 
 from __future__ import annotations

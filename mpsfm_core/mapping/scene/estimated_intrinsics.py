@@ -52,7 +52,7 @@ class PredictedErrors(NamedTuple):
 
     @classmethod
     def unknown(cls, num_images: int) -> PredictedErrors:
-        """Return NaN for all errors of ``num_images`` images."""
+        """Return NaN for the predicted pose and intrinsics errors of ``num_images`` images."""
         return cls(
             np.full(num_images, np.nan), np.full((num_images, len(IntrinsicParameter)), np.nan)
         )

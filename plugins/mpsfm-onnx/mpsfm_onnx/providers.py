@@ -142,7 +142,7 @@ class OnnxNormals(DescribedNormals):
 
 
 class OnnxJoint(DescribedJoint):
-    """Provider of depth and normals from the network that the option ``description`` names."""
+    """Provider of depth and normals from the ONNX network of a YAML description file."""
 
     def __init__(self, options: OnnxOptions, context: ProviderContext) -> None:
         description = load_description(options.description)
