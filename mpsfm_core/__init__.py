@@ -1,33 +1,13 @@
 """Structure-from-Motion with monocular depth and normal priors from exchangeable plugins.
 
-The package ``mpsfm_core`` exports all names that users and plugin authors need. Modules with slow
-imports are loaded when an exported name is first used, because listing the installed plugins
-imports ``mpsfm_core``.
+The package ``mpsfm_core`` exports all names that users and plugin authors need. The module that
+defines an exported name is imported when the name is first used, so that commands start fast.
 """
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any
-
-from mpsfm_core.data import (
-    DenseMatches,
-    DepthPrior,
-    Features,
-    MappingProblem,
-    MultiViewPrior,
-    NormalPrior,
-    PairDepth,
-    PairMatches,
-    PinholeCamera,
-    SparseMatches,
-    VerifiedPair,
-    View,
-)
-from mpsfm_core.data.errors import Cancelled, InputError, MpsfmError
-from mpsfm_core.data.options import Options
-from mpsfm_core.providers import ProviderContext, ProviderSpec, WeightsFile, hookimpl
-from mpsfm_core.providers.provider_config import ProviderConfig
 
 if TYPE_CHECKING:
     from mpsfm_core.api import (
@@ -46,10 +26,28 @@ if TYPE_CHECKING:
     )
     from mpsfm_core.calibration.calibrate import CalibrationImages, calibrate
     from mpsfm_core.config import Config, load_config
+    from mpsfm_core.data import (
+        DenseMatches,
+        DepthPrior,
+        Features,
+        MappingProblem,
+        MultiViewPrior,
+        NormalPrior,
+        PairDepth,
+        PairMatches,
+        PinholeCamera,
+        SparseMatches,
+        VerifiedPair,
+        View,
+    )
+    from mpsfm_core.data.errors import Cancelled, InputError, MpsfmError
+    from mpsfm_core.data.options import Options
     from mpsfm_core.extraction.match_graph import MatchGraph, Priors
     from mpsfm_core.extraction.problem_builder import build_problem
     from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
     from mpsfm_core.pipeline.run import ReconstructionResult, reconstruct
+    from mpsfm_core.providers import ProviderContext, ProviderSpec, WeightsFile, hookimpl
+    from mpsfm_core.providers.provider_config import ProviderConfig
     from mpsfm_core.providers.registry import Registry
     from mpsfm_core.results import plots
     from mpsfm_core.results.exports.formats import export
@@ -73,10 +71,28 @@ _LAZY_MODULES = {
     ),
     "mpsfm_core.calibration.calibrate": ("CalibrationImages", "calibrate"),
     "mpsfm_core.config": ("Config", "load_config"),
+    "mpsfm_core.data": (
+        "DenseMatches",
+        "DepthPrior",
+        "Features",
+        "MappingProblem",
+        "MultiViewPrior",
+        "NormalPrior",
+        "PairDepth",
+        "PairMatches",
+        "PinholeCamera",
+        "SparseMatches",
+        "VerifiedPair",
+        "View",
+    ),
+    "mpsfm_core.data.errors": ("Cancelled", "InputError", "MpsfmError"),
+    "mpsfm_core.data.options": ("Options",),
     "mpsfm_core.extraction.match_graph": ("MatchGraph", "Priors"),
     "mpsfm_core.extraction.problem_builder": ("build_problem",),
     "mpsfm_core.mapping.scene.reconstruction": ("MappingResult", "Reconstruction"),
     "mpsfm_core.pipeline.run": ("ReconstructionResult", "reconstruct"),
+    "mpsfm_core.providers": ("ProviderContext", "ProviderSpec", "WeightsFile", "hookimpl"),
+    "mpsfm_core.providers.provider_config": ("ProviderConfig",),
     "mpsfm_core.providers.registry": ("Registry",),
     "mpsfm_core.results.exports.formats": ("export",),
 }

@@ -39,15 +39,16 @@ from mpsfm_core.dense.densify import densify as densify_reconstruction
 from mpsfm_core.dense.fusion import FusedPointCloud, fuse_depth_maps
 from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
 from mpsfm_core.dense.options import DenseOptions, MeshOptions
-from mpsfm_core.evaluation import CONVENTIONS, read_poses, reconstruction_poses
+from mpsfm_core.evaluation import CONVENTIONS
 from mpsfm_core.evaluation import evaluate as evaluate_poses
 from mpsfm_core.extraction import runner
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.features import FeatureSet, FeatureSource, FeatureTable, GivenFeatures
 from mpsfm_core.extraction.match_graph import MatchGraph, NamePair, Priors
-from mpsfm_core.geometry.pycolmap_conversion import pose_from
 from mpsfm_core.inputs import images as image_inputs
 from mpsfm_core.inputs.images import ImageSet
+from mpsfm_core.inputs.intrinsics import Cameras
+from mpsfm_core.inputs.models import read_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
@@ -72,7 +73,7 @@ PathLike = str | Path
 def load_images(
     images: PathLike | Mapping[str, NDArray[Any]],
     *,
-    cameras: Mapping[str, Any] | Any | None = None,
+    cameras: Cameras | None = None,
     intrinsics: PathLike | None = None,
     image_list: PathLike | None = None,
     output: PathLike | None = None,
@@ -85,11 +86,12 @@ def load_images(
 
     Args:
         images: Folder of photos, path of a video, or (H, W, 3) uint8 RGB pixels by image name.
-        cameras: Camera of all pixel arrays, or camera of each array by image name, as
-            :class:`~mpsfm_core.PinholeCamera` or ``pycolmap.Camera``. Without cameras, the focal
-            length is guessed and refined.
-        intrinsics: Camera intrinsics as ``intrinsics.yaml``, a COLMAP model or ``transforms.json``,
-            by default from EXIF.
+        cameras: Camera of all images, camera of each image by name, or ``pycolmap.Reconstruction``.
+            A camera is a :class:`~mpsfm_core.PinholeCamera` or a ``pycolmap.Camera`` of any
+            perspective model, for the image after EXIF rotation. Without cameras, the focal length
+            is taken from EXIF, or guessed and refined.
+        intrinsics: File with the cameras, instead of ``cameras``: ``intrinsics.yaml``, a COLMAP
+            model or ``transforms.json``.
         image_list: Text file with one image name per line, by default all images of the folder.
         output: Folder into which the keyframes of a video are written.
         config: Configuration, of which the block ``inputs`` is used.
@@ -108,12 +110,12 @@ def load_images(
         >>> images = mpsfm.load_images({"a": rgb_a, "b": rgb_b}, cameras=camera)
     """
     config, registry = configure(config, registry, overrides)
+    if cameras is not None and intrinsics is not None:
+        raise TypeError("give cameras or the file intrinsics, not both")
     if isinstance(images, Mapping):
         if intrinsics is not None or image_list is not None:
             raise TypeError("arrays have cameras, not intrinsics or image_list")
         return image_inputs.images_from_arrays(images, cameras, config.inputs)
-    if cameras is not None:
-        raise TypeError("cameras belong to arrays; give intrinsics for a folder or a video")
     folder, stages = Path(images), Stages(registry, on_event)
     if is_video(folder):
         if output is None:
@@ -121,10 +123,10 @@ def load_images(
         with stages.stage("video"):
             progress = partial(stages.stage_progress, "video")
             folder = extract_frames(folder, Path(output), config.inputs.video, progress)
-    cameras_file = None if intrinsics is None else Path(intrinsics)
+    given = cameras if intrinsics is None else Path(intrinsics)
     names_file = None if image_list is None else Path(image_list)
     with stages.stage("inputs"):
-        return image_inputs.load_images(folder, cameras_file, names_file, config.inputs)
+        return image_inputs.load_images(folder, given, names_file, config.inputs)
 
 
 def extract_features(
@@ -509,13 +511,9 @@ def evaluate(
 def _poses(
     model: PathLike | Reconstruction | pycolmap.Reconstruction | Mapping[str, Any],
 ) -> Mapping[str, Pose]:
-    if isinstance(model, Mapping):
-        return {name: pose_from(name, pose) for name, pose in model.items()}
     if isinstance(model, Reconstruction):
         return model.poses
-    if isinstance(model, pycolmap.Reconstruction):
-        return reconstruction_poses(model)
-    return read_poses(Path(model))
+    return read_poses(Path(model) if isinstance(model, (str, Path)) else model)
 
 
 class _ViewsByName:

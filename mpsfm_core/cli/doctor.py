@@ -14,7 +14,6 @@ import typer
 
 from mpsfm_core.cli.arguments import ConfigName, Offline, config_overrides
 from mpsfm_core.cli.models import CacheDir
-from mpsfm_core.report.reasons import explain
 
 if TYPE_CHECKING:
     from mpsfm_core.pipeline.provider_resolution import ProviderResolution
@@ -36,6 +35,7 @@ def doctor(
     from mpsfm_core.extraction.cache import cache_folder
     from mpsfm_core.pipeline.provider_resolution import preview_providers
     from mpsfm_core.providers.registry import Registry, core_version
+    from mpsfm_core.report.reasons import explain
     from mpsfm_core.support.threads import count_cores
 
     registry = Registry.discover()
@@ -101,6 +101,8 @@ def _missing_plugins(registry: Registry) -> Iterator[str]:
 
 def _better_choices(provision: ProviderResolution) -> Iterator[str]:
     """Yield suggestions to make preferred but unavailable providers available."""
+    from mpsfm_core.report.reasons import explain
+
     for choice in provision.choices:
         for name, why in choice.passed_over.items():
             yield f"{choice.block}: {name} would be better: {explain(why).text}"

@@ -13,8 +13,6 @@ from typing import Any, NoReturn
 import typer
 from typer.core import TyperGroup
 
-from mpsfm_core.data.errors import MpsfmError
-
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C or SIGTERM interrupted."""
 
@@ -50,6 +48,8 @@ def fail(message: str, exit_code: int) -> NoReturn:
 
 def _explain(error: Exception) -> tuple[str, int]:
     """Convert an exception to a message and an exit code."""
+    from mpsfm_core.data.errors import MpsfmError
+
     if isinstance(error, MpsfmError):
         return str(error), error.exit_code
     # An OSError is a machine failure, for example a full disk or missing permissions.

@@ -9,19 +9,17 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mpsfm_core.data.errors import ProviderError, did_you_mean
-from mpsfm_core.providers import KINDS
-from mpsfm_core.providers.discovery import subprocess_environment
+from mpsfm_core.cli.plugin_probe import probe_plugins
+from mpsfm_core.support.child_process import subprocess_environment
 
 if TYPE_CHECKING:
-    from mpsfm_core.providers.registry import ProviderStatus
     from mpsfm_core.testing import CheckResult
 
 _CHECKING = "MPSFM_CHECKING"
@@ -35,11 +33,15 @@ def list_plugins(
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> None:
     """List all providers with distribution, licenses and availability."""
-    from mpsfm_core.providers.registry import Registry
+    crashing, status, messages = probe_plugins()
+    if status:
+        typer.echo(messages, nl=False, err=True)
+    else:  # The child process failed, and this process shows the error.
+        from mpsfm_core.providers.registry import Registry
 
-    status = Registry.discover(probe=True).status()
+        status = [asdict(line) for line in Registry.discover(without=crashing).status()]
     if as_json:
-        typer.echo(json.dumps([asdict(line) for line in status], indent=2, default=str))
+        typer.echo(json.dumps(status, indent=2, default=str))
     else:
         _print_table(status)
 
@@ -84,7 +86,7 @@ def check(
     )
     from mpsfm_core.testing.hook_checks import HOOK_CHECKS, has_hooks, run_hook_checks
 
-    registry = Registry.discover(probe=True)
+    registry = Registry.discover(without=probe_plugins().crashing)
     plugin = find_plugin(registry, name)
     has_providers = plugin is None or not plugin.available
     check_ids = None if only is None else parse_check_ids(only, HOOK_CHECKS)
@@ -119,6 +121,9 @@ def check(
 
 def _parse_kind(text: str) -> str:
     """Return the name of a provider kind, or ``hook``, after checking it."""
+    from mpsfm_core.data.errors import did_you_mean
+    from mpsfm_core.providers import KINDS
+
     known = (*KINDS, "hook")
     if text not in known:
         raise typer.BadParameter(f"no kind {text!r}{did_you_mean(text, known)}")
@@ -133,7 +138,8 @@ def new(
     kind: Annotated[
         str,
         typer.Option(
-            help=f"Kind of the provider: {', '.join(KINDS)}; or hook, for a plugin with hooks.",
+            help="Kind of the provider: depth, normals, multiview, camera, features, matcher, "
+            "retrieval, mask, wrapper; or hook, for a plugin with hooks.",
             parser=_parse_kind,
             metavar="KIND",
         ),
@@ -170,6 +176,8 @@ def _check_in_subprocess(name: str, arguments: list[str]) -> int:
         typer.echo(errors.read(), nl=False, err=True)
     if process.returncode >= 0:
         return process.returncode
+    from mpsfm_core.data.errors import ProviderError
+
     signal_name = signal.Signals(-process.returncode).name
     raise ProviderError(
         f"{name}: the check after the last listed check crashed the process ({signal_name})"
@@ -193,18 +201,20 @@ def _print_summary(results: Sequence[CheckResult]) -> None:
     typer.echo(", ".join(f"{count} {status}" for status, count in sorted(counts.items())))
 
 
-def _print_table(status: tuple[ProviderStatus, ...]) -> None:
+def _print_table(status: Sequence[Mapping[str, Any]]) -> None:
     from rich.text import Text
 
     from mpsfm_core.cli.tables import print_table
 
     rows = [
         (
-            line.kind,
-            Text(line.name, style="bold" if line.available else "dim"),
-            f"{line.distribution} {line.version}",
-            f"{line.code_license} / {line.weights_license}" if line.kind != "plugin" else "",
-            ", ".join(line.capabilities),
+            line["kind"],
+            Text(line["name"], style="bold" if line["available"] else "dim"),
+            f"{line['distribution']} {line['version']}",
+            f"{line['code_license']} / {line['weights_license']}"
+            if line["kind"] != "plugin"
+            else "",
+            ", ".join(line["capabilities"]),
             _state(line),
         )
         for line in status
@@ -214,7 +224,7 @@ def _print_table(status: tuple[ProviderStatus, ...]) -> None:
     )
 
 
-def _state(line: ProviderStatus) -> str:
-    if line.available:
+def _state(line: Mapping[str, Any]) -> str:
+    if line["available"]:
         return "available"
-    return f"unavailable: {line.reason}" + (f"; {line.install_hint}" if line.install_hint else "")
+    return f"unavailable: {line['reason']}; {line['install_hint']}".rstrip("; ")

@@ -19,7 +19,6 @@ from mpsfm_core.cli.arguments import (
     config_overrides,
 )
 from mpsfm_core.cli.errors import handle_sigterm
-from mpsfm_core.report.reasons import explain_gps, explain_image
 
 if TYPE_CHECKING:
     from mpsfm_core.pipeline.run import ReconstructionResult
@@ -167,6 +166,7 @@ def _print_failure(summary: Mapping[str, Any], output: Path) -> None:
 def _print_outcome(result: ReconstructionResult, output: Path) -> None:
     """Print quality, weakly registered and missing photos, and files of a successful run."""
     from mpsfm_core.report.findings import describe_scale, findings, weakest
+    from mpsfm_core.report.reasons import explain_image
     from mpsfm_core.report.verdict import judge
 
     images, best = result.summary["images"], result.summary["reconstructions"][0]
@@ -211,6 +211,8 @@ def _row(label: str, text: str) -> None:
 
 def _place(georeference: Mapping[str, Any]) -> str:
     """Describe the GPS alignment in the summary, or why the model is not aligned."""
+    from mpsfm_core.report.reasons import explain_gps
+
     if "why_not" in georeference:
         return f"not georeferenced: {explain_gps(georeference['why_not']).text}"
     origin = georeference["origin"]

@@ -19,7 +19,11 @@ class Options(BaseModel):
     """Base class of immutable options; unknown keys are errors."""
 
     model_config = ConfigDict(
-        frozen=True, extra="forbid", protected_namespaces=(), ser_json_inf_nan="constants"
+        frozen=True,
+        extra="forbid",
+        protected_namespaces=(),
+        ser_json_inf_nan="constants",
+        defer_build=True,
     )
 
 

@@ -130,7 +130,9 @@ def _align(
         if not _derive(template, template_xy[n], radius, offsets, window, basis, hessian):
             continue
         warp, at = refined_warps[n], searched_xy[n].copy()
-        warp[:] = warps[n]
+        for i in range(2):
+            for j in range(2):
+                warp[i, j] = warps[n, i, j]
         parameters, iteration, invert_hessian = _NUM_TRANSLATION, 0, True
         correlation = 1.0
         while correlation >= 0.0:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Bool, Float64, PinholeCamera, UInt8, View
 from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.geometry.pycolmap_conversion import camera_key, colmap_from_pinhole
+from mpsfm_core.geometry.pycolmap_conversion import camera_key
 from mpsfm_core.inputs.camera_sharing import FocalSource, guess_cameras
 from mpsfm_core.inputs.gps import GpsPosition, read_gps
 from mpsfm_core.inputs.image_decoding import (
@@ -37,7 +37,12 @@ from mpsfm_core.inputs.image_search import (
     require_two_images,
     select_listed_images,
 )
-from mpsfm_core.inputs.intrinsics import Intrinsics, read_intrinsics
+from mpsfm_core.inputs.intrinsics import (
+    Cameras,
+    Intrinsics,
+    intrinsics_from_cameras,
+    read_intrinsics,
+)
 from mpsfm_core.inputs.masks import (
     MaskFile,
     decode_opacity,
@@ -313,11 +318,11 @@ class ImageSet:
 
 def load_images(
     folder: Path,
-    intrinsics: Path | None = None,
+    intrinsics: Path | Cameras | None = None,
     image_list: Path | None = None,
     options: InputOptions | None = None,
     *,
-    model: Path | None = None,
+    model: Path | Cameras | None = None,
     without: Path | None = None,
     names: Sequence[str] | None = None,
 ) -> ImageSet:
@@ -327,9 +332,9 @@ def load_images(
         folder: folder of images in the formats of
             :data:`mpsfm_core.inputs.image_decoding.EXTENSIONS`.
         intrinsics: path of ``intrinsics.yaml``, a COLMAP model (folder or ``cameras.txt``) or
-            ``transforms.json``, for upright images (after EXIF rotation). Without an intrinsics
-            file focal lengths come from EXIF, else from ``options.default_focal_ratio`` with a
-            warning.
+            ``transforms.json``, or cameras of the caller, for upright images (after EXIF rotation).
+            Without intrinsics, focal lengths come from EXIF, else from
+            ``options.default_focal_ratio`` with a warning.
         image_list: text file with one image name per line (``#`` starts a comment), which also sets
             the order of the images.
         options: see :class:`InputOptions`.
@@ -352,8 +357,8 @@ def load_images(
             names = select_listed_images(image_list, names, folder)
         require_two_images(folder, names, image_list or folder)
     masks = {} if options.masks is None else find_masks(options.masks, names, folder)
-    given = _read_cameras(intrinsics, names, folder)
-    partial = _read_cameras(model, names, folder) if given is None else None
+    given = _read_cameras(intrinsics, names, folder, "cameras")
+    partial = _read_cameras(model, names, folder, "poses") if given is None else None
     with ThreadPoolExecutor(min(_READERS, thread_limit())) as pool:
         files = list(pool.map(lambda name: _probe(folder / name, options), names))
     left_out = {name: file.fault for name, file in zip(names, files, strict=True) if file.fault}
@@ -381,17 +386,16 @@ def load_images(
 
 def images_from_arrays(
     pixels: Mapping[str, NDArray[Any]],
-    cameras: Mapping[str, Any] | Any | None = None,
+    cameras: Cameras | None = None,
     options: InputOptions | None = None,
 ) -> ImageSet:
     """Make an image set of pixel arrays in memory.
 
     Args:
         pixels: (H, W, 3) uint8 RGB or (H, W) uint8 gray pixels by image name.
-        cameras: Camera of all images, or camera of each image by name, as
-            :class:`~mpsfm_core.PinholeCamera` or ``pycolmap.Camera``. Without a camera, the focal
-            length starts at ``options.default_focal_ratio`` times the longer image side and is
-            refined.
+        cameras: Camera of all images, camera of each image by name, or COLMAP model. Without
+            cameras, the focal length starts at ``options.default_focal_ratio`` times the longer
+            image side and is refined.
         options: see :class:`InputOptions`.
 
     Raises:
@@ -401,7 +405,8 @@ def images_from_arrays(
     options = options or InputOptions()
     if len(pixels) < 2:
         raise InputError(f"images: at least two images are needed, got {len(pixels)}")
-    probed, arrays, known = {}, {}, {}
+    given = _read_cameras(cameras, pixels, None, "cameras")
+    probed, arrays = {}, {}
     for name, array in pixels.items():
         rgb = np.asarray(array)
         rgb = np.repeat(rgb[..., None], 3, axis=2) if rgb.ndim == 2 else rgb
@@ -414,33 +419,13 @@ def images_from_arrays(
         digest = hashlib.sha256(f"{size}".encode() + np.ascontiguousarray(rgb).tobytes())
         probed[name] = _ProbedImage(size, ImageHeader(None, 1, {}), digest.hexdigest())
         arrays[name] = rgb
-        if (camera := _given_camera(name, size, cameras)) is not None:
-            known[name] = camera
+    known = _known_cameras(probed, given, None)
     images = []
     for name, (camera, focal) in _add_guessed_cameras(known, probed, options).items():
         image = _source_image(name, Path(name), probed[name], camera, focal, options)
         images.append(replace(image, pixels=arrays[name]))
     _warn_of_default_focal_lengths(images, options)
     return ImageSet(images, options)
-
-
-def _given_camera(
-    name: str, size: tuple[int, int], cameras: Mapping[str, Any] | Any | None
-) -> pycolmap.Camera | None:
-    camera: Any = cameras
-    if isinstance(cameras, Mapping):
-        if name not in cameras:
-            raise InputError(f"cameras: no camera of image {name!r}")
-        camera = cameras[name]
-    if isinstance(camera, PinholeCamera):
-        camera = colmap_from_pinhole(camera)
-    if camera is not None and (camera.width, camera.height) != size:
-        raise InputError(
-            f"image {name!r} has {size[0]}x{size[1]} pixels, but its camera is for "
-            f"{camera.width}x{camera.height}"
-        )
-    found: pycolmap.Camera | None = camera
-    return found
 
 
 def _exclude_masks(names: Sequence[str], folder: Path, masks: Path) -> list[str]:
@@ -452,8 +437,15 @@ def _exclude_masks(names: Sequence[str], folder: Path, masks: Path) -> list[str]
     return [name for name in names if not name.startswith(prefix)]
 
 
-def _read_cameras(path: Path | None, names: Sequence[str], folder: Path) -> Intrinsics | None:
-    return None if path is None else read_intrinsics(path, folder).for_images(names)
+def _read_cameras(
+    given: Path | Cameras | None, names: Iterable[str], folder: Path | None, argument: str
+) -> Intrinsics | None:
+    """Return the cameras of a file or of an argument of the caller, with the names of the run."""
+    if given is None:
+        return None
+    if isinstance(given, Path):
+        return read_intrinsics(given, folder).for_images(names)
+    return intrinsics_from_cameras(given, folder, argument).for_images(names)
 
 
 @dataclass(frozen=True)

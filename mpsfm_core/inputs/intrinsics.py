@@ -15,16 +15,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import pycolmap
 import yaml
 
+from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.errors import InputError, did_you_mean
+from mpsfm_core.geometry.pycolmap_conversion import camera_key, colmap_from_pinhole
 from mpsfm_core.inputs.colmap_database import read_database
 from mpsfm_core.inputs.model_orientation import orient_camera, stored_size
 from mpsfm_core.inputs.models import match_names, read_image_lines, read_model
 from mpsfm_core.inputs.text_files import read_text_file
+
+Camera: TypeAlias = PinholeCamera | pycolmap.Camera
+Cameras: TypeAlias = Camera | Mapping[str, Camera] | pycolmap.Reconstruction
+"""Cameras of the caller: one camera of all images, a camera by image name, or a COLMAP model."""
 
 _DEFAULT_MODELS = {3: "SIMPLE_PINHOLE", 4: "PINHOLE"}
 _NUM_ORIENTATIONS = 8
@@ -60,9 +66,10 @@ class CameraEntry:
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """All cameras of an intrinsics file."""
+    """All cameras of an intrinsics file, or of the calling program."""
 
-    source: Path
+    source: Path | str
+    """Path of the intrinsics file, or name of an argument, for error messages."""
     entries: tuple[CameraEntry, ...]
 
     def for_images(self, names: Iterable[str]) -> Intrinsics:
@@ -161,7 +168,7 @@ class Intrinsics:
         listed = [image for entry in self.entries for image in entry.images or ()]
         raise InputError(
             f"{self.source} has no camera for image {name!r}{did_you_mean(name, listed)}; "
-            f"add the camera, or write 'images: all' for one camera of all images"
+            f"add the camera, or give one camera of all images ('images: all' in intrinsics.yaml)"
         )
 
 
@@ -181,9 +188,9 @@ def read_intrinsics(path: Path, images_folder: Path | None = None) -> Intrinsics
             has_images = any((path / name).is_file() for name in ("images.txt", "images.bin"))
             text = path / "cameras.txt"
             is_list = text.is_file() and not has_images
-            entries = _from_text(text) if is_list else _from_model(path, images_folder)
+            entries = _from_text(text) if is_list else _from_model(path, images_folder, path)
         elif path.suffix == ".json":
-            entries = _from_model(path, images_folder)
+            entries = _from_model(path, images_folder, path)
         elif path.suffix == ".db":
             entries = _from_database(path)
         elif path.suffix == ".txt":
@@ -194,6 +201,55 @@ def read_intrinsics(path: Path, images_folder: Path | None = None) -> Intrinsics
         raise InputError(f"intrinsics {path} cannot be read: {error}") from error
     _check_lists(path, entries)
     return Intrinsics(path, entries)
+
+
+def intrinsics_from_cameras(
+    cameras: Cameras, images_folder: Path | None = None, source: str = "cameras"
+) -> Intrinsics:
+    """Convert cameras of the calling program, which are cameras of images after EXIF rotation.
+
+    Args:
+        cameras: Camera of all images, camera of each image by name, or COLMAP model.
+        images_folder: Folder of the images of a COLMAP model of stored pixels.
+        source: Name of the argument with the cameras, for error messages.
+
+    Raises:
+        InputError: ``cameras`` has another type.
+    """
+    if isinstance(cameras, pycolmap.Reconstruction):
+        entries = _from_model(cameras, images_folder, source)
+    elif isinstance(cameras, Mapping):
+        entries = _from_mapping(source, cameras)
+    else:
+        camera = _to_colmap(source, cameras)
+        size = camera.width, camera.height
+        entries = (_entry(source, 1, camera.model_name, list(camera.params), size, None),)
+    return Intrinsics(source, entries)
+
+
+def _from_mapping(source: str, cameras: Mapping[str, Camera]) -> tuple[CameraEntry, ...]:
+    """Return the distinct cameras of a mapping, with the names of their images."""
+    distinct: dict[str, pycolmap.Camera] = {}
+    names: dict[str, list[str]] = {}
+    for name, given in cameras.items():
+        camera = _to_colmap(f"{source}: image {name!r}", given)
+        distinct.setdefault(camera_key(camera), camera)
+        names.setdefault(camera_key(camera), []).append(name)
+    numbered = dict(enumerate(distinct, start=1))
+    return _from_cameras(
+        source,
+        {number: distinct[key] for number, key in numbered.items()},
+        {number: names[key] for number, key in numbered.items()},
+    )
+
+
+def _to_colmap(where: str, camera: object) -> pycolmap.Camera:
+    if isinstance(camera, PinholeCamera):
+        return colmap_from_pinhole(camera)
+    if not isinstance(camera, pycolmap.Camera):
+        kind = type(camera).__name__
+        raise InputError(f"{where}: expected a PinholeCamera or pycolmap.Camera, got {kind}")
+    return camera
 
 
 def _from_yaml(path: Path) -> tuple[CameraEntry, ...]:
@@ -279,20 +335,22 @@ def _from_database(path: Path) -> tuple[CameraEntry, ...]:
     return tuple(replace(entry, is_stored=True) for entry in entries)
 
 
-def _from_model(path: Path, images_folder: Path | None) -> tuple[CameraEntry, ...]:
+def _from_model(
+    path: Path | pycolmap.Reconstruction, images_folder: Path | None, source: Path | str
+) -> tuple[CameraEntry, ...]:
     model = read_model(path, images_folder)
     names: dict[int, list[str]] = {}
     for image in model.images.values():
         names.setdefault(image.camera_id, []).append(image.name)
-    return _from_cameras(path, model.cameras, names)
+    return _from_cameras(source, model.cameras, names)
 
 
 def _from_cameras(
-    path: Path, cameras: Mapping[int, pycolmap.Camera], names: Mapping[int, list[str]]
+    source: Path | str, cameras: Mapping[int, pycolmap.Camera], names: Mapping[int, list[str]]
 ) -> tuple[CameraEntry, ...]:
     return tuple(
         _entry(
-            f"{path}, camera {number}",
+            f"{source}, camera {number}",
             number,
             camera.model_name,
             list(camera.params),

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path, PurePosixPath
+from typing import Any, TypeAlias
 
 import numpy as np
 import pycolmap
@@ -20,34 +21,43 @@ from mpsfm_core.data.result_layout import (
     TRANSFORMS,
     UNDISTORTED,
 )
+from mpsfm_core.geometry.pycolmap_conversion import pose_from
 from mpsfm_core.inputs.colmap_files import check_binary_model
 from mpsfm_core.inputs.model_orientation import orient_model
 from mpsfm_core.inputs.nerfstudio import read_transforms
 from mpsfm_core.inputs.text_files import read_text_file
+
+Poses: TypeAlias = pycolmap.Reconstruction | Mapping[str, Any]
+"""Poses of the caller: a COLMAP model, or ``cam_from_world`` by image name, see
+:func:`~mpsfm_core.geometry.pycolmap_conversion.pose_from`."""
 
 _TEXT_FILES = ("cameras", "images", "points3D", "frames", "rigs")
 _NUM_IMAGE_FIELDS = 10
 """Number of fields of an image line in ``images.txt``; the last field is the name."""
 
 
-def read_poses(path: Path, images_folder: Path | None = None) -> dict[str, Pose]:
+def read_poses(model: Path | Poses, images_folder: Path | None = None) -> dict[str, Pose]:
     """Read the poses ``cam_from_world`` of the registered images of a model by image name.
 
     Args:
-        path: as :func:`read_model`.
+        model: Poses of the caller, or path as in :func:`read_model`.
         images_folder: as :func:`read_model`.
 
     Raises:
-        InputError: as :func:`read_model`.
+        InputError: as :func:`read_model`, or a pose of the caller has a wrong shape.
     """
-    return reconstruction_poses(read_model(path, images_folder))
+    if isinstance(model, Mapping):
+        return {name: pose_from(name, pose) for name, pose in model.items()}
+    return reconstruction_poses(read_model(model, images_folder))
 
 
-def read_model(path: Path, images_folder: Path | None = None) -> pycolmap.Reconstruction:
+def read_model(
+    path: Path | pycolmap.Reconstruction, images_folder: Path | None = None
+) -> pycolmap.Reconstruction:
     """Read a COLMAP model (see :func:`find_model_folder`) or a ``transforms.json``.
 
     Args:
-        path: folder of the COLMAP model, or path of the ``transforms.json``.
+        path: folder of the COLMAP model, path of the ``transforms.json``, or model in memory.
         images_folder: folder of the images. If ``images_folder`` is given, a model of stored pixels
             is converted to upright images (see :func:`orient_model`). A ``transforms.json`` without
             image sizes needs the folder.
@@ -55,8 +65,9 @@ def read_model(path: Path, images_folder: Path | None = None) -> pycolmap.Recons
     Raises:
         InputError: the model does not exist or cannot be read.
     """
-    model = _read_stored_model(path, images_folder)
-    if images_folder is None or not images_folder.is_dir() or _is_result(path):
+    in_memory = isinstance(path, pycolmap.Reconstruction)
+    model = path if in_memory else _read_stored_model(path, images_folder)
+    if images_folder is None or not images_folder.is_dir() or (not in_memory and _is_result(path)):
         return model
     return orient_model(model, images_folder, match_names)
 

@@ -4,7 +4,7 @@ A run without compiled kernels compiles all kernels in parallel to extraction, a
 compilation before mapping. ``python -m mpsfm_core.pipeline.precompile`` compiles all kernels at
 installation. Two processes reconstruct a small synthetic scene and share the kernels on disk. The
 first process compiles the kernels of bundle adjustment first, the second process those of depth
-integration.
+integration and multi-view stereo.
 """
 
 from __future__ import annotations
@@ -12,19 +12,21 @@ from __future__ import annotations
 import hashlib
 import subprocess
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numba
 import numpy as np
 
-from mpsfm_core.data import PinholeCamera, View
+from mpsfm_core.data import Float64, MappingProblem, PinholeCamera, View
 from mpsfm_core.dense.densify import densify
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.geometry.patch_alignment import align_patches
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import InitializationOptions, MapperOptions
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.optimize.bundle_kernels import update_points
 from mpsfm_core.optimize.depth_integration import DepthIntegrator
 from mpsfm_core.providers.builtin.mutual_nearest import mutual_nearest
@@ -82,26 +84,45 @@ def compile_kernels(first: str) -> None:
 
     Args:
         first: Kernels to compile first, ``bundles`` (bundle adjustment) or ``depth`` (depth
-            integration).
+            integration and multi-view stereo).
     """
     scene, poses = room_scene(), arc_poses(3, 10.0)
     problem = make_mapping_problem(scene, _CAMERA, poses, points_per_view=60, map_width=64)
-    if first == "depth":
-        depth, normals = problem.images[0].depth, problem.images[0].normals
-        height, width = depth.shape
-        DepthIntegrator(depth, normals, _CAMERA.resized(width, height)).refine()
-    for is_global in (True, False):
-        initialization = InitializationOptions(global_initialization=is_global)
-        mapping = mapper.reconstruct(problem, MapperOptions(initialization=initialization))
     views = {
         image.name: View(image.name, scene.render(_CAMERA, pose).rgb, _CAMERA)
         for image, pose in zip(problem.images, poses, strict=True)
     }
-    dense, _ = densify(mapping.reconstructions[0], views.__getitem__, DenseOptions())
+    if first == "depth":
+        mutual_nearest(*np.ones((2, 1, 1), np.float32))
+        gray, no_points = np.ones((1, 1), np.float32), np.zeros((0, 2))
+        align_patches(gray, gray, no_points, no_points, np.zeros((0, 2, 2)), 3, 1.0)
+        depth, normals = problem.images[0].depth, problem.images[0].normals
+        height, width = depth.shape
+        DepthIntegrator(depth, normals, _CAMERA.resized(width, height)).refine()
+        _compile_dense(_known_reconstruction(problem, poses), views)
+    for is_global in (True, False):
+        initialization = InitializationOptions(global_initialization=is_global)
+        mapping = mapper.reconstruct(problem, MapperOptions(initialization=initialization))
+    _compile_dense(mapping.reconstructions[0], views)
+
+
+def _known_reconstruction(problem: MappingProblem, poses: Sequence[Float64]) -> Reconstruction:
+    """Make a reconstruction without points from depth priors and known poses."""
+    unmatched = [np.full(len(image.keypoints), -1) for image in problem.images]
+    images = [
+        RegisteredImage(
+            index, image.name, _CAMERA, pose[:, :3], pose[:, 3], point_ids, image.depth, 1.0
+        )
+        for index, (image, pose, point_ids) in enumerate(
+            zip(problem.images, poses, unmatched, strict=True)
+        )
+    ]
+    return Reconstruction(tuple(images), np.zeros((0, 3)), np.zeros(0))
+
+
+def _compile_dense(reconstruction: Reconstruction, views: Mapping[str, View]) -> None:
+    dense, _ = densify(reconstruction, views.__getitem__, DenseOptions())
     fuse_depth_maps(dense, views.__getitem__)
-    mutual_nearest(*np.ones((2, 1, 1), np.float32))
-    gray, no_points = np.ones((1, 1), np.float32), np.zeros((0, 2))
-    align_patches(gray, gray, no_points, no_points, np.zeros((0, 2, 2)), 3, 1.0)
 
 
 def _stamp_path() -> Path | None:

@@ -27,12 +27,13 @@ from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
 from mpsfm_core.extraction.runner import Extraction, extend_matches, extract
 from mpsfm_core.inputs.image_search import check_output_folder, find_images
 from mpsfm_core.inputs.images import ImageSet, load_images
+from mpsfm_core.inputs.intrinsics import Cameras
 from mpsfm_core.inputs.matches import (
     ImportedMatches,
     matches_from_database,
     matches_from_hloc,
 )
-from mpsfm_core.inputs.models import describe_name_difference, match_names, read_poses
+from mpsfm_core.inputs.models import Poses, describe_name_difference, match_names, read_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
@@ -97,9 +98,10 @@ def reconstruct(
     output: PathLike | None = None,
     config: PathLike | Config = "default",
     *,
+    cameras: Cameras | None = None,
     intrinsics: PathLike | None = None,
     image_list: PathLike | None = None,
-    poses: PathLike | None = None,
+    poses: PathLike | Poses | None = None,
     features: Provider | None = None,
     matcher: Provider | None = None,
     retrieval: Provider | None = None,
@@ -126,12 +128,17 @@ def reconstruct(
             and written into ``frames/`` of the output.
         output: Result folder, used by one run at a time, or None to write nothing.
         config: Name of a shipped configuration, a YAML file, or a loaded configuration.
-        intrinsics: Camera intrinsics as ``intrinsics.yaml``, a COLMAP model or ``transforms.json``.
-            Without ``intrinsics``, focal lengths are taken from ``poses``, else from EXIF, else
-            estimated by the camera or depth provider, else set to a default.
+        cameras: Camera of all images, camera of each image by name, or ``pycolmap.Reconstruction``.
+            A camera is a :class:`~mpsfm_core.PinholeCamera` or a ``pycolmap.Camera`` of any
+            perspective model, for the image after EXIF rotation.
+        intrinsics: File with the cameras, instead of ``cameras``: ``intrinsics.yaml``, a COLMAP
+            model or ``transforms.json``. Without cameras, focal lengths are taken from ``poses``,
+            else from EXIF, else estimated by the camera or depth provider, else set to a default.
         image_list: Text file with one image name per line, by default all images of the folder.
-        poses: COLMAP model or ``transforms.json`` with poses of some or all images;
-            ``mapping.known_poses`` chooses whether known poses are fixed or refined.
+        poses: Poses of some or all images as path of a COLMAP model or ``transforms.json``,
+            ``pycolmap.Reconstruction``, or poses ``cam_from_world`` by image name in the forms that
+            :func:`build_problem` accepts. The option ``mapping.known_poses`` chooses whether known
+            poses are fixed or refined.
         features: Provider of features that replaces the configured provider. Each provider argument
             is a name, a configuration block, or an object with the method that its provider kind
             requires. Results of a provider object are not cached for later runs.
@@ -187,13 +194,16 @@ def reconstruct(
     matches = (database,) if database is not None else hloc or ()
     if matches:
         config = _without_matching(config)
-    if isinstance(images, ImageSet) and (intrinsics is not None or image_list is not None):
-        raise TypeError("intrinsics and image_list belong to load_images, which made the images")
+    if cameras is not None and intrinsics is not None:
+        raise TypeError("give cameras or the file intrinsics, not both")
+    given_cameras = cameras if intrinsics is None else Path(intrinsics)
+    if isinstance(images, ImageSet) and (given_cameras is not None or image_list is not None):
+        raise TypeError("cameras and image_list belong to load_images, which made the images")
     source = _Source(
         images if isinstance(images, ImageSet) else Path(images),
-        _path(intrinsics),
+        given_cameras,
         _path(image_list),
-        _path(poses),
+        Path(poses) if isinstance(poses, str) else poses,
         tuple(Path(file) for file in matches),
     )
     run = _Run(source, config, registry, _path(output), fresh, on_event)
@@ -203,15 +213,20 @@ def reconstruct(
 
 @dataclass(frozen=True)
 class _Source:
-    """Input files of a run."""
+    """Input files and objects of a run."""
 
     images: Path | ImageSet
     """Folder of photos, path of a video, or loaded images."""
-    intrinsics: Path | None
+    cameras: Path | Cameras | None
     image_list: Path | None
-    poses: Path | None
+    poses: Path | Poses | None
     matches: tuple[Path, ...]
     """COLMAP database, or features and matches files of hloc; empty to run the matchers."""
+
+    @property
+    def camera_model(self) -> Path | pycolmap.Reconstruction | None:
+        """Model of the known poses, whose cameras are used if no cameras are given."""
+        return None if isinstance(self.poses, Mapping) else self.poses
 
     @property
     def video(self) -> Path | None:
@@ -351,10 +366,10 @@ class _Run:
                 assert self._image_folder is not None
                 images = load_images(
                     self._image_folder,
-                    source.intrinsics,
+                    source.cameras,
                     source.image_list,
                     self._config.inputs,
-                    model=source.poses,
+                    model=source.camera_model,
                     without=self._output,
                 )
             self._check_resources(images)
@@ -377,6 +392,10 @@ class _Run:
         """Compile the numba kernels in parallel to extraction, if a core is free."""
         if thread_limit() > 1:
             self._compilation = precompile.start_compilation()
+        if self._compilation is not None:
+            self._stages.notice(
+                "first run: numerical kernels are compiled during extraction; later runs load them"
+            )
 
     def _finish_compilation(self) -> None:
         if self._compilation is not None:
@@ -694,9 +713,12 @@ def _read_matches(files: tuple[Path, ...], images: ImageSet) -> ImportedMatches 
     return matches_from_hloc(files[0], files[1], images)
 
 
-def _read_known_poses(model: Path, images: ImageSet, images_folder: Path | None) -> dict[str, Pose]:
+def _read_known_poses(
+    given: Path | Poses, images: ImageSet, images_folder: Path | None
+) -> dict[str, Pose]:
     """Read the poses of a model, keyed by the matching image names of the run."""
-    poses = read_poses(model, images_folder)
+    poses = read_poses(given, images_folder)
+    model = given if isinstance(given, Path) else "poses"
     matched = match_names(images.names, poses)
     if not matched:
         difference = describe_name_difference(images.names, poses)

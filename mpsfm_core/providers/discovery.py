@@ -9,14 +9,11 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
-import json
 import logging
-import os
 import re
-import subprocess
 import sys
 import threading
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import redirect_stdout
 from dataclasses import dataclass
 from importlib import metadata
@@ -67,14 +64,18 @@ def create_plugin_manager() -> pluggy.PluginManager:
 
 
 def installed_plugins(
-    timeout_s: float, crashing: Collection[tuple[str, str]] = ()
+    timeout_s: float,
+    crashing: Collection[tuple[str, str]] = (),
+    on_load: Callable[[str, str], None] | None = None,
 ) -> Iterator[LoadedPlugin]:
     """Load every entry point of the group ``mpsfm.plugins``, ordered by distribution and name.
 
     Args:
         timeout_s: Time limit for loading each plugin.
-        crashing: Pairs (name, module) of entry points that are not loaded, see
-            :func:`crashing_plugins`.
+        crashing: Pairs (name, module) of entry points that are not loaded, because they crash the
+            process.
+        on_load: Function that is called with the name and module of each entry point before the
+            entry point is loaded.
 
     Yields:
         One loaded plugin per entry point, with a ``fault`` if loading the plugin failed.
@@ -87,64 +88,9 @@ def installed_plugins(
             fault = "ends the whole process when it is loaded"
             yield LoadedPlugin(entry.name, name, version, fault=fault, hint=hint)
         else:
+            if on_load is not None:
+                on_load(entry.name, entry.value)
             yield _load(entry, name, version, timeout_s)
-
-
-def crashing_plugins(timeout_s: float) -> set[tuple[str, str]]:
-    """Find the plugins that crash the process in which they are loaded.
-
-    A child process prints the name of each entry point before loading the plugin. If the child
-    process crashes, the plugin with the last printed name is the cause. The search for crashing
-    plugins then starts again without that plugin.
-
-    Args:
-        timeout_s: Time limit for loading each plugin.
-
-    Returns:
-        Pairs (name, module) of the entry points of crashing plugins.
-    """
-    entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
-    remaining = {(entry.name, entry.value) for entry in entries}
-    crashing: set[tuple[str, str]] = set()
-    while remaining:
-        command = [
-            sys.executable,
-            "-c",
-            _PROBE_SCRIPT,
-            json.dumps(sorted(remaining)),
-            str(timeout_s),
-        ]
-        process = subprocess.run(
-            command,
-            env=subprocess_environment(),
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            check=False,
-        )
-        announced = [line for line in process.stdout.decode().splitlines() if line.startswith("[")]
-        if process.returncode >= 0 or not announced:
-            break
-        name, module = json.loads(announced[-1])
-        remaining.discard((name, module))
-        crashing.add((name, module))
-    return crashing
-
-
-_PROBE_SCRIPT = """
-import json, os, sys
-from mpsfm_core.providers import discovery
-wanted = [tuple(pair) for pair in json.loads(sys.argv[1])]
-for entry in discovery.metadata.entry_points(group=discovery.ENTRY_POINT_GROUP):
-    if (entry.name, entry.value) in wanted:
-        os.write(1, (json.dumps([entry.name, entry.value]) + chr(10)).encode())
-        discovery._load(entry, entry.name, "", float(sys.argv[2]))
-os._exit(0)
-"""
-
-
-def subprocess_environment() -> dict[str, str]:
-    """Return environment variables that make this process's modules importable in a child."""
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
 
 
 def inspect_plugin(module: object, name: str, distribution: str, version: str) -> LoadedPlugin:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import importlib
 import logging
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from importlib import metadata
@@ -25,7 +25,6 @@ from mpsfm_core.providers import KINDS, Kind, ProviderContext, ProviderSpec, Wei
 from mpsfm_core.providers.builtin import plugin as builtin
 from mpsfm_core.providers.discovery import (
     LoadedPlugin,
-    crashing_plugins,
     create_plugin_manager,
     find_spec_fault,
     inspect_plugin,
@@ -119,7 +118,12 @@ class Registry:
 
     @classmethod
     def discover(
-        cls, timeout_s: float | None = None, environments: bool = True, *, probe: bool = False
+        cls,
+        timeout_s: float | None = None,
+        environments: bool = True,
+        *,
+        without: Collection[tuple[str, str]] = (),
+        on_load: Callable[[str, str], None] | None = None,
     ) -> Registry:
         """Create a registry of the built-in providers, all installed plugins and environments.
 
@@ -131,8 +135,10 @@ class Registry:
                 ``$MPSFM_PLUGIN_TIMEOUT_S`` or 10.
             environments: True also registers the providers of other Python environments as
                 ``NAME@ENVIRONMENT``, see :mod:`mpsfm_core.providers.environments`.
-            probe: True loads all plugins in a child process first. A plugin that crashes the child
-                process is listed as unavailable and not loaded in this process.
+            without: Pairs (name, module) of entry points that crash the process. Their plugins are
+                listed as unavailable and not loaded.
+            on_load: Function that is called with the name and module of each plugin before the
+                plugin is loaded.
 
         Returns:
             Registry with the providers of all plugins.
@@ -140,7 +146,7 @@ class Registry:
         registry = cls()
         registry.register(builtin, name="builtin", distribution=CORE, version=core_version())
         limit = _default_timeout() if timeout_s is None else timeout_s
-        for plugin in installed_plugins(limit, crashing_plugins(limit) if probe else ()):
+        for plugin in installed_plugins(limit, without, on_load):
             registry._add(plugin)
         if environments:
             registry._add_environments()

@@ -62,7 +62,7 @@ def helper(**options: Any) -> Callable[[F], F]:
 
 
 def _compiled(function: F, **options: Any) -> F:
-    compiled: F = njit(**_ALWAYS, **options)(function)
+    compiled: F = njit(**_ALWAYS, no_cfunc_wrapper=True, **options)(function)
     return compiled
 
 

@@ -12,7 +12,7 @@ import mpsfm_core
 LIGHT_IMPORT = """
 import sys
 import mpsfm_core
-heavy = {"torch", "numba", "cv2", "pycolmap", "mpsfm_core.api", "mpsfm_core.pipeline.run"}
+heavy = {"torch", "numba", "cv2", "pycolmap", "numpy", "pydantic", "pluggy", "mpsfm_core.data"}
 assert not heavy & sys.modules.keys(), heavy & sys.modules.keys()
 """
 
@@ -30,3 +30,14 @@ def test_unknown_name_is_an_attribute_error() -> None:
 
 def test_import_loads_nothing_heavy() -> None:
     subprocess.run([sys.executable, "-c", LIGHT_IMPORT], check=True)
+
+
+def test_help_imports_neither_numpy_nor_pydantic() -> None:
+    script = (
+        "import sys\n"
+        "from mpsfm_core.cli import build_app\n"
+        "build_app()(['--help'], standalone_mode=False)\n"
+        "print({'numpy', 'pydantic', 'mpsfm_core.providers'} & sys.modules.keys())"
+    )
+    ended = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+    assert ended.stdout.splitlines()[-1] == b"set()"

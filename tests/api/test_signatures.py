@@ -110,10 +110,11 @@ def test_examples_of_classes_run(module: str) -> None:
     assert tested.attempted and not tested.failed
 
 
-def shown_code() -> str:
+def code_run_by_tests() -> str:
     """Return the code of notebooks and of the pages whose snippets are run as tests."""
     pages = ("docs/library.md", "docs/coming-from.md", "docs/tutorial-plugin.md", "CONTRIBUTING.md")
-    parts = [(ROOT / page).read_text(encoding="utf-8") for page in pages]
+    texts = [(ROOT / page).read_text(encoding="utf-8") for page in pages]
+    parts = re.findall(r"^```python\n(.*?)^```", "\n".join(texts), re.MULTILINE | re.DOTALL)
     for notebook in (ROOT / "examples").glob("*.ipynb"):
         cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
         parts += ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
@@ -121,7 +122,19 @@ def shown_code() -> str:
 
 
 @pytest.mark.parametrize("name", sorted(EXPORTED.keys() - {"__version__"}))
-def test_exported_name_is_documented_with_an_example(name: str) -> None:
+def test_exported_name_has_an_example_that_tests_run(name: str) -> None:
     documentation = inspect.getdoc(EXPORTED[name]) or ""
     assert documentation
-    assert ">>>" in documentation or re.search(rf"\b{name}\b", shown_code()), name
+    has_doctest = getattr(EXPORTED[name], "__module__", "") in MODULES_WITH_DOCTESTS
+    is_run = has_doctest and ">>>" in documentation
+    assert is_run or re.search(rf"\b{name}\b", code_run_by_tests()), name
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_examples_of_functions_pass_known_arguments(name: str) -> None:
+    documentation = inspect.getdoc(FUNCTIONS[name]) or ""
+    for example in doctest.DocTestParser().get_examples(documentation):
+        for node in ast.walk(ast.parse(example.source)):
+            if isinstance(node, ast.Call):
+                target = EXPORTED.get(ast.unparse(node.func).removeprefix("mpsfm."))
+                assert target is None or not misfit(node, target), example.source

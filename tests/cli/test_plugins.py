@@ -36,8 +36,8 @@ def test_plugins_list_imports_nothing_heavy(install_plugin: Callable[..., str]) 
     """
     install_plugin("mpsfm-needy", source)
     script = (
-        "import sys; from mpsfm_core.cli import build_app\n"
-        "build_app()(['plugins', 'list', '--json'], standalone_mode=False)\n"
+        "import dataclasses, json, sys; from mpsfm_core import Registry\n"
+        "print(json.dumps(list(map(dataclasses.asdict, Registry.discover().status()))))\n"
         f"print(*[name for name in {HEAVY} if name in sys.modules], file=sys.stderr)"
     )
     paths = [str(Path(mpsfm_core.__file__).parents[1]), *sys.path]

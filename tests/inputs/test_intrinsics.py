@@ -8,8 +8,9 @@ import numpy as np
 import pycolmap
 import pytest
 
+from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.intrinsics import read_intrinsics
+from mpsfm_core.inputs.intrinsics import intrinsics_from_cameras, read_intrinsics
 
 SIZE = (640, 480)
 
@@ -24,6 +25,42 @@ def refused(tmp_path: Path, text: str, name: str = "a.jpg", size: tuple[int, int
     with pytest.raises(InputError) as caught:
         read(tmp_path, text).camera(name, size)
     return str(caught.value)
+
+
+PINHOLE = PinholeCamera(*SIZE, 500.0, 510.0, 320.0, 240.0)
+
+
+def test_one_camera_object_is_for_all_images() -> None:
+    camera = intrinsics_from_cameras(PINHOLE).camera("any.jpg", SIZE)
+    assert (camera.model_name, camera.params.tolist()) == ("PINHOLE", [500, 510, 320, 240])
+    with pytest.raises(InputError, match=r"cameras, camera 1, image 'any.jpg' \(480x640"):
+        intrinsics_from_cameras(PINHOLE).camera("any.jpg", SIZE[::-1])
+
+
+def test_equal_camera_objects_share_a_camera_and_names_need_no_suffix() -> None:
+    radial = pycolmap.Camera.create_from_model_name(9, "SIMPLE_RADIAL", 600.0, *SIZE)
+    given = intrinsics_from_cameras({"a": PINHOLE, "b": PINHOLE, "c": radial})
+    found = given.for_images(["a.jpg", "b.jpg", "c.jpg"])
+    ids = [found.camera(f"{name}.jpg", SIZE).camera_id for name in "abc"]
+    assert ids == [1, 1, 2]
+    with pytest.raises(InputError, match=r"cameras has no camera for image 'd\.jpg'"):
+        found.camera("d.jpg", SIZE)
+
+
+def test_wrong_camera_object_names_its_image() -> None:
+    with pytest.raises(InputError, match="image 'a': expected a PinholeCamera"):
+        intrinsics_from_cameras({"a": 500.0})
+
+
+def test_cameras_of_a_model_in_memory_are_those_of_its_folder(tmp_path: Path) -> None:
+    options = pycolmap.SyntheticDatasetOptions(num_rigs=1, num_cameras_per_rig=1, num_points3D=20)
+    model = pycolmap.synthesize_dataset(options)
+    model.write(tmp_path)
+    name, camera = model.images[1].name, model.cameras[1]
+    size = camera.width, camera.height
+    in_memory, read_back = intrinsics_from_cameras(model), read_intrinsics(tmp_path)
+    assert in_memory.camera(name, size).params.tolist() == camera.params.tolist()
+    assert in_memory.entries == read_back.entries
 
 
 def test_default_models(tmp_path: Path) -> None:

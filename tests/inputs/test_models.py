@@ -37,6 +37,18 @@ def test_folder_without_model_or_with_broken_model_raises(tmp_path: Path) -> Non
         read_poses(tmp_path)
 
 
+def test_poses_in_memory_are_those_of_the_model() -> None:
+    model = pycolmap.synthesize_dataset(pycolmap.SyntheticDatasetOptions(num_points3D=20))
+    poses = read_poses(model)
+    rigid = {image.name: image.cam_from_world() for image in model.images.values()}
+    assert poses.keys() == rigid.keys() == read_poses(rigid).keys()
+    for name, (rotation, translation) in read_poses(rigid).items():
+        np.testing.assert_array_equal(rotation, poses[name][0])
+        np.testing.assert_array_equal(translation, poses[name][1])
+    with pytest.raises(InputError, match=r"pose of 'a': expected shape \(3, 4\)"):
+        read_poses({"a": np.eye(3)})
+
+
 def test_names_match_without_extension_or_folder() -> None:
     available = ["a/1.jpg", "b/1.jpg", "2.v1.png", "3.jpg", "3.png"]
     assert match_names(["a/1", "2.v1", "3.png"], available) == {

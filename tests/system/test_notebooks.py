@@ -43,13 +43,14 @@ def test_notebooks_use_only_public_names() -> None:
 
 
 @pytest.mark.slow
-def test_notebooks_pass_strict_mypy(tmp_path: Path) -> None:
+def test_examples_pass_strict_mypy(tmp_path: Path) -> None:
     for name in NOTEBOOKS:
         (tmp_path / f"{name}.py").write_text("\n".join(code(name)))
     options = ["--strict", "--allow-untyped-calls", "--cache-dir", str(tmp_path / "cache")]
     options += ["--config-file", str(EXAMPLES.parent / "pyproject.toml")]
-    for name in NOTEBOOKS:
-        run = [sys.executable, "-m", "mypy", *options, str(tmp_path / f"{name}.py")]
+    package = EXAMPLES / "third-party-depth" / "ridge_depth"
+    for path in (*(tmp_path / f"{name}.py" for name in NOTEBOOKS), package):
+        run = [sys.executable, "-m", "mypy", *options, str(path)]
         ended = subprocess.run(run, capture_output=True, text=True, cwd=EXAMPLES.parent)
         assert ended.returncode == 0, ended.stdout
 

@@ -1,10 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 
 from mpsfm_core.testing import ContractSetup
 from mpsfm_core.testing.painted_views import decoder
 
 
-def contract(folder):
+def contract(folder: Path) -> ContractSetup:
     """Write test weights, which compute depth from the colors of the contract test images."""
     colours, bias = decoder()
     np.savez(

@@ -3,7 +3,7 @@ from mpsfm_core.providers.uncertainty.calibration import DepthCalibration
 
 
 @hookimpl
-def mpsfm_providers():
+def mpsfm_providers() -> list[ProviderSpec]:
     return [
         ProviderSpec(
             kind="depth",

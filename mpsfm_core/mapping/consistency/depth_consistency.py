@@ -222,7 +222,9 @@ class DepthConsistencyCheck:
         depth_map = self._scene.maps[image]
         step = compute_subsampling_step(depth_map.valid.shape[1], self._options.map_width)
         depth = subsample(depth_map.depth, step)
-        valid = subsample(depth_map.valid, step)
+        valid = subsample(
+            depth_map.valid, step
+        ).copy()  # kernels compile again for read-only arrays
         std = subsample(depth_map.log_std, step) * np.float32(std_factor)
         if self._options.weigh_evidence:
             local = measure_local_depth_noise(
@@ -354,21 +356,30 @@ def compute_violation_ratio(
         limit: Limit with which the caller compares the violation ratio. Only a quarter of the
             pixels is measured if their violation ratio is significantly above or below the limit.
     """
-    inverse_rotation, counts = rotation.T.copy(), np.zeros((2, 2))
-    inverse_translation = -inverse_rotation @ translation
+    # Loops over scalars instead of array expressions, which take seconds to compile.
+    inverse_rotation, inverse_translation = np.empty((3, 3)), np.zeros(3)
+    for i in range(3):
+        for j in range(3):
+            inverse_rotation[i, j] = rotation[j, i]
+            inverse_translation[i] -= rotation[j, i] * translation[j]
+    violations_a, pixels_a, violations_b, pixels_b, ratio = 0.0, 0.0, 0.0, 0.0, 0.0
     for quarter in range(4):
-        counts[0] += _count_violations(grid_a, grid_b, rotation, translation, criteria, quarter)
-        counts[1] += _count_violations(
+        num_violations, num_pixels = _count_violations(
+            grid_a, grid_b, rotation, translation, criteria, quarter
+        )
+        violations_a, pixels_a = violations_a + num_violations, pixels_a + num_pixels
+        num_violations, num_pixels = _count_violations(
             grid_b, grid_a, inverse_rotation, inverse_translation, criteria, quarter
         )
-        ratio, num_pixels = (counts[:, 0] / counts[:, 1]).sum(), counts[:, 1].mean()
-        std = math.sqrt(2 * limit / num_pixels)
+        violations_b, pixels_b = violations_b + num_violations, pixels_b + num_pixels
+        ratio = violations_a / pixels_a + violations_b / pixels_b
+        std = math.sqrt(4 * limit / (pixels_a + pixels_b))
         if not quarter and abs(ratio - limit) > MIN_SIGNIFICANCE * std:
             break
-    return float(ratio)
+    return ratio
 
 
-@jit.kernel()
+@jit.helper()
 def _count_violations(
     source: _DepthGrid,
     target: _DepthGrid,
@@ -376,16 +387,18 @@ def _count_violations(
     translation: Float64,
     criteria: ViolationCriteria,
     quarter: int,
-) -> Float64:
+) -> tuple[float, float]:
     """Count the violating and the compared pixels of one image on one of four pixel lattices."""
     rows, columns = target.depth.shape
     r, t, num_violations, num_pixels = rotation, translation, 0.0, 0.0
     limit = criteria.max_deviation
     zoom = target.intrinsics[0] / source.intrinsics[0]
     # sample the depth error 0 first, because most pixels are consistent without a depth error
-    steps = np.arange(2 * NUM_ERROR_STEPS + 1)
-    errors = limit * ((steps + 1) // 2) / NUM_ERROR_STEPS * (1 - 2 * (steps % 2))
-    weights = np.exp(-errors * errors / 2) * limit / NUM_ERROR_STEPS / math.sqrt(2 * math.pi)
+    errors, weights = np.empty(2 * NUM_ERROR_STEPS + 1), np.empty(2 * NUM_ERROR_STEPS + 1)
+    for step in range(len(errors)):
+        error = limit * ((step + 1) // 2) / NUM_ERROR_STEPS * (1 - 2 * (step % 2))
+        density = math.exp(-error * error / 2) * limit / NUM_ERROR_STEPS / math.sqrt(2 * math.pi)
+        errors[step], weights[step] = error, density
     min_likelihood = math.exp(-limit * limit / 2)
     first_row = PIXEL_STRIDE // 2 + PIXEL_STRIDE * (quarter // 2)
     first_column = PIXEL_STRIDE // 2 + PIXEL_STRIDE * (quarter % 2)
@@ -420,4 +433,4 @@ def _count_violations(
             if likelihood < min_likelihood:
                 area = (zoom * source_depth / (source_depth * ray_z + t[2])) ** 2
                 num_violations += min(1.0, area) if criteria.by_target_area else 1.0
-    return np.array([num_violations, max(num_pixels, 1.0)])
+    return num_violations, max(num_pixels, 1.0)

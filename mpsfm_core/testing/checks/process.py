@@ -20,7 +20,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mpsfm_core.providers.discovery import subprocess_environment
+from mpsfm_core.support.child_process import subprocess_environment
 from mpsfm_core.testing.contract_case import ContractCase, describe_difference
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.leak_probe import measure_usage
