@@ -12,8 +12,8 @@ The function :func:`mpsfm_core.reconstruct` runs the same stages one after anoth
 
 Every stage accepts arrays and objects of the caller instead of the results of earlier stages. A
 provider argument is the name of an installed provider, a configuration block, or an object with the
-method that its provider kind requires. The package ``mpsfm_core`` imports the module when a stage
-is first used.
+method that its provider kind requires. The package ``mpsfm_core`` imports :mod:`mpsfm_core.api`
+when a stage is first used.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def load_images(
         output: Folder into which the keyframes of a video are written.
         config: Configuration, of which the block ``inputs`` is used.
         overrides: Settings such as ``"inputs.max_image_size=1600"``.
-        registry: Providers that the configuration may name, by default all installed ones.
+        registry: Providers that the configuration may name, by default all installed providers.
         on_event: Function that receives progress events.
 
     Returns:
@@ -147,7 +147,7 @@ def extract_features(
         masks: Mask providers, in whose masked areas features are removed.
         config: Configuration with providers and options.
         overrides: Settings such as ``"features.options.max_keypoints=2048"``.
-        registry: Providers that the configuration may name, by default all installed ones.
+        registry: Providers that the configuration may name, by default all installed providers.
         on_event: Function that receives progress events.
 
     Returns:
@@ -164,7 +164,7 @@ def extract_features(
     """
     config, registry = configure(config, registry, overrides, masks=masks, features=features)
     if config.features is None:
-        raise InputError("features: the configuration has no features provider; name one")
+        raise InputError("features: the configuration has no features provider; name a provider")
     with _extraction(images, config, registry, ("features", "masks"), on_event) as context:
         assert context.config.features is not None
         table = FeatureTable(context, context.config.features)
@@ -199,7 +199,7 @@ def match_images(
         masks: Mask providers, in whose masked areas dense matches are removed.
         config: Configuration with providers and options.
         overrides: Settings such as ``"pairs.mode=sequential"``.
-        registry: Providers that the configuration may name, by default all installed ones.
+        registry: Providers that the configuration may name, by default all installed providers.
         on_event: Function that receives progress events.
 
     Returns:
@@ -262,7 +262,7 @@ def predict_priors(
         masks: Mask providers, in whose masked areas depth and normals are invalid.
         config: Configuration with providers and options.
         overrides: Settings such as ``"extraction.integration_size=300"``.
-        registry: Providers that the configuration may name, by default all installed ones.
+        registry: Providers that the configuration may name, by default all installed providers.
         on_event: Function that receives progress events.
 
     Returns:
@@ -387,8 +387,9 @@ def from_colmap(
     Args:
         model: COLMAP model with poses and points.
         images: Images of the model, which are required for cameras with lens distortion.
-        depth: Depth maps by image name in units of the model. The default is a constant depth map,
-            whose standard deviation covers the depths of the points that the image observes.
+        depth: Depth maps by image name in units of the model. An image without depth map gets a
+            constant depth, whose standard deviation covers the depths of the points that the image
+            observes.
 
     Raises:
         InputError: ``images`` is missing although a camera has lens distortion, or an image without

@@ -58,7 +58,7 @@ _METRICS = ("coverage", "coverage_without_scaling", "z_mad", "nll", "nll_heavy",
 
 @dataclass(frozen=True)
 class CalibrationImages:
-    """Images with ground truth, with the parameters of :func:`mpsfm_core.reconstruct`."""
+    """Images with ground truth, given as in the arguments of :func:`mpsfm_core.reconstruct`."""
 
     folder: Path
     """Folder of the images."""

@@ -29,11 +29,13 @@ from mpsfm_core.optimize.covariance import compute_point_covariances, propagate_
 from mpsfm_core.optimize.options import SOFT_L1_OPTIONS
 
 MIN_ANGLE_DEG = 2.0
-"""Minimum triangulation angle of a true point in degrees [reference: robust_triangles]."""
+"""Minimum triangulation angle in degrees of a 3D point whose depth counts as true [reference:
+robust_triangles]."""
 MAX_LOG_STD = 0.05
-"""Maximum relative std of the depth of a true point [ours]."""
+"""Maximum relative std of the depth of a 3D point whose depth counts as true [ours]."""
 MAX_ERROR_STD = 4.0
-"""Maximum reprojection error of a true point in keypoint stds [reference: 4 px]."""
+"""Maximum reprojection error, in keypoint stds, of a 3D point whose depth counts as true
+[reference: 4 px]."""
 STD_PX_RANGE = (0.3, 3.0)
 """Minimum and maximum of the estimated keypoint noise in pixels [ours]."""
 REACH = 0.08
@@ -67,8 +69,8 @@ def sample_evenly(
 ) -> DepthTruth:
     """Sample pixels uniformly and return the true depth of the point nearest to each pixel.
 
-    The same point may be sampled for several pixels. Pixels without a point within :data:`REACH`
-    are omitted.
+    Several pixels may get the depth of the same 3D point. Pixels without a point within
+    :data:`REACH` are omitted.
 
     Args:
         truth: True depth at the observed points of a view.

@@ -41,7 +41,8 @@ _NORMALISER = gamma(0.5 * (FREEDOM + 1)) / gamma(0.5 * FREEDOM) / np.sqrt(FREEDO
 _RESTARTS = 5
 _SMALLEST_GAIN = 1e-6
 _RANGE = 1e4
-"""Bound of a std factor, relative to the factor that is fitted if its term is the only term."""
+"""Bound of the ratio between a std factor and the factor that is fitted if its term is the only
+one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +172,9 @@ class _Problem:
         bounds = [(v - span, v + span) for v in self._alone]
         bounds += [(0.0, span)] * (self._edge_ratio is not None) + [(-9.0, 9.0)]
         best = minimize(self._objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
-        for _ in range(_RESTARTS):  # A new largest std term invalidates the L-BFGS memory.
+        # Restart L-BFGS, because its curvature estimate is wrong after another std term becomes the
+        # largest.
+        for _ in range(_RESTARTS):
             again = minimize(self._objective, best.x, jac=True, method="L-BFGS-B", bounds=bounds)
             gain = best.fun - again.fun
             best = again if gain > 0 else best

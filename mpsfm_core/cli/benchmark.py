@@ -132,7 +132,7 @@ def _split_list(text: str) -> tuple[str, ...]:
 
 
 def _compare(first: str, second: str) -> None:
-    """Print the pose AUC differences of two finished benchmarks."""
+    """Print the pose AUC differences of two finished benchmark runs."""
     from mpsfm_core.evaluation.comparison import (
         compare_benchmarks,
         format_differences,

@@ -27,7 +27,7 @@ def doctor(
 ) -> None:
     """List installed plugins, the providers of a run, and how to improve runs on this machine.
 
-    The check downloads and computes nothing. Exit code 1 if a plugin is broken.
+    The check downloads and computes nothing. The exit code is 1 if a plugin is broken.
     """
     from mpsfm_core.cli.cache import cache_size, format_size
     from mpsfm_core.config import load_config

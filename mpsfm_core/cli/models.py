@@ -140,8 +140,8 @@ def export(
 ) -> None:
     """Export a network that is not published as a file, from its authors' code and weights.
 
-    The code of the network's authors runs in a subprocess. The exported file is compared with the
-    authors' network, and its provider then finds the file by name.
+    The code of the network's authors runs in a subprocess. The outputs of the exported file are
+    compared with those of the authors' network. The network's provider then finds the file by name.
     """
     from mpsfm_core.data.errors import InputError, did_you_mean
     from mpsfm_core.providers.environments.environment import find_environment
@@ -196,7 +196,7 @@ def verify(
 
 @app.command()
 def path(targets: Targets, cache: CacheDir = None) -> None:
-    """Print the local files of weights; fails if a file is missing."""
+    """Print the local paths of weights files; fail if a weights file is missing."""
     from mpsfm_core.data.errors import WeightsError
     from mpsfm_core.providers.weights import WeightStore
 

@@ -35,7 +35,7 @@ Stage speeds of earlier runs on the same machine replace the default values."""
 _PAIRWISE = {"matching", "verification", "adjustment"}
 """Stages whose work is counted in image pairs instead of images."""
 _FULL_WEIGHT_RATIO = 0.2
-"""Completed ratio of a stage above which the estimate uses only its measured speed [ours]."""
+"""Completed ratio of a stage above which the estimate uses only the measured speed [ours]."""
 
 
 class RemainingTimeEstimator:

@@ -39,9 +39,9 @@ from mpsfm_core.support.format_versions import VERSION, check_version
 from mpsfm_core.support.yaml_text import find_line, parse_assignment, parse_yaml
 
 REPLACE_FAST_PASS = ("features", "matcher", "dense_matcher", "multiview")
-"""Configuration blocks whose ``use:`` drops the block ``fast_pass`` of the parent file.
-The block ``multiview`` is included because the groups of images of a multi-view network are chosen
-by their matches."""
+"""Configuration blocks whose ``use:`` drops the block ``fast_pass`` of the parent file. The block
+``multiview`` is included because the groups of images of a multi-view network are chosen from the
+match graph."""
 
 
 def shipped_configs() -> dict[str, Path]:

@@ -41,7 +41,7 @@ def configure(
 
     Args:
         config: Name of a shipped configuration, a YAML file, or a loaded configuration.
-        registry: Providers that the configuration may name, by default all installed ones.
+        registry: Providers that the configuration may name, by default all installed providers.
         overrides: Settings such as ``"runtime.workers=2"``.
         masks: Mask providers of the caller, or None to keep the configured mask providers.
         providers: Provider of the caller by configuration block, such as ``depth``, where None

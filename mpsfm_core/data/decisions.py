@@ -62,7 +62,7 @@ class ImageReason(ReasonCode):
     """
     CONTRADICTED_BY_IMAGES = ("contradicted-by-images", "num_images")
     MISREGISTERED = ("misregistered", "num_matches")
-    """The matches that contradict the pose outnumber those that support it by ``num_matches``."""
+    """The matches that contradict the pose outnumber the supporting matches by ``num_matches``."""
     SPLIT_OFF = ("split-off", "num_matches")
     """Only one image pair connects the image to the model, and the matches that contradict the pair
     outnumber its inliers by ``num_matches``."""

@@ -44,8 +44,8 @@ class MappingImage:
     focal_known: bool = True
     """False if the focal length is a guess for bundle adjustment to refine."""
     camera_id: int = 0
-    """Number of the physical camera. Images with equal camera number and equal intrinsics share a
-    guessed focal length."""
+    """Number of the physical camera that took the image. Images with equal camera number and equal
+    intrinsics share a guessed focal length."""
     focal_log_std: float = 0.7
     """Prior std of the logarithm of a guessed focal length."""
     focal_guess_px: float | None = None

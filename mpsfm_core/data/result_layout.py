@@ -1,7 +1,8 @@
 """Names of the files and folders that a run writes into its output folder.
 
 Folders that contain a ``summary.json`` are results, so the search for input images skips them. The
-package ``mpsfm_core.results`` writes these files, and ``mpsfm_core.report`` reads these files.
+package ``mpsfm_core.results`` writes the result files, and ``mpsfm_core.report`` reads the result
+files.
 """
 
 SUMMARY = "summary.json"

@@ -197,7 +197,7 @@ class DenseCheckpoints:
         try:
             self._cache.store("dense", self._key(name), depth)
         except OutputError as error:
-            with self._warning_lock:  # several threads save depth maps
+            with self._warning_lock:  # Several threads store depth maps.
                 if not self._failed:
                     _log.warning(_DISK_ERROR, error)
                 self._failed = True

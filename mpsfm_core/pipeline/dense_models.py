@@ -70,7 +70,8 @@ def _densify_model(
     matched = match_names(find_images(images), poses)
     if len(matched) < 2:
         raise InputError(
-            f"{images}: contains {len(matched)} of the photos of {model}, two are needed"
+            f"{images}: the folder contains {len(matched)} of the photos of model {model}; stereo "
+            f"needs two photos"
         )
     photos = load_images(images, model=model, names=list(matched))
     points = {str(image.name): _point_depths(colmap, image) for image in colmap.images.values()}

@@ -168,8 +168,8 @@ class _ProviderSearch:
 
     Args:
         registry: Installed providers.
-        require_weights: Function that makes a weights file available, or raises WeightsError. The
-            function may append a file that must be downloaded to ``absent``.
+        require_weights: Function that makes a weights file available, or raises WeightsError.
+            Instead of downloading a file, the function may append the file to the list ``absent``.
         absent: Weights of the current candidate provider that must be downloaded.
     """
 
@@ -246,7 +246,7 @@ class _ProviderSearch:
             raise SettingsError(tuple(problems))
 
     def _require_files(self, path: SettingPath, kind: Kind, block: ProviderConfig) -> None:
-        """Check the files that options name, and make the weights available."""
+        """Check that the files in provider options exist, and make the weights available."""
         options = self._registry.validate_options(kind, block.use, block.options)
         for key, file in _paths(options):
             if not file.exists():

@@ -141,8 +141,8 @@ def find_shortages(estimate: ResourceEstimate, cache: Path, output: Path | None)
     remedy = "reduce inputs.max_image_size or dense.max_size, use fewer photos"
     if estimate.memory_mb > MAX_RATIO * total_mb:
         raise InputError(
-            f"{need}, but the machine or container has {total_mb:.0f} MB: {remedy}, "
-            f"or set runtime.check_resources=false"
+            f"{need}, but only {total_mb:.0f} MB exist in the machine or container: {remedy}, or "
+            f"set runtime.check_resources=false"
         )
     if estimate.memory_mb > free_mb:
         warnings.append(f"{need}, but {free_mb:.0f} MB are free, so the run may fail: {remedy}")

@@ -156,7 +156,7 @@ def reconstruct(
         hloc: Features file and matches file of hloc, as an alternative to ``database``.
         overrides: Settings such as ``"runtime.workers=2"``; not allowed with a loaded
             configuration.
-        registry: Providers that the configuration may name, by default all installed ones.
+        registry: Providers that the configuration may name, by default all installed providers.
         fresh: If true, ignore the checkpoint of an interrupted run and start mapping again.
         on_event: Function that receives progress events, see :mod:`mpsfm_core.data.events`. To
             cancel the run, the function raises :class:`~mpsfm_core.Cancelled`.
@@ -563,7 +563,7 @@ class _Run:
             try:
                 write_report(self._output)
             except Exception as error:
-                _log.warning("report.html cannot be written, all other results are: %s", error)
+                _log.warning("only report.html cannot be written, of all results: %s", error)
                 _log.debug("the report", exc_info=True)
 
     def _complete_summary(self, summary: RunSummary) -> None:
@@ -571,7 +571,8 @@ class _Run:
         if self._output is None:
             return
         summary["resources"] = self._describe_resources(self._output)
-        with suppress(OSError):  # summary.json of the results stage stays valid
+        # The disk may be full; the summary.json of the results stage remains valid.
+        with suppress(OSError):
             update_summary(self._output, summary)
 
     def _summarize(
@@ -625,7 +626,7 @@ class _Run:
         """
         config = self._config
         store = WeightStore(config.runtime.cache_dir, offline=True)
-        networks = {  # a network that serves two blocks is loaded once
+        networks = {  # A network that predicts both depth and normals is loaded only once.
             (provider.use, file.uri): resources.measure_weights(file, store)
             for _, kind, provider in config.provider_configs()
             for file in self._registry.weights(kind, provider.use, provider.options)
@@ -725,7 +726,8 @@ def _read_known_poses(
         raise InputError(f"{model}: the model has a pose of none of the images; {difference}")
     if len(matched) < 2:
         raise InputError(
-            f"{model}: the model has a pose of {next(iter(matched))} only, two are needed"
+            f"{model}: the model has a pose of {next(iter(matched))} only; a run needs the poses "
+            f"of two images"
         )
     unmatched = sorted(poses.keys() - set(matched.values()))
     if unmatched:

@@ -154,6 +154,6 @@ def peak_memory_mb() -> float | None:
 
         unit = (
             1 << 20 if sys.platform == "darwin" else 1 << 10
-        )  # macOS counts bytes, other systems kilobytes
+        )  # macOS reports peak memory in bytes, other systems in kilobytes.
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
     return None

@@ -139,7 +139,7 @@ def find_spec_fault(spec: ProviderSpec) -> tuple[str, str]:
         )
     try:
         fault = _malformed(spec)
-    except Exception as error:  # Fields of the provider specification have unexpected types.
+    except Exception as error:  # Fields of the provider specification may have any type.
         fault = str(error)
     if fault:
         return f"has a wrong specification: {fault}", "tell the plugin's author"
@@ -199,7 +199,7 @@ def _hint(error: BaseException, distribution: str) -> str:
     """Return advice for the user about a plugin whose import raised an error."""
     absent = (error.name or "") if isinstance(error, ImportError) else ""
     if absent.partition(".")[0] == "mpsfm_core" or "ProviderSpec.__init__()" in str(error):
-        # The plugin was made for a newer plugin interface.
+        # The import fails because the plugin requires a newer version of mpsfm-core.
         return f"pip install --upgrade mpsfm-core, or uninstall {distribution}"
     if absent and isinstance(error, ModuleNotFoundError):
         return f"pip install the package of module {absent!r}, or uninstall {distribution}"
@@ -212,7 +212,8 @@ def _malformed(spec: ProviderSpec) -> str:
         return f"unknown kind {spec.kind!r}{did_you_mean(str(spec.kind), KINDS)}"
     name = spec.name
     if isinstance(name, str) and callable(spec.factory):
-        name = name.partition("@")[0]  # The text after "@" is the name of an environment.
+        # The text after "@" in a provider name is the name of a Python environment.
+        name = name.partition("@")[0]
     if not (isinstance(name, str) and _NAME.fullmatch(name)):
         return f"name {spec.name!r} may only have lower-case letters, digits and - . _"
     if not (callable(spec.factory) or _is_reference(spec.factory)):

@@ -90,9 +90,9 @@ class Executor(Protocol):
     def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
         """Call ``step(item)`` for each item on one of the workers.
 
-        The function ``step`` writes its result to the cache and returns nothing. If a worker is
-        lost, the item that it processed runs again on another worker. Closing the generator cancels
-        the items that no worker has started.
+        The function ``step`` writes its result to the cache and returns nothing. If a worker
+        process ends unexpectedly, another worker processes its item again. Closing the returned
+        generator cancels all items that no worker has started.
 
         Args:
             step: Picklable function that processes one item, such as one image.
@@ -209,7 +209,7 @@ class ProviderSpec:
     """Weights files of the provider, or a function that returns the weights files for given
     provider options. A run finds or downloads the weights files before reading the first image."""
     accuracy: str = ""
-    """Expected accuracy of the provider and its source, in one line."""
+    """Expected accuracy of the provider and the source of the figures, in one line."""
     calibration: DepthCalibration | NormalCalibration | None = None
     """Model that converts the variance of a depth, multi-view or normals provider to a calibrated
     variance. None uses the default uncertainty model."""
@@ -283,8 +283,8 @@ class Hooks:
         """Return the uncertainty model of a provider of this plugin for given provider options.
 
         Args:
-            kind: Kind of the provider, which is ``depth``, ``normals``, ``multiview``, or
-                ``wrapper`` for a wrapper around one of these.
+            kind: Kind of the provider, which is ``depth``, ``normals``, ``multiview`` or
+                ``wrapper``.
             provider: Name of the provider.
             options: Validated options of the provider, None if the provider has no options.
 
@@ -301,7 +301,7 @@ class Hooks:
             options: Value of ``runtime.executor_options``.
 
         Returns:
-            Executor with that name, or None if this plugin does not provide it.
+            Executor with the given name, or None if the plugin has no such executor.
 
         Raises:
             ConfigError: The executor options are wrong or the workers cannot be reached.

@@ -30,13 +30,14 @@ class ProviderConfig(Options):
 
     use: str
     """Name of the provider, as in the output of ``mpsfm plugins list``. The form
-    ``DISTRIBUTION:NAME`` chooses between pip packages that contain providers of the same name."""
+    ``DISTRIBUTION:NAME`` selects the pip package if several packages have a provider of the same
+    name."""
     fallback: tuple[str, ...] = ()
     """Names of fallback providers, tried in this order if the provider ``use`` is unavailable. A
     provider is unavailable if its plugin or weights are missing, or if it rejects the options."""
     environment: str | None = None
     """Name of the Python environment that contains the provider ``use`` (see ``mpsfm env create``).
-    Validation replaces the option by the provider name ``NAME@ENVIRONMENT``."""
+    Validation merges ``environment`` into the provider name ``use`` as ``NAME@ENVIRONMENT``."""
     options: dict[str, Any] = Field(default_factory=dict)
     """Options of the provider without its wrappers, validated by the provider's options class."""
     wrap: tuple[ProviderConfig, ...] = ()
@@ -51,7 +52,10 @@ class ProviderConfig(Options):
     def _merge_environment(cls, values: Any) -> Any:
         if isinstance(values, Mapping) and values.get("environment") and "use" in values:
             if values["use"] == SAME_NETWORK or "@" in str(values["use"]):
-                raise ValueError(f"environment: 'use: {values['use']}' already selects it")
+                raise ValueError(
+                    f"environment: the provider 'use: {values['use']}' already selects an "
+                    f"environment"
+                )
             values = {**values, "use": f"{values['use']}@{values['environment']}"}
             del values["environment"]
         return values

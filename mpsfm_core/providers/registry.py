@@ -127,8 +127,7 @@ class Registry:
     ) -> Registry:
         """Create a registry of the built-in providers, all installed plugins and environments.
 
-        The registry lists a plugin that fails to load with the reason; other plugins are not
-        affected.
+        The registry lists a plugin that fails to load with the reason, and loads all other plugins.
 
         Args:
             timeout_s: Time limit in seconds for loading one plugin, by default
@@ -263,7 +262,8 @@ class Registry:
         """
         entry = self._entry(kind, name)
         factory = entry.spec.factory
-        if hasattr(factory, "code_keys"):  # the provider runs in another Python environment
+        # The factory of a provider in another environment returns hashes of the code there.
+        if hasattr(factory, "code_keys"):
             keys: dict[str, str] | None = factory.code_keys()
             return keys
         found: dict[str, str | None] = {}
@@ -419,7 +419,7 @@ class Registry:
 
     @property
     def hook(self) -> pluggy.HookRelay:
-        """Plugin hooks of pluggy, whose exceptions are not handled as in :meth:`call_hook`."""
+        """Hooks of all plugins, which unlike :meth:`call_hook` let exceptions pass."""
         return self._manager.hook
 
     def call_hook(self, name: str, /, **arguments: Any) -> list[Any]:

@@ -2,7 +2,7 @@
 
 The version of a package does not identify its code if the package is installed in editable mode or
 is installed again without a new version. Therefore the source hash covers the files of the package
-instead of its version.
+instead of the package version.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from pathlib import Path
 _STARTED = time.time()
 """Time at which this process imported MP-SfM, in seconds since 1970."""
 _MAX_FILE_BYTES = 1 << 20
-"""Maximum size of a hashed file; larger files are weights, which cache keys contain by URI."""
+"""Maximum size of a hashed file; larger files are network weights, whose URI is a separate part of
+the cache key."""
 _CORE = "mpsfm_core"
 
 

@@ -40,12 +40,13 @@ def validate_filtered_pairs(
         pairs: Candidate pairs of image names that the plugin received.
 
     Returns:
-        Selected pairs of image names as a list. Selected pairs that are no candidates remain in the
-        list and have no effect.
+        Selected pairs of image names as a list. The list may contain pairs that are no candidates,
+        which the caller ignores.
 
     Raises:
         TypeError: The hook's return value is not an iterable of pairs of image names.
-        ValueError: The plugin selects image pairs, but none of them is a candidate.
+        ValueError: The plugin selects image pairs, but none of the selected pairs is a candidate
+            pair.
     """
     if not isinstance(answer, Iterable):
         raise TypeError(f"the hook must return pairs of image names, got {type_name(answer)}")

@@ -49,7 +49,7 @@ FORMAT = 1
 CACHE_VARIABLE = "MPSFM_CACHE"
 """Environment variable with the path of the cache folder."""
 OFFLINE_VARIABLES = ("MPSFM_OFFLINE", "HF_HUB_OFFLINE")
-"""Environment variables that forbid downloads of weights unless they are unset, empty or 0."""
+"""Environment variables that forbid downloads of weights if their value is neither empty nor 0."""
 
 Progress = Callable[[str, int, "int | None"], None]
 """Function that reports download progress. The arguments are the file name, the number of
@@ -140,7 +140,7 @@ class WeightStore:
                     self._download_to_cache(uri, path, expected or self._recorded(uri))
         except OSError as error:
             raise WeightsError(
-                f"cannot store {uri} in the cache {self.cache_dir}: {error}"
+                f"cannot store weights file {uri} in the cache folder {self.cache_dir}: {error}"
             ) from error
         return path
 
@@ -185,7 +185,9 @@ class WeightStore:
         """
         path = self.locate(uri)
         if path is None:
-            raise WeightsError(f"{uri} is not on this machine; 'mpsfm models fetch' downloads it")
+            raise WeightsError(
+                f"weights file {uri} is not on this machine; 'mpsfm models fetch' downloads it"
+            )
         expected = _normalize_hash(uri, sha256) or self._recorded(uri)
         actual = file_sha256(path)
         if expected not in (None, actual):
@@ -272,7 +274,7 @@ class WeightStore:
             check_version(entries, FORMAT, record, WeightsError)
             entries.pop(VERSION, None)
             if not all(isinstance(entry, dict) for entry in entries.values()):
-                raise ValueError("an entry is not a mapping")
+                raise ValueError("the entry of a weights file is not a mapping")
         except (ValueError, AttributeError, RecursionError) as error:
             raise WeightsError(
                 f"{record} is damaged ({error}): remove this file; weights files are then "
@@ -361,7 +363,7 @@ def _hash_mismatch(uri: str, path: Path | None, expected: str, actual: str) -> W
 
 
 def _file_stamp(path: Path) -> list[int]:
-    """Return the size and modification time of a file, which detect that it was changed."""
+    """Return the size and modification time of a file, which reveal a change of the file."""
     status = path.stat()
     return [status.st_size, status.st_mtime_ns]
 
@@ -535,7 +537,7 @@ def _open_with_timeout(
     thread.start()
     thread.join(_CONNECT_TIMEOUT_S)
     if not outcome:
-        raise TimeoutError(f"no answer from {request.host} within {_CONNECT_TIMEOUT_S:g} s")
+        raise TimeoutError(f"no answer from server {request.host} within {_CONNECT_TIMEOUT_S:g} s")
     if isinstance(outcome[0], Exception):
         raise outcome[0]
     response: http.client.HTTPResponse = outcome[0]
@@ -558,7 +560,7 @@ class _RedirectPolicy(urllib.request.HTTPRedirectHandler):
     def redirect_request(
         self, req: Any, fp: Any, code: int, msg: str, headers: Any, newurl: str
     ) -> Any:
-        """Return the HTTP request for a redirect, or raise WeightsError if it is forbidden."""
+        """Return the request for an HTTP redirect; raise WeightsError if it is forbidden."""
         new = urllib.parse.urlsplit(newurl)
         why = ""
         if not self._is_local_origin and is_local(new.netloc):

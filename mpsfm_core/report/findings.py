@@ -134,7 +134,9 @@ def _missing(summary: Mapping[str, Any]) -> Iterator[Finding]:
     for name, reason in summary["images"]["unregistered"].items():
         by_title[explain_image(reason).title].append((name, explain_image(reason)))
     failed = summary["status"] != "success"
-    if failed:  # the cause of the failure implies that images are unregistered
+    # The finding about the cause of a failed run already explains why these images are
+    # unregistered.
+    if failed:
         implied = {ImageReason.NO_REGISTERED_NEIGHBOR}
         if not summary["pairs"]["verified"]:
             implied.add(ImageReason.NO_VERIFIED_MATCHES)

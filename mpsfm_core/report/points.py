@@ -27,7 +27,8 @@ class PointSet:
     error: Float32
     """(n,) float32 reprojection errors in pixels or relative depth differences in percent."""
     std: Float32
-    """(n,) float32 minimum relative std in percent of the observing depth maps, NaN without one."""
+    """(n,) float32 minimum relative std in percent of the depth maps that observe the point, or
+    NaN."""
     views: Float32
     """(n,) float32 numbers of images that observe each point."""
     error_unit: str

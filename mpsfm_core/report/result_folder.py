@@ -32,7 +32,7 @@ class RefinedMap:
     depth: Float32
     """(h, w) float32 z-depth in units of the COLMAP model."""
     relative_std: Float32
-    """(h, w) float32 standard deviation of the depth over the depth."""
+    """(h, w) float32 standard deviation of the depth divided by the depth."""
     valid: Bool
     """(h, w) bool mask of valid depth."""
     camera: PinholeCamera
@@ -50,7 +50,7 @@ class PriorMaps:
     depth: Float32
     """(h, w) float32 z-depth in units of the depth provider."""
     relative_std: Float32
-    """(h, w) float32 standard deviation of the depth over the depth."""
+    """(h, w) float32 standard deviation of the depth divided by the depth."""
     normals: Float32
     """(h, w, 3) float32 unit normals in the camera frame."""
     valid: Bool
@@ -61,7 +61,7 @@ class PriorMaps:
 
 @dataclass(frozen=True, eq=False)
 class MatchLines:
-    """Sampled verified matches of two images, as keypoints in pixels of the undistorted images."""
+    """Random subset of the verified matches of two images, in pixels of the undistorted images."""
 
     image_a: str
     image_b: str

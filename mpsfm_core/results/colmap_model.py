@@ -45,7 +45,7 @@ def build_model(
 
     Args:
         reconstruction: poses, 3D points and tracks to convert.
-        cameras: camera of each registered image; images with equal cameras share one in the model.
+        cameras: camera of each registered image; images with equal cameras share one COLMAP camera.
         keypoints: keypoints of each registered image in pixels of ``cameras``.
         colors: (p, 3) RGB colors of the 3D points.
 
@@ -77,7 +77,7 @@ def build_model(
 def build_pinhole_model(
     reconstruction: Reconstruction, problem: MappingProblem
 ) -> pycolmap.Reconstruction:
-    """Build a COLMAP model with black points, which needs no images, of the undistorted views.
+    """Build a COLMAP model of the undistorted views with black points, without reading any image.
 
     Cameras of the model are PINHOLE, or have the estimated distortion if the views were not
     undistorted with the estimate.
@@ -224,7 +224,7 @@ def _is_text_complete(folder: Path, model: pycolmap.Reconstruction) -> bool:
 
 
 def _check_free_space(path: Path, size: int) -> None:
-    """Raise ``OSError`` unless a file of this many bytes can be written."""
+    """Raise ``OSError`` unless the disk has space for a file of the given size in bytes."""
     try:
         with path.open("wb") as file:
             for start in range(0, size, _BLOCK):

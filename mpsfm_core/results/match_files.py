@@ -61,8 +61,8 @@ def write_hloc_matches(
     Args:
         path: HDF5 matches file to write.
         graph: Match graph with matches of a sparse matcher.
-        rows: Row number in the features file of each feature (n,) by image name. By default,
-            features and file have the same rows.
+        rows: Row number in the features file of each feature (n,) by image name. By default, row i
+            of the features file is feature i.
 
     Raises:
         InputError: h5py is not installed.

@@ -32,7 +32,7 @@ _EXPOSURE_TIME, _F_NUMBER, _ISO_SPEED = 0x829A, 0x829D, 0x8827
 
 
 class OriginalImages:
-    """Access to the original images of the images of a mapping problem."""
+    """Access to the original image files and cameras of the images in a mapping problem."""
 
     def __init__(self, images: ImageSet, problem: MappingProblem) -> None:
         self.problem = problem
@@ -91,8 +91,9 @@ def exported_image_name(name: str) -> str:
 def export_view(images: ImageSet, index: int, path: Path) -> None:
     """Write the upright, undistorted image in the format of the file extension.
 
-    An upright, undistorted 8-bit RGB file of this format is copied without decoding. Other JPEG
-    files get the exposure of the original file, which Gaussian splatting programs compensate.
+    An upright, undistorted 8-bit RGB file is copied without decoding if its format is the same.
+    Other JPEG files get the exposure of the original file, which Gaussian splatting programs
+    compensate.
     """
     image = images[index]
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -106,7 +106,7 @@ def refine_reconstructions(
     reconstructions: Sequence[Reconstruction],
     options: MapperOptions,
 ) -> tuple[Reconstruction, ...]:
-    """Replace cameras by those of the refined views, and refine the depth maps in these views.
+    """Replace cameras by the cameras of refined views, and refine the depth maps in these views.
 
     Args:
         refined: Images with the cameras that :func:`undistort_images` estimated.

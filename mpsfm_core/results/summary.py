@@ -92,7 +92,7 @@ ProviderSummary = TypedDict(
         "computed": int,
         "from_cache": int,
         "seconds": float,
-        "from": str,  # Python distribution and version
+        "from": str,  # name and version of the provider's pip package
         "chosen": str,
         "passed_over": dict[str, dict[str, Value]],
         "code_license": str,

@@ -1,6 +1,6 @@
 """Write the mapper's input for the report as small images, priors and verified matches.
 
-A failed run also writes these files, so that the report shows the cause.
+A failed run also writes the mapper's input, so that the report shows the cause of the failure.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ def write_views(folder: Path, problem: MappingProblem, view_of: Callable[[str], 
 
     The file ``NAME.webp`` is the downscaled undistorted image. In ``NAME.npz``, ``depth`` (h, w)
     float32 is the depth prior in units of the depth provider. ``relative_std`` (h, w) float16 is
-    the standard deviation of the depth prior over the depth. ``valid`` (h, w) bool is the mask of
-    valid depth. ``normals`` (h, w, 3) float16 are unit normals in the camera frame. ``camera`` (6,)
-    float64 is the width, height, fx, fy, cx, cy of the full undistorted image.
+    the standard deviation of the depth prior divided by the depth. ``valid`` (h, w) bool is the
+    mask of valid depth. ``normals`` (h, w, 3) float16 are unit normals in the camera frame.
+    ``camera`` (6,) float64 is the width, height, fx, fy, cx, cy of the full undistorted image.
 
     In ``matches.npz``, ``names`` (n,) are the image names, and ``pairs`` (p, 2) int64 are image
     pairs as rows of ``names``. ``points_a`` and ``points_b`` (m, 2) float32 are the matched

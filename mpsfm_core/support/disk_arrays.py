@@ -28,8 +28,8 @@ class DiskArrays:
     """Storage of arrays in memory up to a limit, then in unnamed temporary files.
 
     Files are memory-mapped, so the operating system reads pages on demand and frees them when
-    memory is short. A temporary file is deleted with its last array or with the process. If the
-    disk is full, arrays stay in memory. Several threads may store arrays at the same time.
+    memory is short. A temporary file is deleted when its last array is freed or the process ends.
+    If the disk is full, arrays stay in memory. Several threads may store arrays at the same time.
 
     Args:
         folder: Folder of the temporary files. The folder should be on a disk, because the system's

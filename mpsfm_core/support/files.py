@@ -148,7 +148,8 @@ def _exchange(output: Path, scratch: Path) -> None:
     fresh, old = scratch / "new", scratch / "old"
     remaining = sorted(entry.name for entry in fresh.iterdir())
     moves = []
-    if remaining == new:  # else all old entries have been moved, because they precede new ones
+    # If a new entry has been renamed already, all old entries have been moved before.
+    if remaining == new:
         moves = [(output / name, old / name) for name in entries]
         moves = [(source, target) for source, target in moves if source.exists()]
     moves += [(fresh / name, output / name) for name in remaining]
@@ -177,7 +178,7 @@ def _read_plan(scratch: Path) -> tuple[list[str], list[str]]:
         check_version(content, FORMAT, path)
         entries, new = list(content["entries"]), list(content["new"])
         if any(Path(name).name != name or name in ("", "..") for name in (*entries, *new)):
-            raise ValueError("an entry names a file outside of the output folder")
+            raise ValueError("a listed file is outside of the output folder")
         if any((scratch / part).is_symlink() for part in ("new", "old")):
             raise ValueError("the scratch folder contains a symbolic link")
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
@@ -191,7 +192,7 @@ def _clear_up(output: Path) -> None:
     """Finish or remove the incomplete results of killed runs in a locked output folder."""
     for scratch in output.glob(f"{_SCRATCH}*"):
         if scratch.is_symlink() or not scratch.is_dir():
-            continue  # only a real folder can be a scratch folder
+            continue  # A scratch folder is never a symbolic link or a file.
         if (scratch / _READY).is_file() and (scratch / "new").is_dir():
             _log.warning(
                 "%s: a killed run left results incomplete, which are completed now", output
@@ -256,9 +257,8 @@ def _scratch(output: Path) -> Iterator[Path]:
     try:
         yield scratch
     finally:
-        shutil.rmtree(
-            scratch, ignore_errors=True
-        )  # the next run removes files that this call cannot remove
+        # The next run removes temporary files that cannot be removed now.
+        shutil.rmtree(scratch, ignore_errors=True)
 
 
 @contextmanager

@@ -37,7 +37,9 @@ def check_version(
     except (TypeError, ValueError, OverflowError):
         number = 0
     if number < 1:
-        raise error(f"{path}: its {VERSION} is {str(value)[:60]!r}, not a number from 1 on")
+        raise error(
+            f"file {path}: the key {VERSION!r} is {str(value)[:60]!r}, not a positive integer"
+        )
     if number > known:
         raise error(
             f"{path}: the file is of format {number}, written by a newer mpsfm-core; this version "

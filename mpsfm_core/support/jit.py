@@ -128,7 +128,8 @@ def _choose_cache_folder() -> None:
     except OSError:
         return
     if os.access(folder, os.W_OK):
-        os.environ["NUMBA_CACHE_DIR"] = str(folder)  # worker processes inherit the variable
+        # Worker processes inherit the environment variable.
+        os.environ["NUMBA_CACHE_DIR"] = str(folder)
         numba.config.CACHE_DIR = str(folder)
 
 

@@ -31,7 +31,7 @@ MASK_TOLERANCE = 0.05
 """Largest accepted ratio of wrong mask pixels, among pixels at least two pixels away from the
 border of a surface."""
 _MASK_SHIFT_PX = 6
-"""Largest shift in pixels between the true mask and a mask that is measured."""
+"""Largest shift in pixels of the true mask to which a provider's mask is compared."""
 _MASK_GAIN = 0.7
 """Ratio of wrong pixels of a mask after and before shifting the true mask, below which the mask
 counts as shifted."""
@@ -188,7 +188,8 @@ def _require_mask_not_shifted(mask: Bool, example: Example) -> None:
     for y in steps:
         for x in steps:
             near |= np.roll(hole, (y, x), axis=(0, 1))
-    # The sky next to a hole would move with a shifted copy of the mask.
+    # Exclude pixels near the sky, because a shifted copy of the mask also shifts the border of the
+    # sky.
     near &= replace(example, holes=False).truth().edge_free
     wrong = {
         (x, y): int((mask != np.roll(truth, (y, x), axis=(0, 1)))[near].sum())

@@ -40,7 +40,8 @@ def checks_of_kind(kind: Kind) -> tuple[Check, ...]:
 
 
 REQUIRED: tuple[Check, ...] = (check_specification, check_construction, check_output_rules)
-"""Contract checks without which all later checks are meaningless and therefore skipped."""
+"""Contract checks whose failure makes all later checks meaningless; later checks are then
+skipped."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Provider under test with its ContractSetup, and validated calls of it on synthetic views."""
+"""Provider under test with its ContractSetup, which is called on synthetic views."""
 
 from __future__ import annotations
 
@@ -39,8 +39,7 @@ from mpsfm_core.testing.outcome import CheckSkipped, CheckUnmeasured
 from mpsfm_core.testing.process_state import read_process_settings
 
 TruthSource = Literal["painted", "prepared", "image", "none"]
-"""Source from which a provider under test can derive the ground truth, see
-:class:`ContractSetup`."""
+"""Source of the ground truth for a provider under test, see :class:`ContractSetup`."""
 
 AUXILIARY_RELATIVE_STD = 0.02
 """Relative std of the exact depth prior that a normals provider with ``needs-depth`` receives."""
@@ -54,14 +53,13 @@ class ContractSetup:
     ``ProviderSpec.contract`` names. The argument ``folder`` is an empty temporary folder for test
     weights.
 
-    The attribute ``truth_source`` has one of four values.
-
-    * If ``"painted"``, a tiny test network decodes depth and normals from the colors of the views,
-      see :mod:`mpsfm_core.testing.painted_views`.
-    * If ``"prepared"``, the function ``prepare`` writes the ground truth to files, for providers
-      that read files.
-    * If ``"image"``, the correct output follows from a textured view, with or without real weights.
-    * If ``"none"``, the ground truth is unknown, and checks that need it are skipped.
+    The attribute ``truth_source`` has one of four values. The truth source ``"painted"`` means that
+    a tiny test network decodes depth and normals from the colors of the views, see
+    :mod:`mpsfm_core.testing.painted_views`. The truth source ``"prepared"`` means that the function
+    ``prepare`` writes the ground truth to files, for providers that read files. The truth source
+    ``"image"`` means that the correct output follows from a textured view, with or without real
+    weights. The truth source ``"none"`` means that the ground truth is unknown, so checks that
+    compare with the ground truth are skipped.
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
@@ -72,7 +70,7 @@ class ContractSetup:
     ``"none"`` for other provider kinds."""
     prepare: Callable[[Example], None] | None = None
     """Function that is called with each synthetic view before the provider runs on the view, for
-    instance to write a file."""
+    instance to write a depth file."""
     expected_failures: Mapping[str, str] = field(default_factory=dict)
     """Reason of each expected failure by the id of the contract check. If a provider passes a check
     that is expected to fail, the check is reported as failed."""
@@ -112,7 +110,7 @@ class ContractCase:
             spec: Specification of the provider.
             setup: ContractSetup of the provider under test.
             folder: Folder for the files of helper providers, such as a detector for a matcher.
-            name: Name of the provider in the registry, by default that of the specification.
+            name: Name of the provider in the registry, by default the name in the specification.
             behaves_as: Kind of the provider inside a wrapper, or None if the provider under test is
                 not a wrapper.
             device: ``"cpu"`` or ``"cuda"``.
@@ -136,7 +134,7 @@ class ContractCase:
 
     @property
     def truth_source(self) -> TruthSource:
-        """Source from which the provider under test can derive the ground truth."""
+        """Source of the ground truth for the provider under test."""
         if self._ground_truth is not None:
             return "prepared"
         return self.setup.truth_source or ("image" if self.description.sees_truth else "none")
@@ -303,7 +301,7 @@ class ContractCase:
         return provider.predict(view)
 
     def to_pickle(self) -> tuple[Any, ...]:
-        """Return the values from which :func:`restore_case` creates the case in another process.
+        """Return the values from which :func:`restore_case` creates an equal contract case.
 
         The other process can read the files that ``ContractSetup.prepare`` wrote.
         """

@@ -36,10 +36,10 @@ _FY_RATIO = 0.75
 _SKY = ((120, 170, 235), (200, 220, 245))
 """RGB of the sky at the upper and lower border of a textured synthetic view."""
 _HOLES = ((-0.42, -0.05, -0.28, 0.12), (0.33, 0.21, 0.52, 0.34), (-0.1, 0.38, 0.04, 0.47))
-"""Rectangles (left, top, right, bottom) of example views without ground truth, in slopes x / z and
-y / z."""
+"""Rectangles (left, top, right, bottom) without ground truth in example views, in normalized image
+coordinates x / z and y / z."""
 _COS_MAX_CREASE = np.cos(np.deg2rad(20.0))
-"""Smallest cosine between neighboring normals on a smooth surface, that of 20 degrees."""
+"""Smallest cosine of the angle between neighboring normals on a smooth surface, for 20 degrees."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +289,7 @@ def _shift_right(pose: Float64) -> Float64:
 
 
 def _is_smooth(surface: Int64, normals: Float64) -> Bool:
-    """Return the pixels (h, w) without an edge of surface or normals up to two pixels away."""
+    """Return the pixels (h, w) with no surface border or normal edge within two pixels."""
     same = np.ones(surface.shape, dtype=np.bool_)
     rows, columns = surface.shape
     for axis, size in ((0, rows), (1, columns)):

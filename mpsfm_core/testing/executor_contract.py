@@ -104,7 +104,7 @@ def check_errors(executor: Executor) -> None:
 
 
 def check_extraction(name: str, options: dict[str, Any], folder: Path) -> None:
-    """Require bitwise the same extraction as with threads, also if continued after Ctrl-C.
+    """Require extraction bitwise equal to that with threads, also if Ctrl-C interrupts the run.
 
     Args:
         name: Value of ``runtime.executor``.

@@ -139,4 +139,5 @@ GROUND_TRUTH_SPECS: Mapping[Kind, ProviderSpec] = MappingProxyType(
         "normals": _make_spec("normals", GroundTruthNormals),
     }
 )
-"""Specifications by kind. The contract tests replace the factory by :meth:`GroundTruth.factory`."""
+"""Specifications by kind. The contract tests replace the factory of the ground-truth provider by
+:meth:`GroundTruth.factory`."""

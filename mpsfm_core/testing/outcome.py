@@ -10,7 +10,7 @@ class CheckFailed(Exception):
 class CheckUndecided(CheckFailed):
     """The provider's output does not suffice for a contract check, which counts as a failure.
 
-    If the reason is legitimate, the plugin declares it in ``ContractSetup.expected_failures``.
+    A plugin declares a legitimate failure and its reason in ``ContractSetup.expected_failures``.
     """
 
     def __init__(self, reason: str) -> None:

@@ -278,7 +278,7 @@ def test_one_known_pose_is_wrong_input(photo_scene, mpsfm, tmp_path: Path) -> No
     model.write_text(str(tmp_path))
     ended = mpsfm(*photo_scene.arguments, "--output", tmp_path / "out", "--poses", tmp_path)
     assert ended.code == 2
-    assert "has a pose of 0.png only, two are needed" in ended.err
+    assert "has a pose of 0.png only; a run needs the poses of two images" in ended.err
 
 
 def test_poses_without_photo_are_reported(

@@ -26,7 +26,7 @@ class MatcherDepth:
         """Raise an error, because the matcher predicts depth only for image pairs.
 
         Raises:
-            ProviderError: The error is raised for every image.
+            ProviderError: Every call raises the error, because a matcher needs two images.
         """
         raise ProviderError(
             f"the depth of {view.name!r} is predicted by {self.source}, not from a single image"
@@ -37,7 +37,7 @@ class MultiViewDepth(MatcherDepth):
     """Placeholder depth provider for the option ``depth.use=multiview``.
 
     A multi-view network predicts depth for several images jointly. Feature extraction takes the
-    depth of each image from that prediction.
+    depth of each image from the network's joint prediction.
     """
 
     source = "a multi-view network"

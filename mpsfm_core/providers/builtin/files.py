@@ -74,7 +74,8 @@ class DepthFiles:
             )
         if stored is not None and stored.shape != depth.shape:
             raise InputError(
-                f"{path}: the shapes of variance {stored.shape} and depth {depth.shape} differ"
+                f"depth file {path}: the variance has shape {stored.shape}, but the depth has "
+                f"shape {depth.shape}"
             )
         with np.errstate(invalid="ignore"):
             variance = np.maximum(
@@ -96,7 +97,7 @@ class NormalFiles:
 
         Args:
             view: Undistorted image; its name selects the map file.
-            depth: Depth prior, which this provider does not use.
+            depth: Depth prior of the image, which a provider of normal files ignores.
 
         Returns:
             Unit normals in the camera frame.

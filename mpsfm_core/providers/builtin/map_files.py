@@ -38,7 +38,7 @@ def find_file(options: FileOptions, view: View, what: str) -> Path:
         Path of the existing map file.
 
     Raises:
-        InputError: There is no file for the image; the message has the expected path.
+        InputError: The image has no map file; the error message contains the expected path.
     """
     suffixes = _SUFFIXES if options.suffix is None else (options.suffix,)
     full = options.directory / view.name
@@ -68,7 +68,7 @@ def _find_ignoring_case(candidates: list[Path]) -> Path | None:
 def read_upright_arrays(
     options: FileOptions, path: Path, main: str, view: View
 ) -> tuple[dict[str, NDArray[Any]], int]:
-    """Read the named arrays of a map file, and rotate the arrays upright as the view.
+    """Read the named arrays of a map file, and rotate them as EXIF rotates the image.
 
     Args:
         options: Orientation of the map files.
@@ -77,8 +77,8 @@ def read_upright_arrays(
         view: Undistorted image that the map belongs to.
 
     Returns:
-        Arrays of the file by name, and the EXIF orientation by which the grids of the arrays were
-        rotated, 1 for upright maps. Vectors in the arrays, such as normals, are not rotated.
+        Arrays of the map file by name, and the EXIF orientation by which the grids of the arrays
+        were rotated, 1 for upright maps. Vectors in the arrays, such as normals, are not rotated.
     """
     arrays = read_arrays(path, main)
     height, width = (*arrays[main].shape, 0, 0)[:2]
@@ -94,14 +94,14 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
 
     Args:
         path: Path of an NPZ, NPY, EXR or image file; color channels are returned in the order RGB.
-        main: Name of the required array, such as "depth". Files in formats other than NPZ contain
-            one array, which is returned under this name.
+        main: Name of the required array, such as "depth". The only array of an NPY, EXR or image
+            file is returned under the name of the required array.
 
     Returns:
         Arrays of the file by name.
 
     Raises:
-        InputError: The file cannot be read or lacks the required array.
+        InputError: The map file cannot be read or lacks the required array.
     """
     try:
         if path.suffix in (".npz", ".npy"):
@@ -124,7 +124,7 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
 
 
 def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> None:
-    """Raise an error if a map has other channels or another aspect ratio than expected.
+    """Raise an error if the number of channels or the aspect ratio of a map file is wrong.
 
     Args:
         path: Path of the map file, for error messages.
@@ -144,8 +144,9 @@ def check_map(path: Path, values: NDArray[Any], view: View, channels: int) -> No
     aspect = (width / max(height, 1)) / (view.camera.width / view.camera.height)
     if not 1 - _MAX_ASPECT_DIFFERENCE < aspect < 1 + _MAX_ASPECT_DIFFERENCE:
         raise InputError(
-            f"map file {path} has {width}x{height} pixels and does not cover image {view.name!r} "
-            f"({view.camera.width}x{view.camera.height}), because the aspect ratios differ"
+            f"map file {path} does not cover image {view.name!r}, because the map ({width}x"
+            f"{height}) and the image ({view.camera.width}x{view.camera.height}) differ in aspect "
+            f"ratio"
         )
 
 
@@ -173,7 +174,7 @@ def _read_exr(path: Path) -> NDArray[Any]:
         openexr = importlib.import_module("OpenEXR")
     except ImportError as error:
         raise InputError(
-            f"{path}: reading EXR needs the package OpenEXR: pip install OpenEXR"
+            f"reading EXR file {path} needs the package OpenEXR: pip install OpenEXR"
         ) from error
     try:
         with openexr.File(str(path), separate_channels=True) as file:
@@ -193,4 +194,4 @@ def _choose_channels(channels: dict[str, NDArray[Any]]) -> NDArray[Any]:
     for name in _SINGLE_CHANNELS:
         if name in channels:
             return channels[name]
-    raise ValueError(f"none of the EXR channels {', '.join(sorted(channels))} is known")
+    raise ValueError(f"the EXR file has only unknown channels: {', '.join(sorted(channels))}")

@@ -19,16 +19,16 @@ _BLOCK = 128
 in the second image are 4 MB, which fits into CPU caches."""
 _ROUNDING = np.float32(1e-5)
 """Largest rounding error of a squared descriptor distance, relative to the squared descriptor
-length. Squared distances that differ by less count as equal, because the summation order of float32
-depends on the processor."""
+length. Squared distances that differ by less than the rounding error count as equal, because the
+summation order of float32 depends on the processor."""
 
 
 class MutualNearest:
     """Matcher of mutual nearest descriptors in Euclidean distance, for any local features.
 
     The score of a match is ``1 - ratio``. ``ratio`` is the distance to the nearest descriptor
-    divided by the distance to the second nearest. Of the ratios of the two match directions, the
-    larger one is used.
+    divided by the distance to the second nearest. The score uses the larger one of the ratios from
+    the first to the second image and back.
     """
 
     def __init__(self, options: MutualNearestOptions, context: ProviderContext) -> None:
@@ -81,8 +81,8 @@ def mutual_nearest(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
 
     Returns:
         Row indices (k, 2) of matching descriptors in ``a`` and ``b``, their distances (k,), and the
-        ratio (k,) of nearest to second nearest distance. The ratio is the larger one of the two
-        match directions.
+        ratio (k,) of nearest to second nearest distance. Each ratio is the larger one of the ratios
+        from the first to the second image and back.
     """
     if not (len(a) and len(b)):
         empty = np.empty(0, dtype=np.float32)
@@ -106,7 +106,7 @@ def mutual_nearest(a: Float32, b: Float32) -> tuple[Int64, Float32, Float32]:
 
 
 class _Nearest(NamedTuple):
-    """Index of and distances to the two nearest descriptors in the other image, per descriptor."""
+    """Nearest descriptor in the other image and the two smallest distances, per descriptor."""
 
     best: Int64
     nearest: Float32
@@ -135,7 +135,7 @@ def _compare(
     nearest_of_b: Float32,
     second_of_b: Float32,
 ) -> None:
-    """Update the nearest neighbors by the products ``-2 a b`` of a block of descriptors."""
+    """Update the nearest neighbors with the products ``-2 a b`` of a block of descriptors."""
     for i in range(len(norms_a)):
         best, nearest, second = 0, np.float32(np.inf), np.float32(np.inf)
         for j in range(len(norms_b)):

@@ -95,7 +95,7 @@ def fit_normals(
 
 
 class _Fit(NamedTuple):
-    """Plane vectors g (h, w, 3), variance (h, w) of the components perpendicular to g, validity."""
+    """Fitted plane vectors g (h, w, 3), their variance (h, w) perpendicular to g, and validity."""
 
     plane: Float64
     variance: Float64

@@ -81,8 +81,8 @@ class DepthFileOptions(FileOptions):
     metric: bool = True
     """False declares that depth values, multiplied by ``scale``, are not in meters."""
     relative_std: float | None = Field(None, ge=0)
-    """Depth std divided by depth. The option or ``std_floor`` is required if the files have no
-    variance."""
+    """Depth std divided by depth. Either ``relative_std`` or ``std_floor`` is required if the depth
+    files have no variance."""
     std_floor: float = Field(0.0, ge=0)
     """Smallest depth std, in the unit of depth multiplied by ``scale``."""
     variance: FileOptions | None = None
@@ -101,7 +101,7 @@ class NormalFileOptions(FileOptions):
     """Camera axes of the stored normals, which are x right, y down, z forward for ``opencv`` and x
     right, y up, z backward for ``opengl``."""
     std_deg: float | None = Field(None, gt=0)
-    """Angular std in degrees of the normals if the files have no variance."""
+    """Angular std in degrees of normals from files without variance."""
 
 
 class MaskFileOptions(FileOptions):
@@ -126,5 +126,5 @@ class NormalsFromDepthOptions(Options):
     depth edge. Raising the edge threshold fits planes across small depth steps [reference:
     continuity ratio 1.015]."""
     slope_std: float = Field(4.0, ge=0)
-    """Angular std of normals in radians divided by the relative std of depth. Raising this factor
+    """Angular std of normals in radians divided by the relative std of depth. Raising ``slope_std``
     lowers the weight of the normals [tuned: rendered kitchen with FastDepth]."""

@@ -20,8 +20,8 @@ FLAT_CALIBRATION = DepthCalibration(relative_std=0.5)
 """Depth uncertainty of the plane that replaces a missing depth map. The mapper estimates equal
 poses for a relative std from 0.3 to 0.5, and worse poses for 1.0. [tuned: sample scene]"""
 FROM_DEPTH_CALIBRATION = NormalCalibration(std_scale=1.0, std_floor_deg=1.0)
-"""Calibration of normals that are fitted to depth maps. The variance that the fit predicts is kept,
-but the standard deviation is at least 1 degree."""
+"""Calibration of normals that are fitted to depth maps. The angular std that the plane fit predicts
+is raised to at least 1 degree."""
 
 _LICENSE = "Apache-2.0"
 
@@ -87,8 +87,8 @@ def _depth() -> list[ProviderSpec]:
             summary="the depth that the matcher predicts for its pairs (pair-depth)",
             code_license=_LICENSE,
             contract="mpsfm_core.testing.builtin_contracts:depth_of_matcher",
-            # [reference] The factor converts MASt3R's confidence to a depth std; no std is
-            # proportional to depth.
+            # [reference] The factor converts MASt3R's confidence to a depth std. The depth std has
+            # no term that is proportional to depth.
             calibration=DepthCalibration(std_scale=0.862, relative_std=0.0),
         ),
         ProviderSpec(

@@ -38,7 +38,7 @@ class Sift:
         sift.normalization = (
             pycolmap.Normalization.L1_ROOT if options.root else pycolmap.Normalization.L2
         )
-        # Without this log level, COLMAP prints a line for each image.
+        # At its default log level, COLMAP prints a line for each image.
         if "GLOG_minloglevel" not in os.environ:
             pycolmap.logging.minloglevel = max(pycolmap.logging.minloglevel, _WARNING)
 
@@ -54,8 +54,8 @@ class Sift:
         xy = scale_pixels(keypoints[:, :2].astype(np.float64), size, view.camera.size)
         norms = np.linalg.norm(descriptors, axis=1, keepdims=True)
         return Features(
-            # The sub-pixel position of a SIFT keypoint may be outside of the image by a fraction of
-            # a pixel.
+            # Sub-pixel refinement may move a SIFT keypoint out of the image by a fraction of a
+            # pixel.
             np.clip(xy, 0, view.camera.size),
             descriptors / np.maximum(norms, np.float32(1e-6)),
             scales=axes.mean(axis=1) * np.float32(factor),

@@ -59,8 +59,8 @@ class Channel:
                 writes.
             lent: Number of received messages whose arrays may be alive at the same time without a
                 copy. Received arrays are numpy views of a shared memory block, or copies if all
-                blocks are in use. With None, received arrays are never copied and valid until the
-                next message arrives.
+                blocks are in use. If the number is None, received arrays are never copied and are
+                valid until the next message.
         """
         self._reader, self._writer = reader, writer
         self._own, self._other = folder / own, folder / other
@@ -99,7 +99,8 @@ class Channel:
         """
         length, self._target, size = _HEADER.unpack(self._read(_HEADER.size))
         if length > _LARGEST_TEXT:
-            # The pipe contains output of other code instead of a message header.
+            # Other code in the worker process wrote to the pipe, so these bytes are no message
+            # header.
             raise ChannelClosed
         text = self._read(length)
         block = self._inbox[self._announced].for_reading(size) if size else _EMPTY
@@ -155,7 +156,7 @@ class _Block:
         return content
 
     def close(self) -> None:
-        """Drop the reference to the memory map, which is unmapped when no array refers to it."""
+        """Release the memory map; the memory is unmapped when no array refers to it."""
         self._map, self._size = None, 0
 
     def _open(self, size: int) -> None:

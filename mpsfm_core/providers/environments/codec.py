@@ -96,8 +96,8 @@ def decode_message(text: bytes, block: UInt8, copy: bool) -> Any:
     """Decode a Python value from a received message.
 
     The decoder does not validate the decoded instances of data types. The constructors in the
-    sending process validated the values, and :mod:`mpsfm_core.providers.validation` validates every
-    return value of a provider.
+    sending process validated the fields of the instances, and
+    :mod:`mpsfm_core.providers.validation` validates every return value of a provider.
 
     Args:
         text: JSON text of the received message.

@@ -83,11 +83,12 @@ class Environment:
             self._worker = None
 
     def describe(self) -> list[dict[str, Any]]:
-        """Return the stored description of the environment's providers; start no process."""
+        """Return the stored description of the environment's providers; start no worker."""
         path = self.folder / _DESCRIPTION
         try:
             content = json.loads(path.read_text(encoding="utf-8"))
-            # The file was written by a version of MP-SfM that stored no format version.
+            # An early version of MP-SfM wrote the description of the providers as a list without a
+            # format version.
             if isinstance(content, list):
                 content = {"providers": content}
             check_version(content, FORMAT, path)
@@ -128,13 +129,14 @@ def find_environment(name: str) -> Environment:
     """Return the provider environment with the given name.
 
     Raises:
-        InputError: No environment has that name.
+        InputError: No provider environment has the given name.
     """
     known = {environment.name: environment for environment in all_environments()}
     if name not in known:
         hint = did_you_mean(name, known)
         raise InputError(
-            f"no environment {name!r}{hint}; 'mpsfm env create {name} PACKAGE' creates it"
+            f"no provider environment {name!r} exists{hint}; 'mpsfm env create {name} PACKAGE' "
+            f"creates it"
         )
     return known[name]
 
@@ -154,7 +156,7 @@ def create_environment(
 
     Raises:
         InputError: The environment name is invalid, or an environment with that name exists.
-        ProviderError: The environment cannot be created. A partly created environment is removed.
+        ProviderError: An installation command fails; a partly created environment is then removed.
     """
     if not _NAME.fullmatch(name):
         raise InputError(

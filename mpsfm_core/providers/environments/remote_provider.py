@@ -57,14 +57,14 @@ class RemoteOptions(Options):
 
     @classmethod
     def model_validate(cls, values: Any, **_: Any) -> Any:  # type: ignore[override]
-        """Validate option values in the other environment, which may raise SettingsError."""
+        """Validate option values in the provider's environment, or raise SettingsError."""
         return cls._from_values(cls.location.ask("options", values=dict(values)))
 
     @classmethod
     def model_construct(  # type: ignore[override]
         cls, _fields_set: Any = None, **values: Any
     ) -> Any:
-        """Construct the options of a remote provider without validation, as in pydantic."""
+        """Construct the options of a remote provider without validation (pydantic's method)."""
         return cls._from_values({**cls.defaults, **values})
 
     @classmethod
@@ -182,7 +182,7 @@ class RemoteSpec:
 def remote_providers(environment: Environment) -> list[RemoteSpec]:
     """List the provider specifications of an environment from its description file.
 
-    The function starts no process. The names of the listed providers have the form
+    Listing the providers starts no worker process. The names of the listed providers have the form
     ``NAME@ENVIRONMENT``.
 
     Args:
@@ -219,7 +219,7 @@ def remote_providers(environment: Environment) -> list[RemoteSpec]:
 
 @dataclass(frozen=True)
 class _Contract:
-    """Function that requests the setup of a provider's contract tests from its environment."""
+    """Function that gets the setup of a provider's contract tests from another environment."""
 
     location: ProviderLocation
 

@@ -90,7 +90,7 @@ class ProviderServer:
         raise ProviderError(f"unknown request {action!r}")
 
     def _limit_threads(self) -> None:
-        """Limit the threads of native libraries again if modules were imported meanwhile."""
+        """Limit the threads of native libraries again if new modules were imported."""
         if self._num_limited_modules != len(sys.modules):
             self._limit.close()
             self._limit.enter_context(limit_threads(self._threads))

@@ -27,11 +27,11 @@ _START_TIMEOUT_S = 120.0
 """Time limit in seconds for a worker process to import mpsfm-core, perhaps from a slow network
 disk."""
 _NEEDED_BYTES = 256 << 20
-"""Bytes that must be free on ``/dev/shm`` to use it for the messages of a worker process. Otherwise
-files in the temporary folder are used."""
+"""Bytes that must be free on ``/dev/shm`` to use it for the messages of a worker process. If
+``/dev/shm`` has less free space, the messages use files in the temporary folder."""
 _NUM_LENT_BLOCKS = 2
 """Number of replies of a worker whose arrays may be alive without a copy. Two replies suffice,
-because the worker computes one reply while this process stores the last one."""
+because the worker computes a reply while the client process stores the previous reply."""
 _EXIT_TIMEOUT_S = 5.0
 _MPSFM_ERRORS: Mapping[str, type[MpsfmError]] = MappingProxyType(
     {
@@ -202,7 +202,7 @@ def _resolved(
 
 
 def encode_error(error: BaseException) -> dict[str, Any]:
-    """Encode an exception for a message to the other process, see :func:`decode_error`."""
+    """Encode an exception as a message to another process, see :func:`decode_error`."""
     kind = next((k.__name__ for k in type(error).__mro__ if k.__name__ in _MPSFM_ERRORS), "")
     if isinstance(error, SettingsError):
         problems = [[list(p.path), p.text, p.missing] for p in error.problems]
@@ -214,7 +214,7 @@ def encode_error(error: BaseException) -> dict[str, Any]:
 
 
 def decode_error(message: Mapping[str, Any]) -> Exception:
-    """Decode an exception that :func:`encode_error` encoded in the other process."""
+    """Decode an exception that :func:`encode_error` encoded in the worker or client process."""
     if "settings" in message:
         problems = (
             SettingProblem(tuple(p), text, missing) for p, text, missing in message["settings"]

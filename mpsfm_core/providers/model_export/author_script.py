@@ -187,7 +187,8 @@ def _expm1(graph: Any, x: Any) -> Any:
 
 def _answer(model: torch.nn.Module, inputs: Inputs) -> tuple[torch.Tensor, ...]:
     result = model(*(tensor.clone() for tensor in inputs.values()))
-    # If the network returns a mapping, torch's exporter writes the values in the mapping's order.
+    # Torch's exporter writes the outputs of a network that returns a mapping in the order of the
+    # mapping.
     if isinstance(result, Mapping):
         result = tuple(result.values())
     return tuple(result) if isinstance(result, (list, tuple)) else (result,)

@@ -57,12 +57,13 @@ def export_model(
         checkpoint: Path or URI of the authors' weights, or ``random`` for random weights.
         output: Path of the ONNX file to write, by default in the folder of exports.
         sha256: Expected SHA-256 of the authors' checkpoint in hex.
-        size: Size of the network if there are several.
-        python: Python interpreter for the authors' code, by default the running one.
+        size: Variant of the network, such as "large", if the authors published several sizes.
+        python: Python interpreter that runs the authors' code, by default the interpreter of this
+            process.
         store: Weight store that finds or downloads the checkpoint.
 
     Returns:
-        Manifest of the export, as in the JSON file.
+        Content of the JSON manifest with the hashes and source commit of the exported network.
 
     Raises:
         InputError: A source checkout does not exist.
@@ -82,8 +83,8 @@ def export_model(
     target = (output or exports_folder() / f"{name}.onnx").expanduser().resolve()
     target.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix=".export-", dir=target.parent) as scratch:
-        # The temporary ONNX file already has its final name, because it refers to the separate
-        # weights file of a large network by name.
+        # The ONNX file of a large network contains the name of its separate weights file, so the
+        # temporary ONNX file already has its final name.
         made = Path(scratch) / target.name
         script = importlib.util.find_spec(recipe.script)
         if script is None or script.origin is None:
@@ -193,8 +194,8 @@ def run_script(
         code: Folders with the authors' source checkouts.
         output: Path of the ONNX file that the script writes.
         weights: Path of the authors' checkpoint, or None for random weights.
-        size: Size of the network if there are several.
-        python: Python interpreter, by default the running one.
+        size: Variant of the network, such as "large", if the authors published several sizes.
+        python: Python interpreter that runs the script, by default the interpreter of this process.
 
     Raises:
         ProviderError: The export script fails; the message is the last line of the script's error

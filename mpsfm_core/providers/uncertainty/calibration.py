@@ -21,7 +21,7 @@ from mpsfm_core.geometry import log_depth_steps
 _MIN_VARIANCE = 1e-12
 _MIN_SHIFTED_RATIO = 0.01
 """Smallest valid depth or inverse depth after adding the offset ``shift``, as a fraction of the
-median. Pixels below this value are invalid."""
+median. Pixels with a smaller depth or inverse depth become invalid."""
 
 
 class DepthCalibration(Options):
@@ -29,8 +29,9 @@ class DepthCalibration(Options):
 
     The calibrated depth std is ``max(std_scale * network_std, relative_std * depth, std_floor)``.
     The default values are those of Metric3D v2 giant2 in the reference implementation. Plugins
-    declare the values of other networks. The calibrated variance describes the depth errors that
-    remain after the mapper has estimated a scale for the depth map of each image.
+    declare the values of the uncertainty model for other networks. The calibrated variance
+    describes the depth errors that remain after the mapper has estimated a scale for the depth map
+    of each image.
     """
 
     std_scale: float = Field(3.33, gt=0)
@@ -124,7 +125,7 @@ class NormalCalibration(Options):
     """Smallest angular std of normals in degrees [reference inherent_polar_noise]."""
     std_default_deg: float = Field(7.6, gt=0)
     """Angular std of normals in degrees if the network predicts no variance [reference: effect of
-    its floor]."""
+    inherent_polar_noise]."""
     use_network_variance: bool = True
     """False ignores the angular variance that the network predicts."""
 

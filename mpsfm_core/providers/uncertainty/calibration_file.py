@@ -134,8 +134,8 @@ def load_calibration(path: Path, kind: CalibratedKind = "depth") -> Calibration:
         The calibration.
 
     Raises:
-        ConfigError: The calibration file is unreadable (see :func:`read_values`), or a value in it
-            is wrong.
+        ConfigError: The calibration file is unreadable (see :func:`read_values`) or has a wrong
+            value.
     """
     try:
         return parse_settings(CALIBRATIONS[kind], read_values(path, kind))

@@ -15,7 +15,7 @@ from mpsfm_core.results.gltf import FLIP, LINES, POINTS, Y_UP_FROM_Z, GltfScene
 
 ENTRIES = ("scene.glb",)
 _OUTLINE = 0.05
-"""Length of a camera frustum over the spread of 3D points and camera centers."""
+"""Length of a camera frustum divided by the spread of 3D points and camera centers."""
 _EDGES = ((0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 3), (3, 4), (4, 1))
 
 

@@ -26,7 +26,7 @@ _NEIGHBOURS = 3
 _OPACITY = 0.1
 """Initial opacity of a Gaussian (Kerbl et al. 2023)."""
 _MAX_GAUSSIANS = 500_000
-"""Maximum number of Gaussians; of more 3D points, a random subset is used."""
+"""Maximum number of Gaussians; if a model has more 3D points, a random subset is exported."""
 _SH_0 = 0.28209479177387814
 """Constant spherical harmonic of degree 0, ``1 / (2 sqrt(pi))``."""
 

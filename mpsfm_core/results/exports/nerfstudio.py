@@ -25,7 +25,8 @@ from mpsfm_core.results.transforms_json import write_transforms
 
 ENTRIES = ("transforms.json", "images", "depths", "maps", "sparse_pc.ply")
 _STORED_UNITS = 1000
-"""Integer depth per world unit, the inverse of nerfstudio's default ``depth_unit_scale_factor``."""
+"""Integer depth value that stands for one world unit, the inverse of nerfstudio's default
+``depth_unit_scale_factor``."""
 
 
 def write(source: ExportSource, folder: Path) -> None:

@@ -82,7 +82,8 @@ def check_light_import(case: ContractCase) -> str:
     if process.returncode:
         last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
         raise CheckFailed(f"importing the plugin module fails: {last_line}")
-    # The last output line is the result; native code of a plugin may print other lines before.
+    # The last line of the output is the script's result, because native code of a plugin may print
+    # other lines before.
     seconds, heavy = json.loads(process.stdout.splitlines()[-1])
     if heavy:
         raise CheckFailed(f"the plugin module {modules[0]!r} imports {' '.join(heavy)}")
@@ -189,7 +190,8 @@ def check_intrinsics_declared(case: ContractCase) -> None:
     camera = case.example.camera
     longer = replace(camera, fx=1.3 * camera.fx, fy=1.3 * camera.fy)
     answer = case.run_on_view(replace(case.example.view, camera=longer), case.example)
-    # With the focal length only the subset of normals that face the camera may change.
+    # Another focal length may only change which normals face the camera, not the normals
+    # themselves.
     if isinstance(expected, NormalPrior):
         expected, answer = _select_valid_in_both(expected, answer)
     difference = describe_difference(expected, answer)

@@ -70,7 +70,7 @@ def check_depth_is_z(case: ContractCase) -> str:
 
 
 def check_depth_scale(case: ContractCase) -> str:
-    """Require metric depth in meters, and depth that is not metric up to one factor per map."""
+    """Require metric depth in meters, and other depth that is correct up to one factor per map."""
     case.require_truth("painted", "prepared", "image")
     prior = _run(case)
     errors = map_errors.log_errors(prior, case.example, any_scale=not prior.metric)

@@ -178,8 +178,8 @@ def check_features_pixel_convention(case: ContractCase) -> str:
     """Require keypoints for which the center of the first pixel is (0.5, 0.5).
 
     If the view is rotated by 180 degrees, a keypoint (x, y) has to be found at (width - x, height -
-    y). A wrong pixel convention shifts x and y of all keypoints by the same amount. Some networks
-    shift keypoints only in x or only in y; for such networks the check cannot tell.
+    y). A wrong pixel convention shifts x and y of all keypoints by the same amount. The check is
+    undecided for networks that shift keypoints only in x or only in y.
     """
     case.require_truth("image")
     view = case.example.view
@@ -253,7 +253,7 @@ def check_features_descriptors(case: ContractCase) -> str:
 def check_features_dimension(case: ContractCase) -> str:
     """Require the same descriptor length for every view.
 
-    Descriptors of a view without any keypoint must have this length too.
+    The descriptor array (0, d) of a view without keypoints must have the same length d.
     """
     flat = replace(case.example.view, image=np.full_like(case.example.view.image, 128))
     some, none = case.run(case.example), case.run_on_view(flat, case.example)

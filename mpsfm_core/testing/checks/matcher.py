@@ -117,7 +117,8 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
         )
         matches = match_points(case, small, case.example, case.run_on_pair(small, case.example))
         residual = matches.points_b - ratio * matches.points_a
-        # Integer pixel centers in both views shift the residual of a match by this length.
+        # If both views use integer pixel centers, match residuals are shifted by ``expected``
+        # pixels.
         expected = 0.5 * (ratio - 1)
         where = f"between a view and its copy at {numerator}/{denominator} of the size"
         text = _describe_residual(residual, matches.std_px, expected, where, counts)

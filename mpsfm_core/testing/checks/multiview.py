@@ -135,7 +135,7 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
     sizes = ((2 * width, 2 * height), (height, width))
     examples = (common, *(case.example.sized(*size).with_common_camera() for size in sizes))
     found = case.run_on_group(*examples).intrinsics
-    assert found is not None  # The validator guarantees that the field is present.
+    assert found is not None  # The validator requires the predicted intrinsics.
     if case.truth_source == "none":
         ratio = float(found[1, 0] / found[0, 0])
         if not _FOCAL_RATIO_RANGE[0] < ratio < _FOCAL_RATIO_RANGE[1]:
@@ -273,7 +273,7 @@ def _predict_poses(case: ContractCase) -> tuple[Float64, tuple[Example, ...]]:
     case.require_truth("prepared", "image")
     examples = _make_group(case)
     poses = case.run_on_group(*examples).poses
-    assert poses is not None  # The validator guarantees that the field is present.
+    assert poses is not None  # The validator requires the predicted poses.
     return poses, examples
 
 

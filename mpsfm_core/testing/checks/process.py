@@ -184,7 +184,7 @@ def check_memory_released(case: ContractCase) -> str:
             raise CheckFailed(f"{count} calls leave {growth} {name} open")
     if after.memory_mb - before.memory_mb > _MAX_NATIVE_MB:
         growth = after.memory_mb - before.memory_mb
-        raise CheckFailed(f"the memory of the process grows by {growth:.0f} MB in {count} calls")
+        raise CheckFailed(f"{count} calls let the memory of the process grow by {growth:.0f} MB")
     return f"retains {max(retained, 0) / 1000:.1f} kB per view in {count} calls"
 
 
@@ -225,7 +225,7 @@ PROCESS_CHECKS = (
 
 def _rename_example(example: Example, name: str) -> Example:
     renamed = replace(example, name=name)
-    # Reuse the rendered images, because the images do not depend on the name of the provider.
+    # Keep the rendered images of the example, which do not depend on the example's name.
     renamed.__dict__.update(view=replace(example.view, name=name), partner=example.partner)
     return renamed
 
@@ -244,7 +244,7 @@ def _capture_output() -> Iterator[list[str]]:
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), 1)
         stdout = sys.stdout
-        sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115 - closed below without the descriptor
+        sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115 - the descriptor stays open
         try:
             yield lines
         finally:

@@ -62,7 +62,8 @@ class PriorErrors:
     patch: float = 0.0
     """Relative depth error, of either sign, inside one ellipse of the depth map."""
     patch_area: float = 0.1
-    """Area of the ellipse with this depth error relative to the area of the map."""
+    """Area of the ellipse with the additional depth error, relative to the area of the depth
+    map."""
     declared: float = 0.01
     """Relative std that the depth prior reports."""
 

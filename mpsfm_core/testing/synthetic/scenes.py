@@ -330,7 +330,7 @@ def arc_poses(
     radius: float = 3.4,
     height: float = 1.6,
 ) -> list[Float64]:
-    """Return camera poses on an arc around ``target``, ``step_deg`` apart, that look at it.
+    """Return camera poses that look at ``target`` from an arc, ``step_deg`` apart.
 
     With the default values the cameras stay inside :func:`room_scene` up to 60 degrees to either
     side of the middle.

@@ -78,8 +78,9 @@ def make_twin_rooms() -> AnalyticScene:
             _block((x, 2.8, 0.0), (x + 1.4, 4.0, 0.5)),  # bed
         ]
     different: list[Surface] = [
-        _block((2.0, 3.2, 0.0), (4.6, 4.0, 1.9)),  # wardrobe, first room only
-        _block((5.2, 0.6, 0.0), (6.0, 2.4, 2.1)),  # bookshelf, second room only
+        # Only the first room has a wardrobe, and only the second room has a bookshelf.
+        _block((2.0, 3.2, 0.0), (4.6, 4.0, 1.9)),
+        _block((5.2, 0.6, 0.0), (6.0, 2.4, 2.1)),
     ]
     return AnalyticScene((shell, *walls, *lintels, *same, *different))
 

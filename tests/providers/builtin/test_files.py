@@ -91,7 +91,7 @@ def test_depth_of_exr_channels_is_read(channels, folder: Path, context: Provider
 @needs_exr
 def test_exr_without_a_depth_channel(folder: Path, context: ProviderContext) -> None:
     write_exr(folder / "side" / "a.exr", {"mist": DEPTH, "noise": DEPTH})
-    assert "none of the EXR channels mist, noise is known" in refused(folder, context)
+    assert "only unknown channels: mist, noise" in refused(folder, context)
 
 
 def test_exr_without_the_package(
@@ -166,7 +166,8 @@ def test_any_grid_that_covers_the_view(folder: Path, context: ProviderContext) -
     np.save(folder / "side" / "a.npy", DEPTH[::2, ::2])
     assert depth_of(folder, context).shape == (15, 20)
     np.save(folder / "side" / "a.npy", DEPTH[:, :30])
-    assert "does not cover image 'side/a.jpg' (40x30)" in refused(folder, context)
+    message = refused(folder, context)
+    assert "does not cover image 'side/a.jpg'" in message and "the image (40x30)" in message
 
 
 @pytest.mark.parametrize(

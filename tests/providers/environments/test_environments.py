@@ -76,7 +76,7 @@ def test_configuration_selects_provider_in_environment(registry):
 
 def test_environment_given_twice_raises():
     assert ProviderConfig.model_validate({"use": "a", "environment": "b"}).use == "a@b"
-    with pytest.raises(ValueError, match="already selects it"):
+    with pytest.raises(ValueError, match="already selects an environment"):
         ProviderConfig.model_validate({"use": "a@c", "environment": "b"})
 
 
@@ -159,7 +159,7 @@ def test_invalid_or_missing_environment_names_raise(monkeypatch, tmp_path):
     monkeypatch.setenv(FOLDER_VARIABLE, str(tmp_path))
     with pytest.raises(InputError, match="lower-case"):
         create_environment("Not a name", ["x"])
-    with pytest.raises(InputError, match="no environment 'x'"):
+    with pytest.raises(InputError, match="no provider environment 'x'"):
         find_environment("x")
     (tmp_path / "there").mkdir()
     with pytest.raises(InputError, match="mpsfm env remove there"):
