@@ -95,7 +95,7 @@ class _ModelObservations(NamedTuple):
     translations: Float64
     """(n, 3) translations of ``cam_from_world``."""
     focals: Float64
-    """(n,) focal lengths in pixels."""
+    """(n,) focal lengths of the images in pixels."""
     points: Float64
     """(p, 3) triangulated points, world frame."""
     image: Int64

@@ -35,7 +35,8 @@ class CommandGroup(TyperGroup):
 def handle_sigterm() -> None:
     """Install a signal handler that makes SIGTERM end a command like Ctrl-C.
 
-    Call this function after the import of pycolmap, because pycolmap installs a signal handler.
+    Install the signal handler after the import of pycolmap, because pycolmap installs another
+    signal handler.
     """
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 

@@ -1,8 +1,8 @@
 """Immutable, validated data classes that cross package boundaries.
 
-Providers take and return these data classes, and the mapper takes a :class:`MappingProblem`.
-Constructors check shape, dtype and range, raise :class:`~mpsfm_core.data.errors.DataError`, and
-store arrays as read-only views.
+Providers take and return instances of the data classes, and the mapper takes a
+:class:`MappingProblem`. Constructors check shape, dtype and range, raise
+:class:`~mpsfm_core.data.errors.DataError`, and store arrays as read-only views.
 
 Conventions:
 

@@ -184,7 +184,10 @@ class Reason:
         """Check that the reason has a value for each field of its code, and no other values."""
         if set(self.values) != set(self.code.fields):
             wanted = ", ".join(self.code.fields) or "no field"
-            raise DataError(self.code.value, f"reason needs {wanted}, got {', '.join(self.values)}")
+            raise DataError(
+                self.code.value,
+                f"a reason with this code needs the values {wanted}, got {', '.join(self.values)}",
+            )
 
     def to_json(self) -> dict[str, Value]:
         """Convert the reason to the dictionary in ``summary.json``."""

@@ -62,8 +62,8 @@ class Features:
         Args:
             keypoints: (n, 2) positions of the keypoints in COLMAP pixels.
             descriptors: (n, d) descriptors, or None for a matcher that needs no descriptors.
-            scores: (n,) detection scores, or None.
-            scales: (n,) scales in pixels, or None.
+            scores: (n,) detection scores of the keypoints, or None.
+            scales: (n,) scales of the keypoints in pixels, or None.
             std_px: Std of the localization noise of a keypoint in pixels.
 
         Raises:

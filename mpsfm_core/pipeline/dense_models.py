@@ -42,9 +42,9 @@ def densify_model(
 ) -> DenseReport:
     """Compute and write depth maps of a posed model by multi-view stereo.
 
-    The depth search of an image starts from its map in ``model/depth`` of a result folder. Without
-    such a map, the search starts from the depth range of the image's 3D points. Images without
-    depth map and without 3D points are omitted.
+    The depth search of an image starts from its map in ``model/depth`` of a result folder. For an
+    image without depth map, the search starts from the depth range of the image's 3D points. Images
+    without depth map and without 3D points are omitted.
 
     Args:
         model: COLMAP model, ``transforms.json`` or result folder.

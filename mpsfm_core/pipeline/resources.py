@@ -140,9 +140,10 @@ def find_shortages(estimate: ResourceEstimate, cache: Path, output: Path | None)
     need = f"this run takes about {estimate.memory_mb:.0f} MB of memory"
     remedy = "reduce inputs.max_image_size or dense.max_size, use fewer photos"
     if estimate.memory_mb > MAX_RATIO * total_mb:
+        total = f"{total_mb:.0f} MB"
         raise InputError(
-            f"{need}, but only {total_mb:.0f} MB exist in the machine or container: {remedy}, or "
-            f"set runtime.check_resources=false"
+            f"{need}, but the machine or container has only {total}: {remedy}, "
+            f"or set runtime.check_resources=false"
         )
     if estimate.memory_mb > free_mb:
         warnings.append(f"{need}, but {free_mb:.0f} MB are free, so the run may fail: {remedy}")

@@ -184,7 +184,8 @@ def _load(
         thread.join(timeout_s)
     if not outcome:
         fault = f"did not load within {timeout_s:g} s"
-        _log.warning("plugin %r of package %s %s %s", entry.name, distribution, version, fault)
+        text = "plugin %r of package %s did not load within %g s"
+        _log.warning(text, entry.name, distribution, timeout_s)
         hint = f"pip uninstall {distribution}, or raise MPSFM_PLUGIN_TIMEOUT_S"
         return LoadedPlugin(entry.name, distribution, version, fault=fault, hint=hint)
     result = outcome[0]

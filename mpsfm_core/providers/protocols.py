@@ -267,7 +267,8 @@ class Hooks:
     def mpsfm_filter_pairs(self, pairs: Sequence[tuple[str, str]]) -> Sequence[tuple[str, str]]:  # type: ignore[empty-body]
         """Select the image pairs to match from the candidate pairs.
 
-        The run matches an image pair only if this hook of every plugin selects the pair.
+        The run matches an image pair only if the hook ``mpsfm_filter_pairs`` of every plugin
+        selects the pair.
 
         Args:
             pairs: Candidate pairs of image names.

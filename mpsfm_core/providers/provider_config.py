@@ -33,8 +33,8 @@ class ProviderConfig(Options):
     ``DISTRIBUTION:NAME`` selects the pip package if several packages have a provider of the same
     name."""
     fallback: tuple[str, ...] = ()
-    """Names of fallback providers, tried in this order if the provider ``use`` is unavailable. A
-    provider is unavailable if its plugin or weights are missing, or if it rejects the options."""
+    """Names of fallback providers, tried in the given order if the provider ``use`` is unavailable.
+    A provider is unavailable if its plugin or weights are missing, or if it rejects the options."""
     environment: str | None = None
     """Name of the Python environment that contains the provider ``use`` (see ``mpsfm env create``).
     Validation merges ``environment`` into the provider name ``use`` as ``NAME@ENVIRONMENT``."""

@@ -174,7 +174,9 @@ class Registry:
         try:
             loaded = inspect_plugin(plugin, name, distribution, version or "0")
         except Exception as error:
-            raise ProviderError(f"plugin {name!r}: {type(error).__name__}: {error}") from error
+            raise ProviderError(
+                f"plugin {name!r} fails to load: {type(error).__name__}: {error}"
+            ) from error
         if self._manager.is_registered(plugin) or self._manager.has_plugin(_label(loaded)):
             raise ProviderError(f"plugin {name!r} is registered already")
         self._add(loaded, is_versioned=version is not None)
@@ -187,8 +189,9 @@ class Registry:
         Args:
             specs: Specifications of the providers to register.
             distribution: Name of the pip package that ``mpsfm plugins list`` shows.
-            version: Version of the code of the providers, which changes with the code. Without a
-                version, later runs do not reuse results of callable factories from the cache.
+            version: Version of the providers' code, which the caller has to change whenever the
+                code changes. Without a version, later runs do not reuse results of callable
+                factories from the cache.
         """
         for spec in specs:
             fault = find_spec_fault(spec)
@@ -341,9 +344,10 @@ class Registry:
         """Return the uncertainty model of a depth, multi-view or normals provider.
 
         The uncertainty model is searched in the configuration, then in the wrapper providers from
-        the outermost to the innermost, then in the provider. If none of them declares an
-        uncertainty model, the default values of the class are used. A wrapper or provider declares
-        an uncertainty model by the plugin's ``mpsfm_calibration`` hook or in its specification.
+        the outermost to the innermost, then in the provider. Without a declared uncertainty model,
+        the default values of :class:`DepthCalibration` or :class:`NormalCalibration` are used. A
+        wrapper or provider declares an uncertainty model by the plugin's ``mpsfm_calibration`` hook
+        or in its specification.
 
         Args:
             kind: Kind of the provider, such as ``depth``.

@@ -5,9 +5,9 @@ validate its return value. Any exception of a provider becomes an
 :class:`~mpsfm_core.data.errors.MpsfmError` that names provider and image. The functions
 ``validate_*`` only validate a given return value of a provider. Return values are instances of the
 classes in :mod:`mpsfm_core.data`, which validate themselves on construction. The functions
-``validate_*`` validate these instances again, because arrays are mutable. The functions
-``validate_*`` also compare the return value with the image size and with the declared capabilities
-of the provider.
+``validate_*`` validate a returned instance again, because a provider may have changed its arrays.
+The functions ``validate_*`` also compare the return value with the image size and with the declared
+capabilities of the provider.
 """
 
 from __future__ import annotations

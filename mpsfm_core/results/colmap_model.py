@@ -77,7 +77,7 @@ def build_model(
 def build_pinhole_model(
     reconstruction: Reconstruction, problem: MappingProblem
 ) -> pycolmap.Reconstruction:
-    """Build a COLMAP model of the undistorted views with black points, without reading any image.
+    """Build a COLMAP model of the undistorted views with black points; read no image.
 
     Cameras of the model are PINHOLE, or have the estimated distortion if the views were not
     undistorted with the estimate.

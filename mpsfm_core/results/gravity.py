@@ -13,7 +13,7 @@ _ROLL_DEG = 10.0
 """Standard deviation in degrees of the roll of hand-held cameras."""
 _PITCH_DEG = 30.0
 """Standard deviation in degrees of the mean pitch of hand-held cameras. Gravity candidates from
-surface normals may deviate from camera orientations by twice this angle."""
+surface normals may deviate from the camera orientations by twice the pitch std."""
 _SURFACE_DEG = 5.0
 """Maximum deviation in degrees of a surface that counts as horizontal or vertical."""
 _CANDIDATES = 500

@@ -271,7 +271,9 @@ def _translate_disk_errors(output: Path) -> Iterator[None]:
         if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
             raise InputError(f"{output}: the folder cannot be written: {reason}") from error
         full = "the disk is full" if error.errno in _DISK_FULL else "the disk fails"
-        raise OutputError(f"{output}: {full} ({reason}); earlier results are unchanged") from error
+        raise OutputError(
+            f"{output}: {full}, but earlier results are unchanged: {reason}"
+        ) from error
 
 
 def _sync(folder: Path) -> None:

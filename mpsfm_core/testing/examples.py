@@ -29,8 +29,8 @@ Appearance = Literal["painted", "textured"]
 (``textured``)."""
 
 FOCAL_RATIO = 0.75
-"""Ratio of the mean of ``fx`` and ``fy`` to the image width of the outdoor views. A small test
-network that estimates the focal length returns this ratio times the longer side."""
+"""Ratio of the mean of ``fx`` and ``fy`` to the image width of the outdoor views. A test network
+for focal lengths returns ``FOCAL_RATIO`` times the longer side of the image."""
 _FY_RATIO = 0.75
 """Ratio ``fy / fx`` of example views, far from 1 so that swapped focal lengths are measurable."""
 _SKY = ((120, 170, 235), (200, 220, 245))
@@ -280,7 +280,7 @@ def _rolled(pose: Float64, degrees: float) -> Float64:
 def _shift_right(pose: Float64) -> Float64:
     """Move a camera to the right by 0.3 m and rotate the camera back by 4 degrees.
 
-    Every matcher can match two views with this small baseline.
+    Every matcher can match two views that are only 0.3 m and 4 degrees apart.
     """
     cos, sin = np.cos(np.deg2rad(4.0)), np.sin(np.deg2rad(4.0))
     turn = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])

@@ -38,7 +38,7 @@ class GroundTruth:
 
     def __init__(self) -> None:
         self.received_depth: list[bool] = []
-        """True for each call of the normals provider that received a depth prior."""
+        """One value per call of the normals provider, True if the call received a depth prior."""
         self.wrong_inputs: list[str] = []
         """Errors of the cameras and depth priors that the wrapper passed to the provider."""
         self._examples: list[Example] = []

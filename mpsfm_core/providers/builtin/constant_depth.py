@@ -17,8 +17,8 @@ class ConstantDepth:
     """Depth provider that returns the plane z = 1 parallel to the image, without a metric unit.
 
     The provider's specification declares a large depth std, with which the mapper can still lift
-    keypoints to 3D. A depth prior with such a large std hardly influences the reconstruction of
-    images with much overlap.
+    keypoints to 3D. A depth prior with a large std hardly influences the reconstruction of images
+    with much overlap.
     """
 
     def __init__(self, options: Options | None, context: ProviderContext) -> None:

@@ -74,8 +74,8 @@ class DepthFiles:
             )
         if stored is not None and stored.shape != depth.shape:
             raise InputError(
-                f"depth file {path}: the variance has shape {stored.shape}, but the depth has "
-                f"shape {depth.shape}"
+                f"map file {path}: the shapes of variance {stored.shape} and depth {depth.shape} "
+                f"differ"
             )
         with np.errstate(invalid="ignore"):
             variance = np.maximum(

@@ -98,7 +98,7 @@ def read_arrays(path: Path, main: str) -> dict[str, NDArray[Any]]:
             file is returned under the name of the required array.
 
     Returns:
-        Arrays of the file by name.
+        Arrays of the map file by name.
 
     Raises:
         InputError: The map file cannot be read or lacks the required array.

@@ -40,9 +40,9 @@ class NormalsFromDepth:
     instead of roughening the surface. Depth differences of neighboring pixels are therefore more
     accurate than they would be with independent errors of the declared std. A depth error of
     relative std ``s`` that varies over an angle of ``a`` radians tilts a surface by about ``s /
-    a``. The option ``slope_std`` is the factor ``1 / a`` from relative depth std to normal std. The
-    normal variance is the sum of the variance of this tilt and the variance that the residuals of
-    the plane fit imply for independent pixel errors.
+    a``. The option ``slope_std`` is the ratio of normal std in radians to relative depth std. The
+    normal variance is the sum of two terms, one for smooth depth errors that tilt a surface and one
+    for independent pixel errors, which is estimated from the residuals of the plane fit.
     """
 
     def __init__(self, options: NormalsFromDepthOptions, context: ProviderContext) -> None:
@@ -105,8 +105,8 @@ class _Fit(NamedTuple):
 def _relative_bends(inverse: Float64, valid: Bool) -> Float64:
     """Return the relative deviation of inverse depth from the mean of two neighboring pixels.
 
-    The neighbors are those in the row or in the column, whichever gives the larger deviation. The
-    deviation is 0 on any plane, and is set to 0 if a neighboring pixel is invalid.
+    The neighboring pixels are in the same row or in the same column, whichever gives the larger
+    deviation. The deviation is 0 on any plane, and is set to 0 if a neighboring pixel is invalid.
     """
     largest = np.zeros(valid.shape)
     for axis in (0, 1):

@@ -51,8 +51,8 @@ class Channel:
         """Open one end of the channel on a pair of pipes.
 
         Args:
-            reader: Pipe from which this end reads messages.
-            writer: Pipe to which this end writes messages.
+            reader: Pipe from which this end of the channel reads messages.
+            writer: Pipe to which this end of the channel writes messages.
             folder: Folder of the shared memory files of both processes.
             own: File name prefix of the shared memory blocks that this end of the channel writes.
             other: File name prefix of the shared memory blocks that the other end of the channel

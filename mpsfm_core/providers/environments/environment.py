@@ -152,7 +152,7 @@ def create_environment(
         python: Path or version of the Python interpreter, by default the running interpreter.
 
     Returns:
-        The new environment and the description of its providers.
+        The new Python environment and the description of its providers.
 
     Raises:
         InputError: The environment name is invalid, or an environment with that name exists.

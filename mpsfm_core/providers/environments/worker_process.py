@@ -119,11 +119,12 @@ class Worker:
                 request before it replies.
 
         Returns:
-            Value that the worker replies.
+            Value in the reply of the worker.
 
         Raises:
             MpsfmError: Any MP-SfM exception that was raised in the worker.
-            RuntimeError: Any other exception of the provider; the message has its type and text.
+            RuntimeError: The provider raised an exception of another type; the message has its type
+                and text.
             WorkerLost: The worker process crashed or did not reply within the time limit.
         """
         with self._lock:

@@ -94,7 +94,7 @@ class ExportJob:
                 example.
             outputs: Names of the network's outputs in the ONNX file.
             dynamic: Names of the axes of variable length, by axis index and tensor name. The
-                example inputs should differ in the lengths of these axes.
+                example inputs should differ in the lengths of the named axes.
             expected: Outputs of the original network for each example, if ``model`` is a modified
                 form of that network.
         """
@@ -126,7 +126,7 @@ def gather_weights(output: Path, tensor_files: Collection[Path]) -> None:
     """Merge the weights files of an ONNX network above 2 GB into one file.
 
     Args:
-        output: Path of the ONNX file. The weights are written to a file with this path and the
+        output: Path of the ONNX file. The weights are written to the path of the ONNX file with the
             suffix ``.data``.
         tensor_files: Paths of the weights files, each with one tensor, that torch's exporter wrote.
     """

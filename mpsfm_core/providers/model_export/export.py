@@ -27,8 +27,8 @@ RANDOM = "random"
 
 TOLERANCE = 1e-3
 """Largest accepted relative difference between outputs of the ONNX file and of the original
-network, for 99.9 % of the values. The other 0.1 % may differ more, because iterative networks
-amplify float32 rounding of single values."""
+network, for 99.9 % of the values. Up to 0.1 % of the output values may differ more, because
+iterative networks amplify float32 rounding of single values."""
 _QUANTILE = 0.999
 
 

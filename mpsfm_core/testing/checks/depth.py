@@ -132,8 +132,7 @@ def check_depth_validity(case: ContractCase) -> str:
 def check_depth_flip(case: ContractCase) -> str:
     """Require the mirrored depth for the mirrored view.
 
-    This check of mirrored depth also applies, with a larger tolerance, if the ground truth is
-    unknown.
+    If the ground truth is unknown, the check of mirrored depth applies with a larger tolerance.
     """
     prior, mirrored = _run(case), first_depth(case.run(case.example.mirror()))
     if prior.shape != mirrored.shape:

@@ -294,7 +294,7 @@ def _require_same_points(case: ContractCase, other: Example) -> str:
 
 
 def _blank_outside(view: View, *, upper_right: bool) -> tuple[View, tuple[int, int, int, int]]:
-    """Blank a view outside of one corner; return the view and (left, top, right, bottom)."""
+    """Blank a view except for one corner; return the view and the corner's rectangle."""
     width, height = view.camera.size
     left, top, right, bottom = int(0.45 * width), 0, width, int(0.45 * height)
     if not upper_right:

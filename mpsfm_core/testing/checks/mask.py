@@ -29,7 +29,7 @@ def check_mask_polarity(case: ContractCase) -> str:
 def check_mask_place(case: ContractCase) -> str:
     """Require that the mask covers the whole view without a shift.
 
-    Shifted, rotated and cropped masks do not satisfy this rule.
+    Shifted, rotated and cropped masks fail the check.
     """
     case.require_truth("painted", "prepared", "image")
     return compare_with_truth(case, case.example, case.run(case.example))

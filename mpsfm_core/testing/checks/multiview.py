@@ -34,7 +34,7 @@ FOCAL_TOLERANCE = 0.1
 """Largest accepted relative error of a focal length or principal point whose ground truth is known.
 A wrong pixel grid or swapped axes cause a relative error of at least 0.25."""
 _GROUP_SIZES = (2, 5, 9)
-"""Numbers of views in the tested groups."""
+"""Numbers of views in the groups with which multi-view providers are tested."""
 _FOCAL_RATIO_RANGE = (1.5, 2.7)
 """Accepted range for the ratio of the focal lengths that a provider estimates for a view of twice
 the size and for the original view."""

@@ -40,7 +40,7 @@ _AXES: Mapping[str, tuple[int, int, int]] = MappingProxyType(
 def check_normals_frame(case: ContractCase) -> str:
     """Require normals in the camera frame: x right, y down, z forward.
 
-    If a sign change or the rotation to the world frame explains the error, the check names this
+    If a sign change or the rotation to the world frame explains the error, the message names the
     mistake.
     """
     case.require_truth("painted", "prepared", "image")
@@ -89,8 +89,7 @@ def check_normals_validity(case: ContractCase) -> str:
 def check_normals_flip(case: ContractCase) -> str:
     """Require mirrored normals with negated x for the mirrored view.
 
-    This check of mirrored normals also applies, with a larger tolerance, if the ground truth is
-    unknown.
+    If the ground truth is unknown, the check of mirrored normals applies with a larger tolerance.
     """
     prior, mirrored = _run(case), case.run(case.example.mirror())
     if prior.shape != mirrored.shape:

@@ -33,8 +33,8 @@ from mpsfm_core.testing.process_state import (
 
 MAX_CONSTRUCTION_S = 20.0
 """Time limit in seconds to construct a provider. Networks with 1 GB of weights need 5 s on a CPU;
-the limit allows for a busy machine. A plugin whose provider needs more time declares this in
-``expected_failures``."""
+the limit allows for a busy machine. A plugin whose provider needs more time declares an expected
+failure in ``expected_failures``."""
 MAX_CALL_S = 20.0
 """Time limit in seconds for one call with a view of 192 x 144 pixels. The largest networks need 5 s
 on a CPU."""
@@ -244,7 +244,8 @@ def _capture_output() -> Iterator[list[str]]:
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), 1)
         stdout = sys.stdout
-        sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115 - the descriptor stays open
+        # Closing the file object keeps descriptor 1 open.
+        sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
         try:
             yield lines
         finally:

@@ -23,7 +23,7 @@ def check_retrieval_dimension(case: ContractCase) -> str:
 def check_retrieval_self_similarity(case: ContractCase) -> str:
     """Require that no view is more similar to another view than to itself.
 
-    Descriptors of unit norm satisfy this rule. If descriptors have different norms, the
+    Descriptors of unit norm always pass the check. If descriptors have different norms, the
     descriptors of bright or detailed views can be similar to those of all views.
     """
     flat = replace(case.example.view, image=np.full_like(case.example.view.image, 200))
@@ -47,7 +47,7 @@ def check_retrieval_self_similarity(case: ContractCase) -> str:
 def check_retrieval_overlap(case: ContractCase) -> str:
     """Require a higher similarity to neighboring views than to another scene.
 
-    The neighboring views show the same scene from one and two steps to the side.
+    The cameras of the neighboring views are moved sideways by one and by two steps.
     """
     case.require_truth("image", "prepared")
     example, other = case.example, outdoor_example("textured", case.example.camera.size)

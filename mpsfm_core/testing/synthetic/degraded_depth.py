@@ -31,7 +31,7 @@ class DepthErrors:
     """
 
     scale: float = 0.05
-    """Std of the relative depth error that a whole image shares. The property ``std`` excludes this
+    """Std of the relative depth error that a whole image shares. The property ``std`` excludes the
     scale error, because the mapper estimates a scale per image (``s_i`` in the paper)."""
     field: float = 0.05
     """Std of the noise field ``f``, which is a relative depth error."""
@@ -44,8 +44,8 @@ class DepthErrors:
     def std(self) -> float:
         """Relative depth std of a pixel after the image has received its optimal scale.
 
-        The optimal scale also removes the mean of the noise field, so the errors are about 6 %
-        smaller than this std.
+        The optimal scale also removes the mean of the noise field, so the actual errors are about 6
+        % smaller than the returned std.
         """
         return self.field
 

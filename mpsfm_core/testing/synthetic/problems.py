@@ -53,7 +53,7 @@ def make_mapping_problem(
 
     Args:
         scene: Scene to render.
-        camera: Camera of all views.
+        camera: Camera that all synthetic views share.
         poses: Pose ``cam_from_world`` (3, 4) of each view.
         points_per_view: Number of surface points that are sampled in each view. Every sampled point
             that a view sees becomes a keypoint of this view.
