@@ -157,7 +157,7 @@ def _place(data: CalibrationData) -> str:
 
 
 def _scale(data: CalibrationData, calibration: Calibration) -> dict[str, float] | None:
-    """Compute the median over images of the ratio true to prior depth, and its log std."""
+    """Compute the median over images of true / prior depth, and the std of its logarithm."""
     if isinstance(data, NormalData):
         return None
     scales = data.residuals(calibration).scales

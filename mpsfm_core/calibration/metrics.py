@@ -31,9 +31,9 @@ def compute_metrics(residuals: Residuals, std: Float64) -> dict[str, Any]:
     log density of a normal distribution with the std. The key ``nll_heavy`` is the mean negative
     log density of the fitted Student t distribution, which has the same coverage of 1 std. The key
     ``ause`` is the area between the sensitivity curves for errors sorted by std and by true error,
-    relative to the total RMSE; 0 is a perfect order. The key ``rmse`` is the RMSE in meters or rad.
-    The remaining keys are the sensitivity curve, the calibration curve, and the coverage by range
-    of depth or slant.
+    relative to the total RMSE. An ``ause`` of 0 is a perfect order. The key ``rmse`` is the RMSE in
+    meters or rad. The remaining keys are the sensitivity curve, the calibration curve, and the
+    coverage by range of depth or slant.
     """
     total, weights = np.hypot(std, residuals.noise), residuals.weights()
     heavy_scale = total / STD_OF_T

@@ -32,7 +32,7 @@ def draw_plots(metrics: Mapping[str, Metrics], place: str, error: str) -> tuple[
         _coverage,
         _ranges,
     )
-    # A fixed hash salt and no date make the files reproducible.
+    # A fixed hash salt and no date make the SVG and PNG files reproducible.
     with mpl.rc_context({"svg.hashsalt": "mpsfm", "font.size": 9, "svg.fonttype": "none"}):
         figure = Figure(figsize=(10, 7.5), layout="constrained")
         for axes, panel in zip(figure.subplots(2, 2).flat, panels, strict=True):

@@ -59,7 +59,7 @@ def open_viewer(registry: Registry, name: str, output: Path, pictures: Pictures)
 
 @contextmanager
 def show_run(registry: Registry, name: str | None, photos: Path, output: Path) -> Iterator[None]:
-    """Show the run inside the ``with`` block in a viewer; do nothing without a name.
+    """Show the run inside the ``with`` block in a viewer; do nothing without a viewer name.
 
     After a successful run, the viewer stays open until Ctrl-C.
     """

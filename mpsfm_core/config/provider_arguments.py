@@ -91,7 +91,7 @@ def configure(
 def _block(
     kind: Kind, path: SettingPath, provider: Provider, registry: Registry
 ) -> tuple[ProviderConfig, Registry]:
-    """Check a provider argument; return its configuration block and a registry that has it."""
+    """Check a provider argument; return its configuration block and the extended registry."""
     if isinstance(provider, str):
         block = ProviderConfig(use=provider)
     elif isinstance(provider, Mapping):

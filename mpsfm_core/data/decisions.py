@@ -161,8 +161,8 @@ class DoubtReason(ReasonCode):
     FEW_POINTS = ("few-points", "num_images", "min_points")
     """``num_images`` images observe fewer than ``min_points`` 3D points."""
     FEW_EXPLAINED_MATCHES = ("few-explained-matches", "num_images", "min_ratio")
-    """Of the matches of ``num_images`` images, the model explains less than the ratio
-    ``min_ratio``."""
+    """The model explains less than the ratio ``min_ratio`` of the matches of ``num_images``
+    images."""
     GPS_MISFIT = ("gps-misfit", "num_inliers", "num_positions")
     """Only ``num_inliers`` of ``num_positions`` GPS positions fit the camera centers."""
     UNKNOWN_FOCAL_LENGTH = ("unknown-focal-length", "num_images", "std_ratio")

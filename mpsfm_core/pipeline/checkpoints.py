@@ -191,7 +191,7 @@ class DenseCheckpoints:
         return self._cache.load("dense", self._key(name), StereoDepth)
 
     def save(self, name: str, depth: StereoDepth) -> None:
-        """Store the stereo depth map of an image; after a disk error, warn once and stop."""
+        """Store the stereo depth of an image; after a disk error, warn once and store no more."""
         if self._failed:
             return
         try:

@@ -265,7 +265,8 @@ class Registry:
         """
         entry = self._entry(kind, name)
         factory = entry.spec.factory
-        # The factory of a provider in another environment returns hashes of the code there.
+        # The client of a provider in another environment requests the code hashes from that
+        # environment.
         if hasattr(factory, "code_keys"):
             keys: dict[str, str] | None = factory.code_keys()
             return keys

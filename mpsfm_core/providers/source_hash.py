@@ -32,8 +32,8 @@ def hash_source(module: str) -> str | None:
         module: Name of a module in the hashed package, such as ``my_depth.model``.
 
     Returns:
-        SHA-256 in hex, or None if the code in memory may differ from the files, because a file of
-        the imported package has changed after the start of this process.
+        SHA-256 in hex, or None if a file of the imported package has changed since the start of
+        this process. The code in memory may then differ from the files.
     """
     package, root = _find_package(module)
     if root is None:

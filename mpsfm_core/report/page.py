@@ -44,7 +44,7 @@ _NUM_MAPS = 4
 _MAX_COORDINATE = 0xFFFF
 """Maximum value of a 16-bit coordinate."""
 _DEFAULT_MAX_STD = 0.2
-"""Relative std of the brightest color of std maps if no image is registered."""
+"""Relative depth std that the brightest color of a std map encodes if no image is registered."""
 
 
 def write_report(folder: Path) -> Path:

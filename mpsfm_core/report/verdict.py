@@ -63,8 +63,9 @@ def judge(summary: Mapping[str, Any]) -> Verdict:
         summary: content of ``summary.json``.
 
     Returns:
-        The verdict, whose level is ``failed`` without a model, ``doubtful`` if the evidence is weak
-        or contradicts the model, ``partial`` if images are not registered, and else ``good``.
+        The verdict of the run. The level is ``failed`` without a model, ``doubtful`` if the
+        evidence is weak or contradicts the model, ``partial`` if images are not registered, and
+        otherwise ``good``.
     """
     images = summary["images"]
     num_registered, total = len(images["registered"]), images["total"]

@@ -35,7 +35,7 @@ from mpsfm_core.results.ply import read_ply
 PICTURE_SIDE = 320
 """Longer side of pictures in viewers, in pixels."""
 MAX_RELATIVE_STD = 0.3
-"""Maximum relative std of shown depth pixels; uncertain pixels would occlude certain pixels."""
+"""Maximum relative std of shown depth pixels; uncertain pixels would occlude accurate pixels."""
 _MAX_PIXELS = 8000
 """Maximum number of shown pixels per depth map."""
 

@@ -45,7 +45,7 @@ def estimate_gravity(rotations: Float64, normals: Float64) -> Gravity:
 
     Candidate directions are scored by a Gaussian prior on camera roll and pitch and by supporting
     surface normals. The best candidate is refined by least squares. Without surface normals, the
-    direction is wrong if all cameras look steeply down or up.
+    gravity direction is wrong if all cameras look steeply down or up.
 
     Args:
         rotations: (n, 3, 3) camera rotations ``cam_from_world``.
@@ -83,7 +83,7 @@ def rotation_to_z(up: Float64, right: Float64) -> Float64:
 
 
 def _estimate_up_from_cameras(rotations: Float64) -> Float64:
-    """Return the direction most perpendicular to the right axes of all cameras, regularized."""
+    """Return the direction that is most perpendicular to the x axes of all cameras, regularized."""
     rights, ups = rotations[:, 0], -rotations[:, 1]
     mean = ups.mean(axis=0)
     mean = mean / max(float(np.linalg.norm(mean)), 1e-12)

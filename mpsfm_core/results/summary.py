@@ -134,7 +134,8 @@ class RunSummary(TypedDict):
     mapping_steps: dict[str, dict[str, Any]]
     """Run time in seconds and number of calls of each step of the mapper."""
     georeference: dict[str, Any] | None
-    """Alignment of the first reconstruction with GPS positions, or the reason of no alignment."""
+    """Alignment of the first reconstruction with GPS positions, or the reason why it is not
+    aligned."""
     dense: list[dict[str, Any]] | None
     """Report of multi-view stereo for each reconstruction, or None if stereo is disabled."""
     resources: dict[str, Any]

@@ -127,7 +127,9 @@ def require_small_shift(
     largest = central if case.truth_source == "image" else shift.largest
     if largest > limit:
         border = f"and by another ({shift.stretch_x:+.2f}, {shift.stretch_y:+.2f}) px at the border"
-        raise CheckFailed(f"the map content is {text} of the view {border}; {limit:.2f} is allowed")
+        raise CheckFailed(
+            f"the content of the map is {text} of the view {border}; {limit:.2f} px are allowed"
+        )
     return text
 
 
@@ -175,7 +177,7 @@ def _compare_matches(case: ContractCase, example: Example, answer: PairMatches) 
 def _require_mask_not_shifted(mask: Bool, example: Example) -> None:
     """Require that no shifted true mask fits the output mask much better at the holes.
 
-    A mask that excludes a margin around each hole fits the true mask best, and a mask of a coarse
+    A mask that excludes a margin around each hole fits the true mask best. A mask of a coarse
     network fits the true and the shifted masks about equally well.
     """
     truth = example.truth().valid

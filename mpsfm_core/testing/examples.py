@@ -135,8 +135,8 @@ class Example:
     def sized(self, width: int, height: int) -> Example:
         """Return the synthetic view with another image size.
 
-        The pose, the ratio of focal length to image height and the relative position of the
-        principal point stay the same, so the resized view may show more or less of the scene.
+        The pose, the ratio of focal length to image height and the relative principal point stay
+        the same. The resized view may therefore show more or less of the scene.
 
         Args:
             width: Width in pixels.

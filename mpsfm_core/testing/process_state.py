@@ -37,7 +37,7 @@ class ProcessSettings:
     """Environment variables of the process."""
 
     def changes(self, later: ProcessSettings, *, without_torch_numbers: bool = False) -> str:
-        """Describe the first value that differs in a later state, or return an empty string.
+        """Describe the first value that differs in a later process state, or return an empty text.
 
         Args:
             later: Values of the later process state.

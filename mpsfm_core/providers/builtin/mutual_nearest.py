@@ -15,8 +15,8 @@ from mpsfm_core.providers.builtin.options import MutualNearestOptions
 from mpsfm_core.support.jit import kernel
 
 _BLOCK = 128
-"""Rows of the descriptor distance matrix that are computed together. 128 rows for 8192 descriptors
-in the second image are 4 MB, which fits into CPU caches."""
+"""Number of rows of the descriptor distance matrix that are computed together. For 8192 descriptors
+in the second image, 128 rows are 4 MB, which fits into CPU caches."""
 _ROUNDING = np.float32(1e-5)
 """Largest rounding error of a squared descriptor distance, relative to the squared descriptor
 length. Squared distances that differ by less than the rounding error count as equal, because the

@@ -41,8 +41,9 @@ class NormalsFromDepth:
     accurate than they would be with independent errors of the declared std. A depth error of
     relative std ``s`` that varies over an angle of ``a`` radians tilts a surface by about ``s /
     a``. The option ``slope_std`` is the ratio of normal std in radians to relative depth std. The
-    normal variance is the sum of two terms, one for smooth depth errors that tilt a surface and one
-    for independent pixel errors, which is estimated from the residuals of the plane fit.
+    normal variance is the sum of a term for smooth depth errors, which tilt a surface, and a term
+    for independent pixel errors. The residuals of the plane fit determine the term for independent
+    pixel errors.
     """
 
     def __init__(self, options: NormalsFromDepthOptions, context: ProviderContext) -> None:

@@ -48,8 +48,8 @@ class MutualNearestOptions(Options):
 
     ratio: float | None = Field(0.8, gt=0, le=1)
     """Largest ratio of nearest to second nearest descriptor distance, in both directions [COLMAP
-    max_ratio]. Raising the ratio accepts more ambiguous matches. Null disables the ratio test, as
-    is usual for learned features."""
+    max_ratio]. A larger ratio accepts more ambiguous matches. Null disables the ratio test, as is
+    usual for learned features."""
     max_distance: float | None = Field(None, gt=0)
     """Largest Euclidean distance of matching descriptors; null accepts any distance."""
 

@@ -22,9 +22,9 @@ from mpsfm_core.providers.environments.codec import EncodedMessage, decode_messa
 
 _IN_MEMORY = Path("/dev/shm")
 _HEADER = struct.Struct("<IIQ")
-"""Binary format of the message header, which has the number of text bytes, the index of the shared
-memory block for the reply and the number of array bytes. The header is the same in all versions of
-the message protocol, so both processes can read the version in the first message."""
+"""Binary format of the message header: number of text bytes, index of the shared memory block for
+the reply, and number of array bytes. The header is the same in all versions of the message
+protocol, so both processes can read the version in the first message."""
 _LARGEST_TEXT = 1 << 28
 _EMPTY = np.empty(0, dtype=np.uint8)
 

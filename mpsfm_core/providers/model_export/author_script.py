@@ -75,7 +75,8 @@ class ExportJob:
         missing = model.load_state_dict(state, strict=False).missing_keys
         if missing:
             raise SystemExit(
-                f"the checkpoint lacks parameter {missing[0]} and {len(missing) - 1} more"
+                f"the checkpoint lacks {len(missing)} parameters of the network, such as "
+                f"{missing[0]}"
             )
 
     def export(

@@ -1,10 +1,10 @@
 """Uncertainty models of priors, which convert the std of a network to a calibrated std.
 
-As in appendix C of the paper, the calibrated depth std is the maximum of three terms, which are the
-scaled network std, a std proportional to depth, and a floor. The option ``shift`` serves networks
-that predict depth up to scale and shift. It adds the same depth offset to all depth maps, so that
-the mapper only estimates a scale per image. An option for depth edges increases the depth variance
-of pixels at depth discontinuities.
+The calibrated depth std is the maximum of the scaled network std, a std proportional to depth, and
+a floor (appendix C of the paper). The option ``shift`` serves networks that predict depth up to
+scale and shift. The same depth offset is added to all depth maps, so that the mapper only estimates
+a scale per image. An option for depth edges increases the depth variance of pixels at depth
+discontinuities.
 """
 
 from __future__ import annotations

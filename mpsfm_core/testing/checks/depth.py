@@ -280,7 +280,9 @@ def check_depth_focal(case: ContractCase) -> str:
         case.prepare(example)
         focal = run_focal(case.spec, case.provider, example.view)
         if focal is None:
-            raise CheckSkipped("the provider estimates no focal length with these options")
+            raise CheckSkipped(
+                "the provider estimates no focal length with the options of the ContractSetup"
+            )
         found.append(focal)
     if not _FOCAL_GROWTH[0] < found[1] / found[0] < _FOCAL_GROWTH[1]:
         raise CheckFailed(

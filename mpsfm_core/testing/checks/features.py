@@ -54,9 +54,9 @@ shuffled descriptors."""
 def check_features_axes(case: ContractCase) -> str:
     """Require keypoints (x, y) in the textured part of landscape, portrait and odd-sized views.
 
-    The textured part is a low and wide area in the upper right or lower left corner, so that
-    keypoints with swapped x and y are outside. Keypoints of a resized, padded, cropped or rotated
-    image that are not mapped back are outside of the textured part as well.
+    The textured part is a wide area in the upper right or lower left corner, so that keypoints with
+    swapped x and y are outside. Keypoints of a resized, padded, cropped or rotated image that are
+    not mapped back are outside of the textured part as well.
     """
     case.require_truth("image", "prepared")
     width, height = case.example.camera.size

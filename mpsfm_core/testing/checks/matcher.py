@@ -99,9 +99,9 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
     """Require dense matches in COLMAP's pixel convention.
 
     If a view is matched with its copy at half the size, the matched coordinates in the copy are
-    exactly half as large. Matched coordinates with integer pixel centers differ from half the
-    coordinates. A matcher that is not invariant to scale is checked with copies of three quarters
-    of the size, and with a copy that is rotated by 180 degrees.
+    exactly half as large. With integer pixel centers, the matched coordinates in the copy are not
+    exactly half as large. A matcher that is not invariant to scale is checked with copies of three
+    quarters of the size, and with a copy that is rotated by 180 degrees.
     """
     if not case.declares("dense"):
         raise CheckSkipped(

@@ -45,7 +45,7 @@ _MEMORY_TIME_S = 1.5
 4 calls."""
 _MAX_RETAINED_BYTES = 20_000
 """Bytes of Python and numpy memory that a call of a provider may retain. The pixels of a view have
-at least 83 kB, so a retained view is detected; caches of the Python interpreter grow by less than 4
+at least 83 kB, so a retained view is detected. Caches of the Python interpreter grow by less than 4
 kB."""
 _MAX_NATIVE_MB = 40.0
 """Growth of the resident memory in MB during all calls after which a native leak is reported. The
@@ -244,8 +244,7 @@ def _capture_output() -> Iterator[list[str]]:
     with tempfile.TemporaryFile() as file:
         os.dup2(file.fileno(), 1)
         stdout = sys.stdout
-        # Closing the file object keeps descriptor 1 open.
-        sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115
+        sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115 - descriptor 1 must stay open
         try:
             yield lines
         finally:

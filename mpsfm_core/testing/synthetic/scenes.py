@@ -333,7 +333,7 @@ def arc_poses(
     """Return camera poses that look at ``target`` from an arc, ``step_deg`` apart.
 
     With the default values the cameras stay inside :func:`room_scene` up to 60 degrees to either
-    side of the middle.
+    side of the middle of the arc.
     """
     angles = np.deg2rad(180.0 + step_deg * (np.arange(count) - (count - 1) / 2))
     eyes = np.asarray(target) + radius * np.column_stack(
