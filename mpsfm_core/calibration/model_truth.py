@@ -166,7 +166,7 @@ def _noise_px(problem: BundleProblem) -> float:
     long = lengths > 2
     if not long.any():
         return 1.0
-    # A point has 3 parameters for 2 x length residuals, so 2 x length - 3 degrees of freedom.
+    # A point with n observations has 2 n residuals and 3 parameters, so 2 n - 3 degrees of freedom.
     lost = np.sqrt(2 * lengths[long] / (2 * lengths[long] - 3))
     residuals = _residuals(problem)[long] * lost[:, None]
     return float(np.clip(MAD_TO_STD * np.median(np.abs(residuals)), *STD_PX_RANGE))

@@ -62,9 +62,9 @@ class PairsSummary(TypedDict):
     matched: int
     verified: int
     all: list[dict[str, Any]]
-    """:class:`~mpsfm_core.extraction.report.PairReport` of each pair, with the number ``explained``
-    of inliers whose keypoints share a 3D point of the first model, and the reason ``cannot_start``
-    why the pair cannot initialize a component."""
+    """:class:`~mpsfm_core.extraction.report.PairReport` of each pair, with two more entries. The
+    entry ``explained`` is the number of inliers whose keypoints share a 3D point of the first
+    model. The entry ``cannot_start`` is the reason why the pair cannot initialize a component."""
 
 
 class ReconstructionSummary(TypedDict):

@@ -168,7 +168,8 @@ class Worker:
             timer.cancel()
 
     def _lost(self, late: str) -> WorkerLost:
-        """Release the worker's resources and return an error that describes how it ended."""
+        """Release the worker's resources and return an error that describes how the worker
+        ended."""
         try:
             code = self._process.wait(_EXIT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
