@@ -144,7 +144,8 @@ def mesh_model(
 ) -> TriangleMesh:
     """Mesh the depth maps of a result folder; write ``mesh.ply`` and ``mesh.glb``.
 
-    The PLY file has the frame of the model. The GLB file is rotated so that gravity points down.
+    The vertices of the PLY file are in the world frame of the COLMAP model. The GLB file is rotated
+    so that gravity points down.
 
     Args:
         folder: Result folder with depth maps.

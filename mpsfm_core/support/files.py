@@ -272,7 +272,8 @@ def _translate_disk_errors(output: Path) -> Iterator[None]:
             raise InputError(f"{output}: the folder cannot be written: {reason}") from error
         full = "the disk is full" if error.errno in _DISK_FULL else "the disk fails"
         raise OutputError(
-            f"{output}: {full}, but earlier results are unchanged: {reason}"
+            f"output folder {output} cannot be written: {full}, but earlier results are unchanged "
+            f"({reason})"
         ) from error
 
 

@@ -168,8 +168,7 @@ class Worker:
             timer.cancel()
 
     def _lost(self, late: str) -> WorkerLost:
-        """Release the worker's resources and return an error that describes how the worker
-        ended."""
+        """Release the worker's resources and return an error with the reason of its end."""
         try:
             code = self._process.wait(_EXIT_TIMEOUT_S)
         except subprocess.TimeoutExpired:
