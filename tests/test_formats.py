@@ -267,7 +267,7 @@ def test_documentation_lists_every_format() -> None:
 
 @pytest.mark.parametrize("version", [0, -3, "two", None, [1], float("nan"), float("inf")])
 def test_check_version_of_invalid_version_raises(version: object) -> None:
-    with pytest.raises(InputError, match=r"x\.json: its format_version is .*, not a number"):
+    with pytest.raises(InputError, match=r"x\.json: the key .* is .*, not a positive"):
         check_version({VERSION: version}, 1, Path("x.json"))
 
 

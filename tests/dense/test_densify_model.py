@@ -76,7 +76,7 @@ def test_densify_model_with_other_images_raises(model: Path, tmp_path: Path) -> 
     other.mkdir()
     for name in ("x.png", "y.png"):
         cv2.imwrite(str(other / name), np.zeros((8, 8, 3), np.uint8))
-    with pytest.raises(InputError, match="two are needed"):
+    with pytest.raises(InputError, match="stereo needs two photos"):
         densify_model(model, other, model / "out")
 
 

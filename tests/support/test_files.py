@@ -87,7 +87,7 @@ def test_full_disk_raises_one_error(output: Path) -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 16, limit))
     try:
         with (
-            pytest.raises(OutputError, match=r"out: the disk is full .*earlier results"),
+            pytest.raises(OutputError, match=r"the disk is full, but earlier results"),
             replace_entries(output, ENTRIES) as fresh,
         ):
             (fresh / "points.ply").write_bytes(bytes(1 << 20))
