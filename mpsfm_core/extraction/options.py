@@ -23,13 +23,13 @@ class PairOptions(Options):
     """Minimum number of images that each image is matched with, in mode ``auto``. More partners per
     image find more pairs of small overlap, but matching takes proportionally longer. [tuned:
     benchmarks.pairs]"""
-    overlap: int = Field(2, ge=1)
+    overlap: int = expert(2, ge=1)
     """Number of following images that each image is paired with, in modes ``sequential`` and
     ``auto``. [reference noverlap]"""
     quadratic: bool = expert(False)
     """Pair each image with the images 1, 2, 4, 8 ... positions later, in modes ``sequential`` and
     ``auto``. [COLMAP quadratic_overlap]"""
-    top_k: int = Field(20, ge=1)
+    top_k: int = expert(20, ge=1)
     """Number of most similar images that each image is paired with, in mode ``retrieval``.
     [reference nquery]"""
     min_similarity: float = expert(0.0)

@@ -40,7 +40,7 @@ class RegistrationOptions(Options):
     next_view: Literal["match-scores", "inlier-matches", "visible-points"] = expert("match-scores")
     """Ranking of the next image, by summed match scores or number of matches with the best matching
     registered image, or by number of visible 3D points. [paper, next view selection]"""
-    min_inliers: int = Field(30, ge=3)
+    min_inliers: int = expert(30, ge=3)
     """Smallest number of inliers of an image pose; raising it registers fewer, more reliable
     images. [COLMAP abs_pose_min_num_inliers]"""
     min_pose_inlier_ratio: float = expert(0.7, ge=0, le=1)
@@ -101,7 +101,7 @@ class TriangulationOptions(Options):
     max_angle_error_deg: float = expert(2.0, gt=0)
     """Largest angular error of an observation in a new image, before refinement.
     [COLMAP tri_create_max_angle_error, tri_continue_max_angle_error]"""
-    max_error_px: float = Field(4.0, gt=0)
+    max_error_px: float = expert(4.0, gt=0)
     """Largest reprojection error of an observation, in standard deviations of the keypoint
     position; raising it keeps more, but less accurate points. [COLMAP filter_max_reproj_error]"""
 
@@ -109,7 +109,7 @@ class TriangulationOptions(Options):
 class RefinementOptions(Options):
     """Options of bundle adjustment and depth integration (paper 3.3)."""
 
-    integrate: bool = Field(True)
+    integrate: bool = expert(True)
     """Refine depth maps, whereas False keeps the scaled depth priors, which is faster."""
     map_width: int = expert(200, ge=16)
     """Width in pixels to which depth maps are subsampled for refinement. Wider depth maps are
@@ -158,7 +158,7 @@ class RefinementOptions(Options):
 class ConsistencyOptions(Options):
     """Options of the dense depth consistency check between images (paper 3.4)."""
 
-    enabled: bool = True
+    enabled: bool = expert(True)
     """Reject images whose depth contradicts registered images, while False registers more wrong
     images."""
     weigh_evidence: bool = expert(True)
@@ -203,9 +203,9 @@ class MappingOptions(Options):
     weigh_by_score: bool = expert(True)
     """Weight matches by their scores in pose support and in bundle adjustment.
     [tuned: benchmarks.ablation]"""
-    max_components: int = Field(10, ge=1)
+    max_components: int = expert(10, ge=1)
     """Maximum number of disconnected components. [COLMAP max_num_models]"""
-    max_runs: int = Field(3, ge=1)
+    max_runs: int = expert(3, ge=1)
     """Maximum number of mapper runs with different seeds; raising it takes longer and may register
     more images of difficult scenes. [tuned: benchmarks.accuracy]"""
     enough_explained: float = expert(0.75, ge=0, le=1)

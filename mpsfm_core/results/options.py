@@ -12,7 +12,7 @@ class ResultOptions(Options):
     """Write the COLMAP model also as text, into ``sparse_text/``."""
     nerfstudio: bool = False
     """Write ``transforms.json`` for nerfstudio and other programs with this format."""
-    depth_maps: bool = True
+    depth_maps: bool = expert(True)
     """Write the refined depth maps into ``depth/``."""
     report: bool = True
     """Write ``report.html``, and small images, priors and matches into ``views/``."""

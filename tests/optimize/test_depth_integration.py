@@ -321,7 +321,7 @@ def test_result_does_not_depend_on_threads():
 
 def test_wrong_grids_and_variances_raise():
     depth, normals, _ = random_problem((6, 7), 0)
-    with pytest.raises(DataError, match="one grid"):
+    with pytest.raises(DataError, match="equal width and height"):
         DepthIntegrator(depth, normals, camera_of((7, 6)))
     with pytest.raises(DataError, match="variance"):
         DepthIntegrator(replace(depth, variance=None), normals, camera_of((6, 7)))
