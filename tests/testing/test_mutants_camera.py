@@ -36,7 +36,7 @@ def scaled(prior: Any, focal: float = 1.0, std: float = 1.0) -> Any:
     )
 
 
-def check(template: ProviderSpec, change: Change, id: str) -> CheckResult:
+def run_check(template: ProviderSpec, change: Change, id: str) -> CheckResult:
     """Run one contract check on the correct provider with a change of its output."""
 
     def factory(options: Any, context: Any) -> Any:
@@ -62,7 +62,7 @@ def with_radial(prior: Any, radial: float = 0.0) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("change", "id", "message"),
+    ("change", "check", "message"),
     [
         (lambda p, v, c: scaled(p, 1.3), "camera-focal", "the truth is 144.0 px"),
         (lambda p, v, c: scaled(p, 1 / p.focal_px), "camera-size", "at twice the image size"),
@@ -95,12 +95,12 @@ def with_radial(prior: Any, radial: float = 0.0) -> Any:
     ],
 )
 def test_check_names_fault_of_camera_provider(
-    template: ProviderSpec, change: Change, id: str, message: str, tmp_path: Path
+    template: ProviderSpec, change: Change, check: str, message: str, tmp_path: Path
 ) -> None:
     def changed(prior: Any, view: Any, correct: Any) -> Any:
         return change(with_radial(prior), view, correct)
 
-    result = check(template, changed, id)
+    result = run_check(template, changed, check)
     assert (result.status, message in result.message) == ("fail", True), result
 
 
@@ -111,5 +111,5 @@ def test_gravity_that_is_not_mirrored_fails(template: ProviderSpec) -> None:
         fixed.append(prior.gravity)
         return with_radial(replace(prior, gravity=fixed[0]))
 
-    result = check(template, change, "camera-mirror")
+    result = run_check(template, change, "camera-mirror")
     assert result.status == "fail" and "gravity" in result.message

@@ -32,13 +32,14 @@ from tests.support import reference_providers as ref
 from tests.support.reference_providers import PaintedDepth, PaintedMask, Thumbnail, Wrapper
 from tests.testing import (
     test_mutants_any_kind,
+    test_mutants_camera,
     test_mutants_maps,
     test_mutants_matching,
     test_mutants_multiview,
 )
 
 PAINTED = ContractSetup(truth_source="painted")
-SPECIAL = {"specification", "construction", "light-import", "speed"}
+SPECIAL = {"specification", "construction", "light-import", "speed", "camera-mirror"}
 """Checks with tests of their own, and ``speed``, whose limit of 20 s no quick test exceeds."""
 
 
@@ -388,6 +389,7 @@ def test_faulty_wrapper_fails_its_check(
 def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
     modules = (
         test_mutants_any_kind,
+        test_mutants_camera,
         test_mutants_maps,
         test_mutants_matching,
         test_mutants_multiview,
