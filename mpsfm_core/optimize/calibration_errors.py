@@ -129,7 +129,7 @@ def predict_calibration_errors(
     if num_images > MAX_IMAGES or moving is None or not moving.any() or not len(problem.points):
         return None
     columns = _number_columns(num_images, num_cameras, len(problem.points))
-    equations = _linearize(problem, options, columns)
+    equations = _linearize(problem, options, columns, extended=not known.all())
     offsets = _prior_offsets(problem, columns)
     camera_stds, lens_stds, edit_stds = (
         _prior_stds(problem, columns, known, longer_sides, deviation_stds)
@@ -260,15 +260,23 @@ def _invert(information: Float64, std: Float64, free: Int64) -> Float64:
 
 
 def _linearize(
-    problem: BundleProblem, options: BundleOptions, columns: _Columns
+    problem: BundleProblem, options: BundleOptions, columns: _Columns, *, extended: bool
 ) -> _NormalEquations:
-    """Linearize the residuals at the solution, eliminate points, and scale by the variance."""
+    """Linearize the residuals at the solution, eliminate points, and scale by the variance.
+
+    Args:
+        problem: Solved bundle adjustment problem.
+        options: Options of bundle adjustment with the robust losses.
+        columns: First column of each kind of parameter.
+        extended: False if all intrinsics are known. The Jacobian then excludes intrinsics, and the
+            gradient is 0, because the solution is the minimum for known intrinsics.
+    """
     max_observations = max(MAX_OBSERVATIONS, MAX_IMAGE_OBSERVATIONS * len(problem.rotations))
     step = 1 + len(problem.obs_point) // max_observations
     rows = np.flatnonzero(np.asarray(problem.obs_point) % step == 0)
     blocks = _Observations(problem, rows)
     jacobian, residuals, variance_factor, newton_factor = _linearize_reprojection(
-        problem, options, columns, blocks
+        problem, options, columns, blocks, extended=extended
     )
     hessian, gradient = csr_array(jacobian.T @ jacobian), jacobian.T @ residuals
     depth_hessian = csr_array(hessian.shape)
@@ -282,10 +290,12 @@ def _linearize(
     prior = np.zeros(columns.end)
     prior[scales] = precision / step
     depth_hessian = csr_array(depth_hessian + diags_array(prior))
-    information, reduced = _eliminate_points(hessian + depth_hessian, gradient, columns.point)
     posterior, _ = _eliminate_points(
         hessian / variance_factor + depth_hessian, gradient, columns.point
     )
+    if not extended:
+        return _NormalEquations(step * posterior, np.zeros(columns.point), step * posterior)
+    information, reduced = _eliminate_points(hessian + depth_hessian, gradient, columns.point)
     factor = step / variance_factor
     return _NormalEquations(
         factor * information, factor * newton_factor * reduced, step * posterior
@@ -342,14 +352,18 @@ class _Observations:
 
 
 def _linearize_reprojection(
-    problem: BundleProblem, options: BundleOptions, columns: _Columns, seen: _Observations
+    problem: BundleProblem,
+    options: BundleOptions,
+    columns: _Columns,
+    seen: _Observations,
+    *,
+    extended: bool,
 ) -> tuple[csr_array, Float64, float, float]:
-    """Linearize the weighted reprojection errors.
+    """Linearize the weighted reprojection errors by poses and points, ``extended`` by intrinsics.
 
     Returns:
         Jacobian (2m, parameters), residuals (2m,), variance factor and Newton factor.
     """
-    num_images, num_cameras = len(problem.rotations), len(problem.intrinsics)
     z = seen.in_camera[:, 2:]
     slopes = seen.in_camera[:, :2] / z
     intrinsics = problem.intrinsics[seen.camera]
@@ -362,13 +376,54 @@ def _linearize_reprojection(
     weight, curvature = _evaluate_loss(
         options.reprojection_loss, options.reprojection_scale, squared
     )
-    num_parameters = 3 * len(np.unique(seen.point)) + 6 * (num_images - 1)
+    num_parameters = 3 * len(np.unique(seen.point)) + 6 * (len(problem.rotations) - 1)
     factors = _estimate_factors(weight, curvature, squared, num_parameters)
+    image = seen.image[:, None]
     by_slopes = scale[:, :, None] * derivative
     by_point = (
         np.concatenate([by_slopes, -np.einsum("mij,mj->mi", by_slopes, slopes)[:, :, None]], axis=2)
         / z[:, :, None]
     )
+    blocks = [_by_pose(by_point, seen), by_point @ seen.rotation]
+    indices = [
+        np.repeat((columns.pose + 6 * image + np.arange(6))[:, None], 2, axis=1),
+        np.repeat((columns.point + 3 * seen.point[:, None] + np.arange(3))[:, None], 2, axis=1),
+    ]
+    if extended:
+        by_intrinsics, intrinsics_indices = _linearize_intrinsics(
+            problem, columns, seen, errors, inverse_std
+        )
+        blocks.append(by_intrinsics)
+        indices.append(intrinsics_indices)
+    root = np.sqrt(weight)[:, None]
+    jacobian = np.concatenate(blocks, axis=2) * root[:, :, None]
+    matrix = _to_sparse(jacobian, np.concatenate(indices, axis=2), columns.end)
+    return matrix, (residuals * root).ravel(), *factors
+
+
+def _linearize_intrinsics(
+    problem: BundleProblem,
+    columns: _Columns,
+    seen: _Observations,
+    errors: Float64,
+    inverse_std: Float64,
+) -> tuple[Float64, Int64]:
+    """Differentiate the reprojection errors by shared intrinsics and by deviations of images.
+
+    Args:
+        problem: Bundle adjustment problem.
+        columns: First column of each kind of parameter.
+        seen: The m observations.
+        errors: (m, 2) offsets of the projections from the principal point, in standard deviations.
+        inverse_std: (m,) inverse standard deviations of the keypoints in 1/pixels.
+
+    Returns:
+        Derivatives (m, 2, 6) and their columns (m, 2, 6): log focal length, two radial
+        coefficients, principal point, and the deviations of log focal length and principal point.
+    """
+    num_images, num_cameras = len(problem.rotations), len(problem.intrinsics)
+    slopes = seen.in_camera[:, :2] / seen.in_camera[:, 2:]
+    scale = problem.intrinsics[seen.camera, :2] * inverse_std[:, None]
     radius2 = (slopes**2).sum(axis=1, keepdims=True)
     direction = slopes
     if problem.fisheye is not None and problem.fisheye.any():
@@ -378,26 +433,18 @@ def _linearize_reprojection(
         direction = np.where(is_fisheye, slopes * angle / radius, slopes)
         radius2 = np.where(is_fisheye, angle**2, radius2)
     by_radial = np.stack([scale * direction * radius2, scale * direction * radius2**2], axis=2)
-    by_center = np.broadcast_to(inverse_std[:, None, None], (len(z), 2, 1))
-    by_focal, by_world_point = errors[:, :, None], by_point @ seen.rotation
-    by_camera, by_deviation = (by_focal, by_radial, by_center), (by_focal, by_center)
-    jacobian = np.concatenate(
-        [_by_pose(by_point, seen), *by_camera, *by_deviation, by_world_point], axis=2
-    )
-    image, camera = seen.image[:, None], seen.camera[:, None]
-    axes = np.arange(2)[None]
-    parts = [
-        np.repeat((columns.pose + 6 * image + np.arange(6))[:, None], 2, axis=1),
+    by_center = np.broadcast_to(inverse_std[:, None, None], (len(slopes), 2, 1))
+    by_focal = errors[:, :, None]
+    image, camera, axes = seen.image[:, None], seen.camera[:, None], np.arange(2)[None]
+    indices = [
         np.repeat((columns.focal + camera)[:, None], 2, axis=1),
         np.repeat((columns.radial + camera + num_cameras * axes)[:, None], 2, axis=1),
         (columns.center + camera + num_cameras * axes)[:, :, None],
         np.repeat((columns.focal_deviation + image)[:, None], 2, axis=1),
         (columns.center_deviation + image + num_images * axes)[:, :, None],
-        np.repeat((columns.point + 3 * seen.point[:, None] + np.arange(3))[:, None], 2, axis=1),
     ]
-    root = np.sqrt(weight)[:, None]
-    matrix = _to_sparse(jacobian * root[:, :, None], np.concatenate(parts, axis=2), columns.end)
-    return matrix, (residuals * root).ravel(), *factors
+    jacobian = np.concatenate([by_focal, by_radial, by_center, by_focal, by_center], axis=2)
+    return jacobian, np.concatenate(indices, axis=2)
 
 
 def _linearize_depth(
