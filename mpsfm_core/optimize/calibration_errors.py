@@ -359,7 +359,9 @@ def _linearize_reprojection(
     *,
     extended: bool,
 ) -> tuple[csr_array, Float64, float, float]:
-    """Linearize the weighted reprojection errors by poses and points, ``extended`` by intrinsics.
+    """Linearize the weighted reprojection errors by poses, points and intrinsics.
+
+    Without ``extended``, the Jacobian excludes intrinsics.
 
     Returns:
         Jacobian (2m, parameters), residuals (2m,), variance factor and Newton factor.
