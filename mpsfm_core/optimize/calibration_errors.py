@@ -28,7 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
-from scipy.sparse import bsr_array, csr_array, diags_array
+from scipy.sparse import bsr_array, csr_array, diags_array, vstack
 
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.data.camera_models import NUM_INTRINSICS, IntrinsicParameter
@@ -54,7 +54,7 @@ MAX_IMAGES = 300
 [ours]"""
 MAX_OBSERVATIONS, MAX_IMAGE_OBSERVATIONS = 30_000, 500
 """Maximum number of observations in all, and on average per image. If both are exceeded, evenly
-spaced points predict the errors. [ours]"""
+spaced points contribute to the Gauss-Newton matrix. [ours]"""
 MAX_OTHER_IMAGES = 50
 """Maximum number of other images that the pose of an image is compared with. [ours]"""
 MAX_ERROR_DEG = 180.0
@@ -273,48 +273,67 @@ def _linearize(
     """
     max_observations = max(MAX_OBSERVATIONS, MAX_IMAGE_OBSERVATIONS * len(problem.rotations))
     step = 1 + len(problem.obs_point) // max_observations
-    rows = np.flatnonzero(np.asarray(problem.obs_point) % step == 0)
-    blocks = _Observations(problem, rows)
+    is_sampled = np.asarray(problem.obs_point) % step == 0
+    # The gradient of a part of the observations is not small at the minimum for all observations.
+    seen = _Observations(problem, np.flatnonzero(is_sampled | extended))
+    is_sampled = is_sampled[seen.rows]
     jacobian, residuals, variance_factor, newton_factor = _linearize_reprojection(
-        problem, options, columns, blocks, extended=extended
+        problem, options, columns, seen, extended=extended
     )
-    hessian, gradient = csr_array(jacobian.T @ jacobian), jacobian.T @ residuals
+    hessian = _compute_hessian(jacobian, np.repeat(is_sampled, 2))
     depth_hessian = csr_array(hessian.shape)
     if problem.obs_log_depth is not None:
-        jacobian, residuals = _linearize_depth(problem, options, columns, blocks)
-        depth_hessian = csr_array(jacobian.T @ jacobian)
-        gradient = gradient + jacobian.T @ residuals
+        depth_jacobian, depth_residuals = _linearize_depth(problem, options, columns, seen)
+        depth_hessian = _compute_hessian(depth_jacobian, is_sampled)
+        jacobian = csr_array(vstack([jacobian, depth_jacobian]))
+        residuals = np.concatenate([residuals, depth_residuals])
     precision, deviations = _scale_prior(problem)
     scales = np.arange(columns.scale, columns.focal)
-    gradient[scales] += precision / step * deviations
-    prior = np.zeros(columns.end)
-    prior[scales] = precision / step
+    prior, prior_gradient = np.zeros((2, columns.end))
+    prior[scales], prior_gradient[scales] = precision / step, precision * deviations
     depth_hessian = csr_array(depth_hessian + diags_array(prior))
-    posterior, _ = _eliminate_points(
-        hessian / variance_factor + depth_hessian, gradient, columns.point
-    )
+    posterior = step * _eliminate_points(hessian / variance_factor + depth_hessian, columns.point)
     if not extended:
-        return _NormalEquations(step * posterior, np.zeros(columns.point), step * posterior)
-    information, reduced = _eliminate_points(hessian + depth_hessian, gradient, columns.point)
-    factor = step / variance_factor
+        return _NormalEquations(posterior, np.zeros(columns.point), posterior)
+    information = step * _eliminate_points(hessian + depth_hessian, columns.point)
+    gradient = _reduce_gradient(jacobian, jacobian.T @ residuals + prior_gradient, columns.point)
     return _NormalEquations(
-        factor * information, factor * newton_factor * reduced, step * posterior
+        information / variance_factor, newton_factor / variance_factor * gradient, posterior
     )
 
 
-def _eliminate_points(hessian: csr_array, gradient: Float64, first: int) -> tuple[Float64, Float64]:
-    """Return the Schur complement (c, c) and the reduced gradient (c,) of the camera parameters.
+def _compute_hessian(jacobian: csr_array, chosen: Bool) -> csr_array:
+    """Return the Gauss-Newton matrix of the chosen rows of a Jacobian."""
+    rows = jacobian if chosen.all() else csr_array(jacobian[np.flatnonzero(chosen)])
+    return csr_array(rows.T @ rows)
+
+
+def _eliminate_points(hessian: csr_array, first: int) -> Float64:
+    """Return the Schur complement (c, c) of the camera parameters.
 
     Args:
         hessian: Gauss-Newton matrix of camera parameters and points.
-        gradient: Gradient of the cost.
         first: First column of the points.
     """
     hessian = csr_array(hessian)
     coupling = csr_array(hessian[:first, first:])
     weighted = csr_array(coupling @ _invert_points(csr_array(hessian[first:, first:])))
-    information = (hessian[:first, :first] - weighted @ coupling.T).toarray()
-    return information, gradient[:first] - weighted @ gradient[first:]
+    information: Float64 = (hessian[:first, :first] - weighted @ coupling.T).toarray()
+    return information
+
+
+def _reduce_gradient(jacobian: csr_array, gradient: Float64, first: int) -> Float64:
+    """Return the gradient (c,) of the camera parameters after the elimination of points.
+
+    Args:
+        jacobian: Jacobian of all residuals.
+        gradient: Gradient of the cost.
+        first: First column of the points.
+    """
+    by_points = csr_array(jacobian[:, first:])
+    point_step = _invert_points(csr_array(by_points.T @ by_points)) @ gradient[first:]
+    reduced: Float64 = (gradient - jacobian.T @ (by_points @ point_step))[:first]
+    return reduced
 
 
 def _scale_prior(problem: BundleProblem) -> tuple[Float64, Float64]:
