@@ -129,14 +129,17 @@ def predict_calibration_errors(
     if num_images > MAX_IMAGES or moving is None or not moving.any() or not len(problem.points):
         return None
     columns = _number_columns(num_images, num_cameras, len(problem.points))
-    equations = _linearize(problem, options, columns, extended=not known.all())
+    extended = not known.all()
+    equations = _linearize(problem, options, columns, extended=extended)
     offsets = _prior_offsets(problem, columns)
     camera_stds, lens_stds, edit_stds = (
         _prior_stds(problem, columns, known, longer_sides, deviation_stds)
         for deviation_stds in (NO_DEVIATIONS, LENS_DEVIATIONS, EDIT_DEVIATIONS)
     )
-    camera_step = _compute_step(equations, camera_stds, offsets)
-    edit_step = _compute_step(equations, edit_stds, offsets)
+    camera_step = edit_step = np.zeros(columns.point)
+    if extended:
+        camera_step = _compute_step(equations, camera_stds, offsets)
+        edit_step = _compute_step(equations, edit_stds, offsets)
     covariance = _compute_covariance(equations, lens_stds)
     focal = columns.focal + np.asarray(problem.camera_of_image)
     deviation = columns.focal_deviation + np.arange(num_images)
@@ -228,25 +231,35 @@ def _compute_step(equations: _NormalEquations, std: Float64, offsets: Float64) -
     """Return the Newton step (c,) of all camera parameters, 0 for constants."""
     step, free = np.zeros(len(std)), np.flatnonzero(std > 0)
     gradient = equations.gradient[free] + offsets[free] / std[free] ** 2
-    step[free] = -_invert(equations.information, std, free) @ gradient
+    step[free] = -_solve(equations.information, std, free, gradient[:, None])[:, 0]
     return step
 
 
 def _compute_covariance(equations: _NormalEquations, std: Float64) -> Float64:
     """Return the covariance (c, c) of all camera parameters, 0 for constants."""
     covariance, free = np.zeros((len(std), len(std))), np.flatnonzero(std > 0)
-    covariance[np.ix_(free, free)] = _invert(equations.posterior, std, free)
+    covariance[np.ix_(free, free)] = _solve(equations.posterior, std, free, np.eye(len(free)))
     return covariance
 
 
-def _invert(information: Float64, std: Float64, free: Int64) -> Float64:
-    """Invert the sum of information and prior precision of the free parameters."""
+def _solve(information: Float64, std: Float64, free: Int64, right: Float64) -> Float64:
+    """Solve for the free parameters by the sum of information and prior precision.
+
+    Args:
+        information: Information matrix (c, c) of all camera parameters.
+        std: Prior standard deviations (c,) of all camera parameters.
+        free: Indices (f,) of the free parameters.
+        right: Right-hand sides (f, r).
+
+    Returns:
+        The solutions (f, r).
+    """
     matrix = information[np.ix_(free, free)]
     diagonal = np.diagonal(matrix) + 1.0 / std[free] ** 2
     # Unobserved parameters without prior stay constant.
     diagonal = np.where(diagonal > 0, diagonal, 1.0)
-    scale, identity = 1.0 / np.sqrt(diagonal), np.eye(len(free))
-    matrix *= scale * scale[:, None]
+    scale = 1.0 / np.sqrt(diagonal)[:, None]
+    matrix *= scale.T * scale
     damping = MIN_DAMPING
     while True:
         matrix[np.diag_indices(len(free))] = 1.0 + damping
@@ -255,8 +268,8 @@ def _invert(information: Float64, std: Float64, free: Int64) -> Float64:
         except LinAlgError:
             damping *= 10  # rounding errors exceed the smallest eigenvalue
             continue
-        inverse: Float64 = cho_solve(factor, identity) * scale * scale[:, None]
-        return inverse
+        solution: Float64 = scale * cho_solve(factor, scale * right)
+        return solution
 
 
 def _linearize(
@@ -347,7 +360,7 @@ def _scale_prior(problem: BundleProblem) -> tuple[Float64, Float64]:
 
 
 class _Observations:
-    """Observations with their points in the camera frame.
+    """Keypoint observations, with the observed 3D points in the frame of the observing camera.
 
     Attributes:
         rows: (m,) index of each observation in the bundle adjustment problem.
