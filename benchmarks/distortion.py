@@ -39,7 +39,7 @@ LENSES = [
     "RADIAL:-0.2,0.05",
     "OPENCV_FISHEYE:0.05,-0.02",
 ]
-"""Camera models and distortion coefficients of the resampled images."""
+"""Camera models and distortion coefficients with which the photos are resampled."""
 ONE_CAMERA = "COLMAP, one camera"
 NUM_BISECTIONS = 40
 """Number of bisection steps in the search for the shortest focal length with which a resampled

@@ -111,14 +111,15 @@ def exchange(folder: Path) -> Any:
 
 
 class File(NamedTuple):
-    """File of a format. ``path`` is relative to the golden folder, and ``read`` returns the
-    content. ``anew`` is the content that is read if a file of a later version is replaced, or None
-    if such a file is refused.
+    """File of a format, whose path is relative to the golden folder and whose content ``read`` gives.
+
+    A file of a later version is either refused (``rewritten`` is None), or replaced by a new file
+    with the content ``rewritten``.
     """
 
     path: str
     read: Callable[[Path], Any]
-    anew: Any = None
+    rewritten: Any = None
 
 
 FILES: dict[str, File] = {
@@ -140,13 +141,13 @@ FILES: dict[str, File] = {
         "cache/weights/hashes.json",
         lambda folder: WeightStore(folder / "cache")._recorded("https://example.org/v1/model.onnx"),
     ),
-    "timings": File("cache/timings.json", speeds, anew=0.3),
+    "timings": File("cache/timings.json", speeds, rewritten=0.3),
     "environment": File(
         "environment/providers.json",
         lambda folder: {p["kind"] for p in Environment(folder / "environment").describe()},
-        anew=set(),
+        rewritten=set(),
     ),
-    "frames": File("frames/frames.json", frames, anew="looked into"),
+    "frames": File("frames/frames.json", frames, rewritten="looked into"),
     "exchange": File("exchange/.mpsfm-killed/ready.json", exchange),
 }
 EXPECTED = {
@@ -203,8 +204,8 @@ def test_file_without_version_is_read_as_version_one(
 @pytest.mark.parametrize("name", FILES)
 def test_file_of_later_version_is_refused_or_replaced(name: str, golden: Path) -> None:
     change_version(golden / FILES[name].path, 999)
-    if FILES[name].anew is not None:
-        assert FILES[name].read(golden) == FILES[name].anew
+    if FILES[name].rewritten is not None:
+        assert FILES[name].read(golden) == FILES[name].rewritten
         return
     newer = r"is of format 999, written by a newer mpsfm-core"
     with pytest.raises(InputError, match=newer) as caught:

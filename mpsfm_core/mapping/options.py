@@ -44,8 +44,9 @@ class RegistrationOptions(Options):
     """Smallest number of inliers of an image pose; raising it registers fewer, more reliable
     images. [COLMAP abs_pose_min_num_inliers]"""
     min_pose_inlier_ratio: float = expert(0.7, ge=0, le=1)
-    """Smallest inlier ratio of the 2D-3D matches of an image pose; raising it rejects more wrong
-    poses and more images with repeated structure. [tuned: benchmarks.ablation]"""
+    """Smallest inlier ratio of the 2D-3D matches with which PnP may register an image. A larger
+    ratio rejects more wrong poses, and more correct poses of images with repeated structure.
+    [tuned: benchmarks.ablation]"""
     max_error_px: float = expert(12.0, gt=0)
     """Largest reprojection error of an inlier of PnP; raising it accepts less accurate points.
     [COLMAP abs_pose_max_error]"""

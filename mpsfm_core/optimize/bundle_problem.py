@@ -135,7 +135,7 @@ class IntrinsicPrior(NamedTuple):
     """(s,) inverse variance of the prior on the parameter of each camera."""
 
     def residuals(self, state: kernels.BundleParameters) -> Float64:
-        """Return the residuals (s,), intrinsic parameters minus their prior means."""
+        """Return the differences (s,) between intrinsic parameters and their prior means."""
         intrinsics, distortion = state.intrinsics[self.camera], state.distortion[self.camera]
         values = intrinsic_parameters(intrinsics, distortion)[:, self.parameter]
         residuals: Float64 = values - self.mean

@@ -1,4 +1,4 @@
-"""Environment of child processes that run Python."""
+"""Environment variables for Python processes that this process starts."""
 
 from __future__ import annotations
 

@@ -58,7 +58,7 @@ def test_depth_decreases_the_variance() -> None:
 
 
 def test_covariance_equals_scatter_of_triangulated_depth() -> None:
-    """With 1 px noise in two exact cameras, triangulated points have the predicted covariance."""
+    """Points triangulated from keypoints with 1 px of noise scatter as the covariance predicts."""
     rng = np.random.default_rng(0)
     turns = np.stack([rotation(np.array([0, 0.1, 0])), rotation(np.array([0.1, -0.2, 0.3]))])
     point = np.array([0.2, -0.1, 4.0])

@@ -195,7 +195,7 @@ class FocalRatio(PaintedDepth):
 
 
 class InvertedMask(PaintedDepth):
-    """Fault: depth is valid where the mask of the view is False."""
+    """Fault: the provider marks depth as valid at masked-out pixels only."""
 
     def predict(self, view: View) -> DepthPrior:
         prior = super().predict(view)

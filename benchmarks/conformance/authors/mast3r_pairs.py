@@ -34,8 +34,8 @@ _SIZE = 256  # MASt3R's descriptor matching takes minutes for larger images on a
 def answers(model: Any, first: Any, second: Any) -> dict[str, Any]:
     """Compute the depth of two views, each in its camera frame, and the matches of both passes."""
     with torch.inference_mode():
-        # The predictions of MASt3R are view 1 in frame 1, view 2 in frame 1, view 2 in frame 2,
-        # and view 1 in frame 2.
+        # MASt3R predicts four point maps: views 1 and 2 in the camera frame of view 1, then views
+        # 2 and 1 in the camera frame of view 2.
         predictions = symmetric_inference(model, first, second, "cpu")
     features, certainties = (
         [view[key][0] for view in predictions] for key in ("desc", "desc_conf")

@@ -78,7 +78,7 @@ class CameraProvider(Protocol):
     """Provider that calibrates the camera of a single image."""
 
     def calibrate(self, view: View) -> CameraPrior | None:
-        """Estimate the focal length, and optionally radial distortion and gravity, of an image.
+        """Estimate an image's focal length and, if possible, radial distortion and gravity.
 
         Args:
             view: Image. The estimate must not depend on ``view.camera``, which is a guess.
@@ -135,7 +135,7 @@ def compare_with_true_camera(
 
 
 def check_camera_focal(case: CheckedProvider) -> str:
-    """Require a focal length in pixels of the view that agrees with the truth within 4 std.
+    """Require that the estimated focal length in pixels is within 4 std of the true one.
 
     A view of half the width around the image center has the same focal length.
     """

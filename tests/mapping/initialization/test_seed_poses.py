@@ -1,4 +1,4 @@
-"""Tests of seed poses: a reconstruction initializes another reconstruction with more matches."""
+"""Tests of seed poses, with which a second reconstruction starts from the poses of the first."""
 
 from __future__ import annotations
 
