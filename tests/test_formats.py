@@ -111,7 +111,7 @@ def exchange(folder: Path) -> Any:
 
 
 class File(NamedTuple):
-    """File of a format, whose path is relative to the golden folder and whose content ``read`` gives.
+    """File of a format, with its path in the golden folder and the function that reads its content.
 
     A file of a later version is either refused (``rewritten`` is None), or replaced by a new file
     with the content ``rewritten``.
