@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -15,8 +15,9 @@ def evaluate(
         Path, typer.Argument(help="COLMAP model, transforms.json or mpsfm result folder.")
     ],
     truth: Annotated[
-        Path, typer.Argument(metavar="GT", help="Model with true poses, in the same formats.")
-    ],
+        Path | None,
+        typer.Argument(metavar="GT", help="Model with true poses, in the same formats."),
+    ] = None,
     images: Annotated[
         str | None,
         typer.Option(
@@ -44,12 +45,26 @@ def evaluate(
         ),
     ] = None,
     distance: Distances = None,
+    held_out: Annotated[
+        bool,
+        typer.Option(
+            "--held-out",
+            help="Render the dense cloud and mesh of MODEL at the poses of photos that did not "
+            "contribute (dense.hold_out_every), and compare with the photos; needs no GT.",
+        ),
+    ] = False,
+    geometry: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.ply", help="Render this cloud or mesh in the frame of MODEL instead."
+        ),
+    ] = None,
     photos: Annotated[
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Folder of the photos, to rotate models of EXIF-rotated photos; default: the "
-            "folder that the run recorded.",
+            help="Folder of the photos, for EXIF rotation and for --held-out; default: the folder "
+            "that the run recorded.",
         ),
     ] = None,
 ) -> None:
@@ -58,21 +73,32 @@ def evaluate(
     Photos of MODEL and GT are matched by name. Photos of GT without pose in MODEL count as
     unregistered. With true depth or a scan, the errors of the depth maps and the dense cloud of a
     result folder are printed too. Without a scan, the dense cloud is compared with the points of
-    the true depth maps.
+    the true depth maps. With --held-out and without GT, the quality of renderings is printed.
     """
     import json
 
+    from mpsfm_core.data.errors import InputError, did_you_mean
     from mpsfm_core.evaluation import CONVENTIONS, evaluate, read_poses
     from mpsfm_core.evaluation.result_folder import find_photos
 
     if convention not in CONVENTIONS:
-        from mpsfm_core.data.errors import InputError, did_you_mean
-
         raise InputError(f"no convention {convention!r}{did_you_mean(convention, CONVENTIONS)}")
     names = _select_names(images, image_list)
+    report: dict[str, Any] = {}
+    if held_out:
+        from mpsfm_core.evaluation.held_out import evaluate_held_out
+
+        report["held_out"] = evaluate_held_out(model, photos, names, geometry)
+    elif geometry is not None:
+        raise InputError("--geometry is only used with --held-out")
+    if truth is None:
+        if not held_out or gt_depth is not None or scan is not None:
+            raise InputError("GT is missing: the model with true poses, or --held-out")
+        typer.echo(json.dumps(report, indent=2))
+        return
     photos = photos or find_photos(model)
     poses, true_poses = read_poses(model, photos), read_poses(truth, photos)
-    report = evaluate(poses, true_poses, names, CONVENTIONS[convention])
+    report |= evaluate(poses, true_poses, names, CONVENTIONS[convention])
     if gt_depth is not None or scan is not None:
         from mpsfm_core.evaluation.result_folder import (
             evaluate_cloud,

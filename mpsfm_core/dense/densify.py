@@ -128,8 +128,8 @@ def densify(
 ) -> tuple[Reconstruction, DenseReport]:
     """Refine the depth maps of a reconstruction by multi-view stereo.
 
-    Images without confirmed pose and images without overlap keep their depth maps. The densified
-    depth maps do not depend on the number of threads.
+    Images without confirmed pose, held-out images and images without overlap keep their depth
+    maps. The densified depth maps do not depend on the number of threads.
 
     Args:
         reconstruction: Posed images with refined depth maps.
@@ -149,8 +149,8 @@ def densify(
         The reconstruction with densified depth maps, and a report on source images and stereo
         pixels.
     """
-    image_rows = [row for row, image in enumerate(reconstruction.images) if image.confirmed]
-    images = [reconstruction.images[row] for row in image_rows]
+    images = reconstruction.dense_images
+    image_rows = [reconstruction.images.index(image) for image in images]
     steps = _DensifySteps(images, view_of, options, checkpoints, store_array, poses_use_depth)
     rows = [row for row, views in enumerate(steps.sources) if views]
     with ThreadPoolExecutor(workers or thread_limit()) as pool:

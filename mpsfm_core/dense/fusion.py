@@ -73,8 +73,8 @@ def fuse_depth_maps(
 ) -> FusedPointCloud:
     """Fuse depth maps into one point cloud; the point with the lowest std replaces duplicates.
 
-    The point cloud omits pixels with large depth std, inconsistent pixels, and images without
-    confirmed pose.
+    The point cloud omits pixels with large depth std, inconsistent pixels, held-out images and
+    images without confirmed pose.
 
     Args:
         reconstruction: Posed images with depth maps.
@@ -83,7 +83,7 @@ def fuse_depth_maps(
             remain, each depth map is subsampled randomly.
         seed: Random seed of the subsampling of depth maps.
     """
-    images = reconstruction.confirmed_images
+    images = reconstruction.dense_images
 
     def select_unique(_: int, pixels: Int64, votes: _ConsistencyVotes) -> tuple[Int64, UInt8]:
         mask = votes.consistent & ~votes.duplicate

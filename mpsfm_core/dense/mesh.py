@@ -131,7 +131,7 @@ def mesh_depth_maps(
         InputError: scikit-image is missing, no pixel has consistent depth, or no surface is found.
     """
     marching_cubes, simplify = _import_libraries()
-    images = reconstruction.confirmed_images
+    images = reconstruction.dense_images
     masks = compute_consistent_masks(images)
     maps = [
         _weight_depth(image, mask) for image, mask in zip(images, masks, strict=True) if mask.any()

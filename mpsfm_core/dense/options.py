@@ -17,6 +17,9 @@ class DenseOptions(Options):
     """Run multi-view stereo; if False, the results contain the refined depth maps of the mapper."""
     max_size: int = Field(640, ge=64)
     """Maximum length of a depth map's longer side in pixels; larger maps are finer and slower."""
+    hold_out_every: int | None = Field(None, ge=2)
+    """Exclude every n-th registered image, in alphabetical order, from dense depth, cloud and mesh,
+    so that ``mpsfm evaluate --held-out`` can render the excluded images; None excludes none."""
     correlation_px: float = expert(40.0, gt=0)
     """Correlation length of the error of the refined depth, in pixels of the depth map."""
 

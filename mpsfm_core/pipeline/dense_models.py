@@ -164,6 +164,11 @@ def mesh_model(
         poses = reconstruction_poses(source.model)
         files = [source.folder / DEPTH / f"{name}.npz" for name in source.names]
         depths = [read_depth_map(file)[1] if file.is_file() else None for file in files]
+        held_out = source.summary.get("images", {}).get("held_out", ())
+        depths = [
+            None if name in held_out else depth
+            for name, depth in zip(source.names, depths, strict=True)
+        ]
         posed = _reconstruction_of_maps(
             source.images, [poses[name] for name in source.names], depths
         )

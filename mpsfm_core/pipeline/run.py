@@ -39,7 +39,12 @@ from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction, RegisteredImage
+from mpsfm_core.mapping.scene.reconstruction import (
+    MappingResult,
+    Reconstruction,
+    RegisteredImage,
+    hold_out,
+)
 from mpsfm_core.pipeline import precompile, resources
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, MappingCheckpoints
 from mpsfm_core.pipeline.provider_resolution import ProviderResolution, resolve_providers
@@ -311,7 +316,7 @@ class _Run:
         if not mapping.reconstructions:
             self._fail(images, extraction, mapping, originals)
         mapping = self._georeference(images, mapping)
-        mapping = self._densify(mapping, originals)
+        mapping = self._densify(hold_out(mapping, self._config.dense.hold_out_every), originals)
         result = self._write_results(images, extraction, mapping, originals)
         self._delete_checkpoints()
         self._write_report()

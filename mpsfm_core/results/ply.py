@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,6 +72,21 @@ def write_cloud(path: Path, cloud: FusedPointCloud) -> None:
     write_ply(path, cloud.points, cloud.colors, cloud.normals, extra)
 
 
+class _PlyFile(NamedTuple):
+    """Content of a PLY file after its header was parsed."""
+
+    encoding: str
+    """Key of :data:`_ORDERS`."""
+    header: list[str]
+    """Lines of the header after the format line."""
+    vertex: np.dtype[Any]
+    """Layout of a vertex."""
+    num_vertices: int
+    """Number of vertices."""
+    body: bytes
+    """Bytes after the header."""
+
+
 def read_ply(path: Path) -> tuple[Float64, UInt8]:
     """Read the vertices of a text or binary PLY file.
 
@@ -81,19 +96,7 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
     Raises:
         InputError: the file is not a PLY file, is cut off, or has points that are not finite.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
-    end = data.find(b"end_header", 0, _LONGEST_HEADER)
-    start = data.find(b"\n", end) + 1 if end >= 0 else 0
-    lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
-    match [line.split() for line in lines[:2]]:
-        case [["ply"], ["format", encoding, *_]] if encoding in _ORDERS and start:
-            vertex, count = _layout(path, lines[2:], _ORDERS[encoding])
-        case _:
-            raise InputError(f"{path} is not a PLY file")
-    body = data[start:]
+    encoding, _, vertex, count, body = _parse_ply(path)
     if encoding == "ascii":
         vertices = _read_text(path, body, vertex, count)
     elif len(body) < count * vertex.itemsize:
@@ -107,6 +110,71 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
     if not set(rgb) <= set(vertex.names or ()):
         return points, np.full((count, 3), 128, np.uint8)
     return points, np.stack([vertices[color] for color in rgb], axis=1).astype(np.uint8)
+
+
+def read_triangles(path: Path) -> Int64:
+    """Read the triangles of a text or binary PLY file.
+
+    Returns:
+        Vertex indices (m, 3) int64 of the triangles, (0, 3) for a point cloud.
+
+    Raises:
+        InputError: the file is not a PLY file, is cut off, has faces that are not triangles, or the
+            index of a missing vertex.
+    """
+    encoding, header, vertex, count, body = _parse_ply(path)
+    match [line.split() for line in header if line.startswith(("element", "property list"))]:
+        case [["element", "vertex", _]]:
+            return np.zeros((0, 3), np.int64)
+        case [
+            ["element", "vertex", _],
+            ["element", "face", number],
+            ["property", "list", "uchar" | "uint8" as size, index, _],
+            *_,
+        ] if index in _TYPES and number.isdecimal():
+            face = np.dtype(
+                [("count", _TYPES[size]), ("rows", _ORDERS[encoding] + _TYPES[index], 3)]
+            )
+        case _:
+            raise InputError(
+                f"{path}: the PLY header has elements other than vertices and triangles"
+            )
+    if encoding == "ascii":
+        lines = body.decode("ascii", "replace").splitlines()[count : count + int(number)]
+        rows = [line.split()[:4] for line in lines]
+        if len(rows) < int(number) or any(row[:1] != ["3"] or len(row) < 4 for row in rows):
+            raise InputError(f"PLY file {path} is cut off or has faces that are not triangles")
+        triangles = np.array(rows, np.int64).reshape(-1, 4)[:, 1:]
+    else:
+        try:
+            faces = np.frombuffer(body, face, int(number), count * vertex.itemsize)
+        except ValueError as error:
+            raise InputError(
+                f"PLY file {path} is cut off: the header has {number} faces"
+            ) from error
+        if (faces["count"] != 3).any():
+            raise InputError(f"{path}: the PLY file has faces that are not triangles")
+        triangles = faces["rows"].astype(np.int64)
+    if triangles.size and not (triangles.min() >= 0 and triangles.max() < count):
+        raise InputError(f"{path}: a face of the PLY file has the index of a missing vertex")
+    return triangles
+
+
+def _parse_ply(path: Path) -> _PlyFile:
+    """Read a PLY file and parse its header."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path} cannot be read: {error.strerror or error}") from error
+    end = data.find(b"end_header", 0, _LONGEST_HEADER)
+    start = data.find(b"\n", end) + 1 if end >= 0 else 0
+    lines = data[: max(end, 0)].decode("ascii", "replace").splitlines()
+    match [line.split() for line in lines[:2]]:
+        case [["ply"], ["format", encoding, *_]] if encoding in _ORDERS and start:
+            vertex, count = _layout(path, lines[2:], _ORDERS[encoding])
+        case _:
+            raise InputError(f"{path} is not a PLY file")
+    return _PlyFile(encoding, lines[2:], vertex, count, data[start:])
 
 
 def _layout(path: Path, header: list[str], order: str) -> tuple[np.dtype[Any], int]:

@@ -46,6 +46,8 @@ class ImagesSummary(TypedDict):
     """Reason why each tentatively registered image is not verified, by image name."""
     unregistered: dict[str, dict[str, Value]]
     """Reason why each unregistered image is not registered, by image name."""
+    held_out: list[str]
+    """Registered images that do not contribute to dense depth, cloud and mesh."""
     left_out: dict[str, str]
     """Reason why an image file is not used, by file name."""
     failed: dict[str, str]
@@ -214,6 +216,9 @@ def describe_images(
         "registered": [name for name in images.names if name not in reasons],
         "unconfirmed": {name: reason for name, reason in reasons.items() if name in placed},
         "unregistered": {name: reason for name, reason in reasons.items() if name not in placed},
+        "held_out": sorted(
+            image.name for image in registered.values() if image.held_out and image.confirmed
+        ),
         "left_out": images.left_out,
         "failed": extraction["failed"],
         "details": {

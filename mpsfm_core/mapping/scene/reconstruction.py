@@ -92,6 +92,8 @@ class RegisteredImage:
     """Scale of the depth prior, in world units per unit of the prior."""
     confirmed: bool = True
     """False if the image was registered tentatively, without verification."""
+    held_out: bool = False
+    """True if the dense stage ignores the image, so that the image can evaluate the geometry."""
     pose_error_deg: float | None = None
     """Predicted root mean square of the relative pose error with other images in degrees, or None
     without a prediction."""
@@ -185,6 +187,14 @@ class Reconstruction:
         """Images whose registration was verified, without tentatively registered images."""
         return tuple(image for image in self.images if image.confirmed)
 
+    @property
+    def dense_images(self) -> tuple[RegisteredImage, ...]:
+        """Images that contribute to densification, the dense cloud and the mesh.
+
+        Images with unconfirmed poses and held-out images do not contribute.
+        """
+        return tuple(image for image in self.confirmed_images if not image.held_out)
+
     def state_dict(self) -> StateDict:
         """Return the reconstruction for a checkpoint."""
         images = [image.state_dict() for image in self.images]
@@ -233,6 +243,23 @@ class MappingResult:
     """Disconnected components, the largest first, or an empty tuple if no initialization
     succeeded."""
     report: MappingReport
+
+
+def hold_out(mapping: MappingResult, every: int | None) -> MappingResult:
+    """Mark every n-th registered image of each component as held out, in alphabetical order.
+
+    Args:
+        mapping: Result of the mapper.
+        every: Distance n between held-out images; None holds out no image.
+    """
+    if every is None:
+        return mapping
+    parts = []
+    for part in mapping.reconstructions:
+        names = set(sorted(image.name for image in part.confirmed_images)[::every])
+        images = tuple(replace(image, held_out=image.name in names) for image in part.images)
+        parts.append(replace(part, images=images))
+    return replace(mapping, reconstructions=tuple(parts))
 
 
 def find_explained_matches(
