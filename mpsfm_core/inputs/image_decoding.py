@@ -45,14 +45,19 @@ def read_bytes(path: Path) -> bytes:
         raise InputError(f"image {path} cannot be read: {error.strerror or error}") from error
 
 
-def check_decodable(data: bytes, path: Path) -> None:
-    """Decode an image at 1/8 size; raise :class:`InputError` if it is damaged or not an image."""
+def check_decodable(data: bytes, path: Path) -> UInt8 | None:
+    """Decode an image at 1/8 size; raise :class:`InputError` if it is damaged or not an image.
+
+    Returns:
+        (h, w) uint8 gray image at 1/8 size, or None for formats that OpenCV does not decode.
+    """
     if is_cut_jpeg(data):
         raise InputError(
             f"image {path} is cut off: the end of the file is missing. Copy the image file again"
         )
-    if find_decoder(data, path) is None:  # other formats are decoded in ``upright_size``
-        decode_stored(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    if find_decoder(data, path) is not None:  # other formats are decoded in ``upright_size``
+        return None
+    return decode_stored(data, path, cv2.IMREAD_REDUCED_GRAYSCALE_8)
 
 
 def check_size(data: bytes, path: Path, max_pixels: int) -> None:

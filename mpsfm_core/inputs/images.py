@@ -51,6 +51,7 @@ from mpsfm_core.inputs.masks import (
     resize_mask,
 )
 from mpsfm_core.inputs.options import InputOptions
+from mpsfm_core.inputs.panorama import is_equirectangular
 from mpsfm_core.inputs.undistortion import (
     UndistortionMap,
     distort_pixels,
@@ -564,11 +565,14 @@ def _probe(path: Path, options: InputOptions) -> _ProbedImage:
         return _ProbedImage((0, 0), ImageHeader(None, 1, {}), "", str(error))
     check_size(data, path, options.max_pixels)
     try:
-        check_decodable(data, path)
+        reduced = check_decodable(data, path)
         header = read_header(data)
-        if header.projection is not None:
+        projection = header.projection
+        if projection is None and reduced is not None and is_equirectangular(reduced):
+            projection = "equirectangular, by its pixels"
+        if projection is not None:
             raise InputError(
-                f"image {path} is a panorama ({header.projection}): cut it into perspective views "
+                f"image {path} is a panorama ({projection}): cut it into perspective views "
                 f"first, for example with ffmpeg's v360 filter"
             )
         size = upright_size(data, header, path)
