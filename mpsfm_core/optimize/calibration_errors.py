@@ -8,16 +8,19 @@ principal point per image, each with a zero-mean normal prior (additional parame
 restricted model predicts the estimates of the extended model. The covariance of the extended model
 predicts the remaining uncertainty.
 
-The change of poses is predicted with the deviations of zoomed and cropped images. The change of
-shared intrinsics is predicted without deviations of single images. The covariance includes the
-small deviations of a lens.
+The prior of an image's deviations is a mixture of small deviations of a lens, and large deviations
+of an edited image that was zoomed or cropped ("spike and slab"; George and McCulloch, "Variable
+Selection via Gibbs Sampling", 1993). The probability that an image is edited follows from the Bayes
+factor of both priors with even prior odds (Kass and Raftery, "Bayes Factors", 1995). The Newton
+step uses a normal prior with the variance of the mixture.
 
-With the Gauss-Newton matrix ``H``, gradient ``g`` and precision ``P`` of the priors, the Newton
-step is ``-(H / v + P)^-1 (c g / v + P q)``, and the covariance is ``(H / v + P)^-1``, where ``q``
-are the deviations of the parameters from their prior means. The variance factor ``v`` is estimated
-from the residuals (Foerstner and Wrobel, "Photogrammetric Computer Vision", 2016, 4.2.3), because
-the declared keypoint noise need not be true. The factors ``v`` and ``c`` account for the curvature
-of the robust loss (Huber, "Robust Statistics", 1981, 7.6).
+With the Gauss-Newton matrix ``H`` and gradient ``g`` of the reprojection errors, those of depth
+``D`` and ``d``, and the precision ``P`` of the priors, the Newton step is ``-C (c g / v + d + P
+q)``, where ``q`` are the deviations of the parameters from their prior means, and ``C = (H / v + D
++ P)^-1`` is the covariance. The variance factor ``v`` is estimated from the residuals (Foerstner
+and Wrobel, "Photogrammetric Computer Vision", 2016, 4.2.3), because the declared keypoint noise
+need not be true. The factors ``v`` and ``c`` account for the curvature of the robust loss (Huber,
+"Robust Statistics", 1981, 7.6).
 """
 
 from __future__ import annotations
@@ -29,6 +32,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 from scipy.sparse import bsr_array, csr_array, diags_array, vstack
+from scipy.special import expit
 
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.data.camera_models import NUM_INTRINSICS, IntrinsicParameter
@@ -41,20 +45,20 @@ FOCAL = IntrinsicParameter.FOCAL_LENGTH
 CENTER_STD = 0.02
 """Standard deviation of the principal point from the image center, in longer image sides.
 [tuned: benchmarks.verdicts]"""
-NO_DEVIATIONS = (0.0, 0.0)
 LENS_DEVIATIONS = (0.002, 0.001)
 EDIT_DEVIATIONS = (0.05, 0.02)
 """Standard deviations of an image's log focal length and principal point, in longer image sides,
 from those of its shared camera. Autofocus and optical stabilization of a lens cause small
 deviations, zooming and cropping large deviations. [tuned: benchmarks.verdicts]"""
+MIXTURE_ITERATIONS = 3
+"""Number of updates of the probabilities that images are edited. [ours]"""
 RADIAL_STDS = (0.1, 0.05)
 """Standard deviations of the radial coefficients ``k1`` and ``k2``. [tuned: benchmarks.verdicts]"""
 MAX_IMAGES = 300
 """Maximum number of images for a prediction, whose run time is cubic in the number of images.
 [ours]"""
-MAX_OBSERVATIONS, MAX_IMAGE_OBSERVATIONS = 30_000, 500
-"""Maximum number of observations in all, and on average per image. If both are exceeded, evenly
-spaced points contribute to the Gauss-Newton matrix. [ours]"""
+CHUNK_ROWS = 1500
+"""Number of point coordinates that are eliminated at a time. [ours]"""
 MAX_OTHER_IMAGES = 50
 """Maximum number of other images that the pose of an image is compared with. [ours]"""
 MAX_ERROR_DEG = 180.0
@@ -101,12 +105,9 @@ class _NormalEquations(NamedTuple):
     """Normal equations of the camera parameters after the elimination of points."""
 
     information: Float64
-    """(c, c) Gauss-Newton matrix, divided by the variance factor."""
+    """(c, c) Gauss-Newton matrix, whose reprojection part is divided by the variance factor."""
     gradient: Float64
-    """(c,) gradient of the cost, scaled to a Newton step."""
-    posterior: Float64
-    """(c, c) Gauss-Newton matrix of which only the reprojection part is divided by the variance
-    factor."""
+    """(c,) gradient of the cost, scaled to a Newton step with ``information``."""
 
 
 def predict_calibration_errors(
@@ -132,24 +133,25 @@ def predict_calibration_errors(
     extended = not known.all()
     equations = _linearize(problem, options, columns, extended=extended)
     offsets = _prior_offsets(problem, columns)
-    camera_stds, lens_stds, edit_stds = (
+    stds, edit_stds = (
         _prior_stds(problem, columns, known, longer_sides, deviation_stds)
-        for deviation_stds in (NO_DEVIATIONS, LENS_DEVIATIONS, EDIT_DEVIATIONS)
+        for deviation_stds in (LENS_DEVIATIONS, EDIT_DEVIATIONS)
     )
-    camera_step = edit_step = np.zeros(columns.point)
     if extended:
-        camera_step = _compute_step(equations, camera_stds, offsets)
-        edit_step = _compute_step(equations, edit_stds, offsets)
-    covariance = _compute_covariance(equations, lens_stds)
+        stds = _mix_prior_stds(equations, offsets, stds, edit_stds, columns)
+    else:
+        # The solution is the minimum for known intrinsics.
+        equations = equations._replace(gradient=np.zeros(columns.point))
+    step, covariance = _compute_posterior(equations, stds, offsets)
     focal = columns.focal + np.asarray(problem.camera_of_image)
     deviation = columns.focal_deviation + np.arange(num_images)
-    log_focal = camera_step[focal] ** 2 + covariance[focal, focal]
+    log_focal = (step[focal] + step[deviation]) ** 2 + covariance[focal, focal]
     log_focal += covariance[deviation, deviation] + 2 * covariance[focal, deviation]
     radial = columns.radial + np.arange(num_cameras)
     return CalibrationErrors(
-        pose_deg=_measure_pose_errors(problem, edit_step[: 6 * num_images], covariance),
+        pose_deg=_measure_pose_errors(problem, step[: 6 * num_images], covariance),
         log_focal=np.sqrt(np.maximum(log_focal, 0.0)),
-        radial=np.sqrt(camera_step[radial] ** 2 + covariance[radial, radial]),
+        radial=np.sqrt(step[radial] ** 2 + covariance[radial, radial]),
     )
 
 
@@ -227,19 +229,74 @@ def _find_scale_gauge(problem: BundleProblem) -> int:
     return int(np.argmax(np.abs(offset)))
 
 
-def _compute_step(equations: _NormalEquations, std: Float64, offsets: Float64) -> Float64:
-    """Return the Newton step (c,) of all camera parameters, 0 for constants."""
-    step, free = np.zeros(len(std)), np.flatnonzero(std > 0)
+def _mix_prior_stds(
+    equations: _NormalEquations,
+    offsets: Float64,
+    lens_stds: Float64,
+    edit_stds: Float64,
+    columns: _Columns,
+) -> Float64:
+    """Return prior standard deviations (c,) that mix those of lenses and of edited images.
+
+    The Bayes factor of an image compares the evidence of both priors for the deviations of this
+    image, given the mixed priors of all other images. The iteration starts with the prior of edited
+    images for all images.
+
+    Args:
+        equations: Normal equations of the camera parameters.
+        offsets: Deviations (c,) of the camera parameters from their prior means.
+        lens_stds: Prior standard deviations (c,) with the deviations of a lens.
+        edit_stds: Prior standard deviations (c,) with the deviations of edited images.
+        columns: First column of each kind of parameter.
+    """
+    num_images = columns.center_deviation - columns.focal_deviation
+    rows = np.arange(columns.focal_deviation, columns.point).reshape(3, num_images).T
+    rows = rows[edit_stds[rows[:, 0]] > 0]
+    edit, lens = edit_stds[rows] ** 2, lens_stds[rows] ** 2
+    mixed: Float64 = edit_stds.copy()
+    for _ in range(MIXTURE_ITERATIONS):
+        step, covariance = _compute_posterior(equations, mixed, offsets)
+        precision = np.linalg.inv(covariance[rows[:, :, None], rows[:, None]])
+        vector = np.einsum("nij,nj->ni", precision, step[rows])
+        log_edit, log_lens = (
+            _log_evidence(precision, vector, mixed[rows] ** 2, prior) for prior in (edit, lens)
+        )
+        probability = expit(log_edit - log_lens)[:, None]
+        mixed[rows] = np.sqrt(probability * edit + (1 - probability) * lens)
+    return mixed
+
+
+def _log_evidence(precision: Float64, vector: Float64, used: Float64, prior: Float64) -> Float64:
+    """Return the log evidence (n,) of normal priors, up to a constant for each image.
+
+    Args:
+        precision: Posterior precision (n, d, d) of the deviations of each image.
+        vector: Product (n, d) of posterior precision and posterior mean.
+        used: Prior variances (n, d) of this posterior.
+        prior: Prior variances (n, d) whose evidence is computed.
+    """
+    changed = precision + (1 / prior - 1 / used)[:, None] * np.eye(prior.shape[1])
+    mean = np.linalg.solve(changed, vector[:, :, None])[:, :, 0]
+    log_determinant = np.linalg.slogdet(changed)[1] + np.log(prior).sum(axis=1)
+    evidence: Float64 = ((vector * mean).sum(axis=1) - log_determinant) / 2
+    return evidence
+
+
+def _compute_posterior(
+    equations: _NormalEquations, std: Float64, offsets: Float64
+) -> tuple[Float64, Float64]:
+    """Return the Newton step (c,) and covariance (c, c) of the camera parameters.
+
+    Step and covariance of constant parameters are 0.
+    """
+    free = np.flatnonzero(std > 0)
+    step, covariance = np.zeros(len(std)), np.zeros((len(std), len(std)))
     gradient = equations.gradient[free] + offsets[free] / std[free] ** 2
-    step[free] = -_solve(equations.information, std, free, gradient[:, None])[:, 0]
-    return step
-
-
-def _compute_covariance(equations: _NormalEquations, std: Float64) -> Float64:
-    """Return the covariance (c, c) of all camera parameters, 0 for constants."""
-    covariance, free = np.zeros((len(std), len(std))), np.flatnonzero(std > 0)
-    covariance[np.ix_(free, free)] = _solve(equations.posterior, std, free, np.eye(len(free)))
-    return covariance
+    solution = _solve(
+        equations.information, std, free, np.column_stack([np.eye(len(free)), -gradient])
+    )
+    covariance[np.ix_(free, free)], step[free] = solution[:, :-1], solution[:, -1]
+    return step, covariance
 
 
 def _solve(information: Float64, std: Float64, free: Int64, right: Float64) -> Float64:
@@ -281,72 +338,42 @@ def _linearize(
         problem: Solved bundle adjustment problem.
         options: Options of bundle adjustment with the robust losses.
         columns: First column of each kind of parameter.
-        extended: False if all intrinsics are known. The Jacobian then excludes intrinsics, and the
-            gradient is 0, because the solution is the minimum for known intrinsics.
+        extended: False if all intrinsics are known. The Jacobian then excludes intrinsics.
     """
-    max_observations = max(MAX_OBSERVATIONS, MAX_IMAGE_OBSERVATIONS * len(problem.rotations))
-    step = 1 + len(problem.obs_point) // max_observations
-    is_sampled = np.asarray(problem.obs_point) % step == 0
-    # The gradient of a part of the observations is not small at the minimum for all observations.
-    seen = _Observations(problem, np.flatnonzero(is_sampled | extended))
-    is_sampled = is_sampled[seen.rows]
-    jacobian, residuals, variance_factor, newton_factor = _linearize_reprojection(
+    seen = _Observations(problem)
+    jacobian, residuals = _linearize_reprojection(
         problem, options, columns, seen, extended=extended
     )
-    hessian = _compute_hessian(jacobian, np.repeat(is_sampled, 2))
-    depth_hessian = csr_array(hessian.shape)
     if problem.obs_log_depth is not None:
         depth_jacobian, depth_residuals = _linearize_depth(problem, options, columns, seen)
-        depth_hessian = _compute_hessian(depth_jacobian, is_sampled)
         jacobian = csr_array(vstack([jacobian, depth_jacobian]))
         residuals = np.concatenate([residuals, depth_residuals])
     precision, deviations = _scale_prior(problem)
-    scales = np.arange(columns.scale, columns.focal)
-    prior, prior_gradient = np.zeros((2, columns.end))
-    prior[scales], prior_gradient[scales] = precision / step, precision * deviations
-    depth_hessian = csr_array(depth_hessian + diags_array(prior))
-    posterior = step * _eliminate_points(hessian / variance_factor + depth_hessian, columns.point)
-    if not extended:
-        return _NormalEquations(posterior, np.zeros(columns.point), posterior)
-    information = step * _eliminate_points(hessian + depth_hessian, columns.point)
-    gradient = _reduce_gradient(jacobian, jacobian.T @ residuals + prior_gradient, columns.point)
-    return _NormalEquations(
-        information / variance_factor, newton_factor / variance_factor * gradient, posterior
-    )
+    prior, gradient = np.zeros(columns.end), jacobian.T @ residuals
+    prior[columns.scale : columns.focal] = precision
+    gradient[columns.scale : columns.focal] += precision * deviations
+    hessian = csr_array(jacobian.T @ jacobian + diags_array(prior))
+    return _eliminate_points(hessian, gradient, columns.point)
 
 
-def _compute_hessian(jacobian: csr_array, chosen: Bool) -> csr_array:
-    """Return the Gauss-Newton matrix of the chosen rows of a Jacobian."""
-    rows = jacobian if chosen.all() else csr_array(jacobian[np.flatnonzero(chosen)])
-    return csr_array(rows.T @ rows)
-
-
-def _eliminate_points(hessian: csr_array, first: int) -> Float64:
-    """Return the Schur complement (c, c) of the camera parameters.
+def _eliminate_points(hessian: csr_array, gradient: Float64, first: int) -> _NormalEquations:
+    """Return the normal equations of the camera parameters by the Schur complement.
 
     Args:
         hessian: Gauss-Newton matrix of camera parameters and points.
+        gradient: Gradient by camera parameters and points.
         first: First column of the points.
     """
-    hessian = csr_array(hessian)
-    coupling = csr_array(hessian[:first, first:])
-    weighted = csr_array(coupling @ _invert_points(csr_array(hessian[first:, first:])))
-    information: Float64 = (hessian[:first, :first] - weighted @ coupling.T).toarray()
-    return information
-
-
-def _reduce_gradient(jacobian: csr_array, gradient: Float64, first: int) -> Float64:
-    """Return the gradient (c,) of the camera parameters after the elimination of points.
-
-    Args:
-        jacobian: Jacobian of all residuals.
-        gradient: Gradient of the cost.
-        first: First column of the points.
-    """
-    by_points = csr_array(jacobian[:, first:])
-    point_step = _invert_points(csr_array(by_points.T @ by_points)) @ gradient[first:]
-    reduced: Float64 = (gradient - jacobian.T @ (by_points @ point_step))[:first]
-    return reduced
+    factor = _factorize_inverses(csr_array(hessian[first:, first:]))
+    coupling = csr_array(factor @ hessian[first:, :first])
+    information = hessian[:first, :first].toarray()
+    for start in range(0, coupling.shape[0], CHUNK_ROWS):
+        rows = coupling[start : start + CHUNK_ROWS]
+        used = np.unique(rows.indices)
+        dense = rows[:, used].toarray()
+        information[np.ix_(used, used)] -= dense.T @ dense
+    reduced = gradient[:first] - coupling.T @ (factor @ gradient[first:])
+    return _NormalEquations(information, reduced)
 
 
 def _scale_prior(problem: BundleProblem) -> tuple[Float64, Float64]:
@@ -372,12 +399,13 @@ class _Observations:
         in_camera: (m, 3) point ``R X + t`` in the camera frame.
     """
 
-    def __init__(self, problem: BundleProblem, rows: Int64) -> None:
-        image, point = np.asarray(problem.obs_image)[rows], np.asarray(problem.obs_point)[rows]
+    def __init__(self, problem: BundleProblem) -> None:
+        image, point = np.asarray(problem.obs_image), np.asarray(problem.obs_point)
         rotated = np.einsum("mij,mj->mi", problem.rotations[image], problem.points[point])
         in_camera = rotated + problem.translations[image]
         visible = in_camera[:, 2] > 0
-        self.rows, self.image, self.point = rows[visible], image[visible], point[visible]
+        self.rows = np.flatnonzero(visible)
+        self.image, self.point = image[visible], point[visible]
         self.camera = np.asarray(problem.camera_of_image)[self.image]
         self.rotation = problem.rotations[self.image]
         self.rotated, self.in_camera = rotated[visible], in_camera[visible]
@@ -390,13 +418,14 @@ def _linearize_reprojection(
     seen: _Observations,
     *,
     extended: bool,
-) -> tuple[csr_array, Float64, float, float]:
+) -> tuple[csr_array, Float64]:
     """Linearize the weighted reprojection errors by poses, points and intrinsics.
 
     Without ``extended``, the Jacobian excludes intrinsics.
 
     Returns:
-        Jacobian (2m, parameters), residuals (2m,), variance factor and Newton factor.
+        Jacobian (2m, parameters) and residuals (2m,), both divided by the square root of the
+        variance factor. The residuals are scaled to a Newton step.
     """
     z = seen.in_camera[:, 2:]
     slopes = seen.in_camera[:, :2] / z
@@ -411,7 +440,7 @@ def _linearize_reprojection(
         options.reprojection_loss, options.reprojection_scale, squared
     )
     num_parameters = 3 * len(np.unique(seen.point)) + 6 * (len(problem.rotations) - 1)
-    factors = _estimate_factors(weight, curvature, squared, num_parameters)
+    variance_factor, newton_factor = _estimate_factors(weight, curvature, squared, num_parameters)
     image = seen.image[:, None]
     by_slopes = scale[:, :, None] * derivative
     by_point = (
@@ -429,10 +458,10 @@ def _linearize_reprojection(
         )
         blocks.append(by_intrinsics)
         indices.append(intrinsics_indices)
-    root = np.sqrt(weight)[:, None]
+    root = np.sqrt(weight / variance_factor)[:, None]
     jacobian = np.concatenate(blocks, axis=2) * root[:, :, None]
     matrix = _to_sparse(jacobian, np.concatenate(indices, axis=2), columns.end)
-    return matrix, (residuals * root).ravel(), *factors
+    return matrix, (newton_factor * residuals * root).ravel()
 
 
 def _linearize_intrinsics(
@@ -571,8 +600,8 @@ def _to_sparse(values: Float64, indices: Int64, num_columns: int) -> csr_array:
     return csr_array((values.ravel(), indices.ravel(), starts), shape=(num_rows, num_columns))
 
 
-def _invert_points(matrix: csr_array) -> csr_array:
-    """Invert the block-diagonal information matrix (3p, 3p) of the points."""
+def _factorize_inverses(matrix: csr_array) -> csr_array:
+    """Return block-diagonal factors ``L^T`` (3p, 3p) of the inverses ``L L^T`` of point blocks."""
     num_points = matrix.shape[0] // 3
     entries = matrix.tocoo()
     blocks = np.zeros((num_points, 3, 3))
@@ -580,8 +609,9 @@ def _invert_points(matrix: csr_array) -> csr_array:
     mean = np.trace(blocks, axis1=1, axis2=2) / 3
     boost = np.where(mean > 0, POINT_DAMPING * mean, 1.0)
     inverse = np.linalg.inv(blocks + boost[:, None, None] * np.eye(3))
+    factors = np.linalg.cholesky(inverse).transpose(0, 2, 1)
     rows = np.arange(num_points + 1)
-    return csr_array(bsr_array((inverse, rows[:-1], rows), shape=matrix.shape).tocsr())
+    return csr_array(bsr_array((factors, rows[:-1], rows), shape=matrix.shape).tocsr())
 
 
 def _measure_pose_errors(problem: BundleProblem, step: Float64, covariance: Float64) -> Float64:

@@ -141,7 +141,7 @@ def test_predict_calibration_errors_of_focal_length_matches_true_errors(
 
 def test_predict_calibration_errors_with_overestimated_noise_are_below_the_stated_std() -> None:
     _, predicted, stated = focal_errors(8, noise_px=0.1)
-    assert (predicted < 0.6 * stated).all()
+    assert (predicted < 0.7 * stated).all()
 
 
 @pytest.mark.parametrize("zoom", [0.9, 0.97])
@@ -191,3 +191,22 @@ def test_predict_calibration_errors_of_a_pure_rotation_are_large() -> None:
 def test_predict_calibration_errors_without_a_variable_pose_returns_none() -> None:
     scene = replace(make_scene(0), variable_pose=np.zeros(NUM_IMAGES, dtype=np.bool_))
     assert predict_calibration_errors(scene, OPTIONS, UNKNOWN, np.array([WIDTH])) is None
+
+
+def test_predict_calibration_errors_of_a_weak_unedited_image_are_small() -> None:
+    scene = make_scene(0, noise_px=0.1)
+    # The first image observes points in a plane, which leaves its focal length undetermined.
+    pose_of_first = scene.rotations[0], scene.translations[0]
+    depth = (scene.points @ pose_of_first[0].T + pose_of_first[1])[:, 2]
+    in_plane = np.abs(depth - np.median(depth)) < 0.3
+    chosen = (scene.obs_image > 0) | in_plane[scene.obs_point]
+    weak = replace(
+        scene,
+        obs_image=scene.obs_image[chosen],
+        obs_point=scene.obs_point[chosen],
+        obs_xy=scene.obs_xy[chosen],
+        obs_std_px=np.ones(int(chosen.sum())),
+    )
+    solved, errors = solve(weak)
+    assert measure_pose_errors_deg(solved, weak)[0] < 0.5
+    assert errors.pose_deg[0] < 1
