@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from mpsfm_core.extraction.match_graph import MatchGraph, Priors
     from mpsfm_core.extraction.problem_builder import build_problem
     from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
+    from mpsfm_core.pipeline.localize import LocalizationResult, localize
     from mpsfm_core.pipeline.run import ReconstructionResult, reconstruct
     from mpsfm_core.providers import ProviderContext, ProviderSpec, WeightsFile, hookimpl
     from mpsfm_core.providers.provider_config import ProviderConfig
@@ -90,6 +91,7 @@ _LAZY_MODULES = {
     "mpsfm_core.extraction.match_graph": ("MatchGraph", "Priors"),
     "mpsfm_core.extraction.problem_builder": ("build_problem",),
     "mpsfm_core.mapping.scene.reconstruction": ("MappingResult", "Reconstruction"),
+    "mpsfm_core.pipeline.localize": ("LocalizationResult", "localize"),
     "mpsfm_core.pipeline.run": ("ReconstructionResult", "reconstruct"),
     "mpsfm_core.providers": ("ProviderContext", "ProviderSpec", "WeightsFile", "hookimpl"),
     "mpsfm_core.providers.provider_config": ("ProviderConfig",),
@@ -108,6 +110,7 @@ __all__ = [
     "DepthPrior",
     "Features",
     "InputError",
+    "LocalizationResult",
     "MappingProblem",
     "MappingResult",
     "MatchGraph",
@@ -142,6 +145,7 @@ __all__ = [
     "hookimpl",
     "load_config",
     "load_images",
+    "localize",
     "match_images",
     "plots",
     "predict_priors",

@@ -29,6 +29,7 @@ from mpsfm_core.extraction.features import (
 from mpsfm_core.extraction.match_graph import MatchGraph, Priors
 from mpsfm_core.extraction.matching.dense_matches import NO_POINTS
 from mpsfm_core.extraction.matching.pair_matching import (
+    AssembledMatches,
     CandidateMatches,
     PairMatcher,
     PairVerifier,
@@ -248,6 +249,26 @@ def match_images(
         proposed,
         matcher,
     )
+
+
+def match_queries(
+    context: ExtractionContext, num_references: int, between: Sequence[Pair] = ()
+) -> AssembledMatches:
+    """Match images with similar images of a model, and verify the matches.
+
+    Keypoints are not adjusted, so that the keypoints of the model do not depend on the queries.
+
+    Args:
+        context: Context of the extraction, whose first images are the images of the model.
+        num_references: Number of images of the model; all further images are queries.
+        between: Pairs of queries that are matched, too.
+    """
+    source = feature_table(context)
+    located = [NO_FEATURES] * len(context.images) if source is None else source.extract()
+    pairs = PairSelection(context, source).choose_references(num_references)
+    candidates = PairMatcher(context, source).match(sorted([*pairs, *between]), located)
+    geometries = PairVerifier(context, located).verify(candidates)
+    return assemble_matches(candidates, geometries, located)
 
 
 def verify_imported(context: ExtractionContext, imported: ImportedMatches) -> MatchGraph:

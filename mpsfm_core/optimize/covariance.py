@@ -1,4 +1,4 @@
-"""Covariances of 3D points, and the variance of their depth in a camera."""
+"""Covariances of 3D points and of camera poses, and the variance of depth in a camera."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpsfm_core.data import Float64
+from mpsfm_core.data import Float64, Pose
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.bundle_problem import BundleProblem, prepare_bundle, range_executor
 from mpsfm_core.optimize.options import BundleOptions
@@ -66,3 +66,57 @@ def propagate_depth_variance(covariances: Float64, rotations: Float64) -> Float6
     axis = rotations[..., 2, :]
     variance: Float64 = np.einsum("...a,...ab,...b->...", axis, covariances, axis)
     return variance
+
+
+def compute_pose_covariance(
+    pose: Pose,
+    intrinsics: Float64,
+    points: Float64,
+    point_covariances: Float64,
+    std_px: Float64,
+    log_focal_std: float = 0.0,
+) -> Float64:
+    """Compute the covariance of a camera pose from observed points of uncertain position.
+
+    The covariance is the inverse of ``sum(J^T S^-1 J)`` with the Jacobian ``J`` of a projection
+    and ``S = std_px^2 I + P C P^T``, where ``P`` is the Jacobian of the projection with respect to
+    the point and ``C`` the covariance of the point.
+
+    Args:
+        pose: ``cam_from_world``.
+        intrinsics: (4,) camera parameters fx, fy, cx, cy in pixels.
+        points: (m, 3) observed points in the world frame.
+        point_covariances: (m, 3, 3) covariances of the points without the observations of this
+            camera, in squared world units.
+        std_px: (m,) standard deviation of the observations in pixels.
+        log_focal_std: Prior standard deviation of the log focal length, which is estimated together
+            with the pose, or 0 for a known focal length.
+
+    Returns:
+        (6, 6) covariance of ``w`` and ``dt`` in ``R <- exp(w) R, t <- t + dt``, in radians and
+        world units. The covariance is infinite if the observations do not determine the pose.
+    """
+    rotation, translation = pose
+    turned = points @ rotation.T
+    x, y, z = (turned + translation).T
+    fx, fy = intrinsics[:2]
+    zero = np.zeros_like(z)
+    projection = np.stack([fx / z, zero, -fx * x / z**2, zero, fy / z, -fy * y / z**2], axis=1)
+    projection = projection.reshape(-1, 2, 3)
+    a, b, c = turned.T
+    rotating = np.stack([zero, c, -b, -c, zero, a, b, -a, zero], axis=1).reshape(-1, 3, 3)
+    zooming = np.stack([fx * x / z, fy * y / z], axis=1)[..., None]
+    jacobian = np.concatenate([projection @ rotating, projection, zooming], axis=2)
+    moving = projection @ rotation
+    noise = moving @ point_covariances @ moving.transpose(0, 2, 1)
+    noise += std_px[:, None, None] ** 2 * np.eye(2)
+    information = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(noise, jacobian)).sum(axis=0)
+    if log_focal_std > 0:
+        information[6, 6] += 1.0 / log_focal_std**2
+    else:
+        information = information[:6, :6]
+    try:
+        covariance: Float64 = np.linalg.inv(information)[:6, :6]
+    except np.linalg.LinAlgError:
+        return np.full((6, 6), np.inf)
+    return covariance

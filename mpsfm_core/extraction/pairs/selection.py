@@ -74,6 +74,48 @@ class PairSelection:
             similar + pairs.numbered_neighbor_pairs(self._context.images.names, options)
         )
 
+    def choose_references(self, num_references: int) -> list[Pair]:
+        """Pair each query image with its most similar images of a model.
+
+        The similarity is the dot product of global descriptors with a retrieval provider, else the
+        match score of local features. All images of the model are chosen if they are not more than
+        ``pairs.partners``, or without features.
+
+        Args:
+            num_references: Number of images of the model. These images are the first images of the
+                set, and all other images are queries.
+        """
+        options, count = self._context.config.pairs, len(self._context.images)
+        by_retrieval = self._context.config.retrieval is not None
+        num_chosen = options.top_k if options.mode == "retrieval" else options.partners
+        if num_references <= num_chosen or not (by_retrieval or self._table):
+            num_chosen = num_references
+            rank = np.zeros((count - num_references, num_references))
+        elif by_retrieval:
+            descriptors = np.stack(self._descriptors()).astype(np.float64)
+            rank = descriptors[num_references:] @ descriptors[:num_references].T
+        else:
+            rank = self._score_references(num_references)
+        best = np.argsort(-rank, axis=1, kind="stable")[:, :num_chosen]
+        return self._select(
+            [(int(b), num_references + row) for row, chosen in enumerate(best) for b in chosen]
+        )
+
+    def _score_references(self, num_references: int) -> Float64:
+        """Return the match scores (queries, references) of local features."""
+        table, context = self._table, self._context
+        assert table is not None
+        references = [
+            pair_similarity.strongest_descriptors(table[index]) for index in range(num_references)
+        ]
+
+        def score(query: int) -> list[float]:
+            strongest = pair_similarity.strongest_descriptors(table[query])
+            return [pair_similarity.match_score(strongest, other) for other in references]
+
+        queries = range(num_references, len(context.images))
+        return np.array(context.each("similarity", queries, score))
+
     def choose_again(self, verified: Sequence[Pair]) -> list[Pair]:
         """Select further image pairs between the components of the match graph.
 

@@ -9,7 +9,7 @@ Therefore bundle adjustment uses the scaled depth priors, unless the option ``bu
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,7 +34,11 @@ from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, lift_low_parallax
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
 from mpsfm_core.optimize.calibration_errors import predict_calibration_errors
-from mpsfm_core.optimize.covariance import compute_point_covariances, propagate_depth_variance
+from mpsfm_core.optimize.covariance import (
+    compute_point_covariances,
+    compute_pose_covariance,
+    propagate_depth_variance,
+)
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
 from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, BundleOptions, Loss
 from mpsfm_core.optimize.subsampling import (
@@ -73,6 +77,17 @@ MAX_NOISE_CHANGE = 1.25
 MIN_SCALE_POINTS = 20
 """Smallest number of well triangulated points for which the depth scale shared by several images is
 estimated again. [ours]"""
+
+MEDIAN_ERROR = float(np.sqrt(2 * np.log(2)))
+"""Median length of a vector of two standard normal variables, such as a reprojection error."""
+_OBSERVATION_FIELDS = (
+    "obs_image",
+    "obs_point",
+    "obs_xy",
+    "obs_std_px",
+    "obs_log_depth",
+    "obs_std_log_depth",
+)
 
 
 class _Bundle(NamedTuple):
@@ -284,6 +299,40 @@ class Refiner:
             predicted.stds[bundle.images, IntrinsicParameter.FOCAL_LENGTH] = errors.log_focal
             predicted.stds[bundle.images, IntrinsicParameter.RADIAL_DISTORTION] = radial
         return predicted
+
+    def compute_pose_covariance(self, image: int) -> Float64:
+        """Compute the covariance (6, 6) of the pose of an image from the points that it observes.
+
+        The poses of the other images are treated as exact. The covariance of a point results from
+        the keypoints and depth of the other images. See
+        :func:`~mpsfm_core.optimize.covariance.compute_pose_covariance` for the parameters.
+        """
+        scene = self.scene
+        bundle = self._collect_bundle([image])
+        if bundle is None:
+            return np.full((6, 6), np.inf)
+        problem, options = bundle.problem, self._scale_losses()
+        own = problem.obs_image == int(np.flatnonzero(bundle.images == image)[0])
+        observations: dict[str, Any] = {
+            name: values[~own]
+            for name in _OBSERVATION_FIELDS
+            if isinstance(values := getattr(problem, name), np.ndarray)
+        }
+        covariances = compute_point_covariances(replace(problem, **observations), options)
+        rows = problem.obs_point[own]
+        std_px = np.broadcast_to(problem.obs_std_px, own.shape)[own]
+        keypoints, _ = self._observed_depth(image)
+        errors_px, _ = scene.project(keypoints, scene.tracks.xyz[scene.tracks.point_of[keypoints]])
+        noise = max(1.0, float(np.median(errors_px / std_px)) / MEDIAN_ERROR)
+        given = scene.problem.images[image]
+        return compute_pose_covariance(
+            (scene.rotations[image], scene.translations[image]),
+            scene.intrinsics[image],
+            problem.points[rows],
+            covariances[rows],
+            noise * std_px,
+            0.0 if given.focal_known else given.focal_log_std,
+        )
 
     def _scale_losses(
         self, reprojection_scale: float = 1.0, depth_scale: float = 1.0

@@ -1,0 +1,437 @@
+"""Localize photos in an existing model: match, register with fixed poses, and write the poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.config import Config
+from mpsfm_core.config.provider_arguments import Provider, configure
+from mpsfm_core.data import MappingImage, MappingProblem, NormalPrior
+from mpsfm_core.data.camera_models import NO_DISTORTION, CameraModel
+from mpsfm_core.data.decisions import Reason
+from mpsfm_core.data.errors import DataError, InputError
+from mpsfm_core.data.events import EventCallback
+from mpsfm_core.extraction.cache import content_key, digest, pack, unpack
+from mpsfm_core.extraction.context import ExtractionContext
+from mpsfm_core.extraction.matching.pair_matching import merge_matches
+from mpsfm_core.extraction.pairs.pairing import numbered_neighbor_pairs
+from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
+from mpsfm_core.extraction.runner import (
+    extract,
+    extraction_environment,
+    match_queries,
+    predict_priors,
+)
+from mpsfm_core.inputs.image_search import check_output_folder, find_images
+from mpsfm_core.inputs.images import ImageSet, SourceImage, load_images
+from mpsfm_core.inputs.intrinsics import Cameras
+from mpsfm_core.inputs.models import find_model_folder, match_names, reconstruction_poses
+from mpsfm_core.mapping.localization import (
+    FixedModel,
+    LocalizedImage,
+    Localizer,
+    snap_to_observations,
+    triangulate_model,
+)
+from mpsfm_core.mapping.state import flatten_state, unflatten_state
+from mpsfm_core.pipeline.provider_resolution import resolve_providers
+from mpsfm_core.pipeline.stages import Stages
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.report.reasons import explain
+from mpsfm_core.results.exports.source import ExportSource
+from mpsfm_core.results.localization import (
+    ENTRIES,
+    LocalizedPhoto,
+    extend_model,
+    write_localization,
+)
+from mpsfm_core.support.files import lock_output_folder, replace_entries
+from mpsfm_core.support.format_versions import VERSION
+from mpsfm_core.support.npz import read_npz, write_npz
+from mpsfm_core.support.threads import limit_threads
+
+PathLike = str | Path
+
+FORMAT = 1
+"""Format version of the database of a model for localization."""
+DATABASE = "localization.npz"
+"""Name of the database in the folder of the model."""
+BATCH_SIZE = 50
+"""Number of photos that are localized together, which bounds the memory."""
+QUERY_FOLDER = "query/"
+"""Prefix of the names of photos during localization, which images of the model do not have."""
+_UNUSED_BLOCKS = {"runtime", "results", "dense", "fast_pass", "description"}
+"""Configuration blocks that do not change the database."""
+
+
+@dataclass(frozen=True, eq=False)
+class LocalizationResult:
+    """Result of :func:`localize`."""
+
+    photos: Mapping[str, LocalizedPhoto]
+    """Localized photos by name."""
+    reasons: Mapping[str, Reason]
+    """Reason why a photo has no pose, by name of the photo."""
+    extended: pycolmap.Reconstruction | None
+    """Copy of the model with the localized photos, or None without the option ``extend``."""
+    output: Path | None
+    """Folder of the written files, or None if nothing was written."""
+
+
+def localize(
+    model: PathLike,
+    photos: PathLike,
+    output: PathLike | None = None,
+    config: PathLike | Config = "default",
+    *,
+    images: PathLike | None = None,
+    cameras: Cameras | None = None,
+    intrinsics: PathLike | None = None,
+    features: Provider | None = None,
+    matcher: Provider | None = None,
+    retrieval: Provider | None = None,
+    camera: Provider | None = None,
+    depth: Provider | None = None,
+    normals: Provider | None = None,
+    masks: Sequence[Provider] | None = None,
+    database: PathLike | None = None,
+    sequence: bool = False,
+    extend: bool = False,
+    overrides: Sequence[str] = (),
+    registry: Registry | None = None,
+    on_event: EventCallback | None = None,
+) -> LocalizationResult:
+    """Estimate the poses of photos in an existing model, which stays unchanged.
+
+    Each photo is matched with similar images of the model. Its pose results from points that are
+    triangulated from the images of the model, or lifted from the depth of a single image.
+
+    Args:
+        model: COLMAP model with at least two images, or result folder.
+        photos: Folder of the photos to localize, or one photo.
+        output: Folder for the poses, or None to write nothing.
+        config: Name of a shipped configuration, a YAML file, or a loaded configuration. The block
+            ``fast_pass`` is not used.
+        images: Folder of the images of the model, by default the folder that the run of the result
+            folder recorded, else ``images/`` next to the model.
+        cameras: Camera of all photos, camera of each photo by name, or ``pycolmap.Reconstruction``.
+            Without cameras, focal lengths are taken from EXIF, else estimated by the camera or
+            depth provider, else set to a default, and then refined.
+        intrinsics: File with the cameras, instead of ``cameras``: ``intrinsics.yaml``, a COLMAP
+            model or ``transforms.json``.
+        features: Provider of features that replaces the configured provider, see
+            :func:`reconstruct`.
+        matcher: Sparse or dense matcher, which replaces all configured matchers.
+        retrieval: Provider of global image descriptors, which select the images of the model to
+            match. By default, images with similar features are selected.
+        camera: Provider of focal lengths.
+        depth: Provider of depth priors.
+        normals: Provider of normal priors.
+        masks: Mask providers, which replace the configured mask providers.
+        database: File with the triangulated points and depth of the model, by default
+            ``localization.npz`` in the folder of the model. A missing or outdated file is written.
+        sequence: If true, photos with consecutive numbers in their names are matched, too, and
+            registered together. By default, each photo is localized independently.
+        extend: If true, add the localized photos to a copy of the model.
+        overrides: Settings such as ``"runtime.workers=2"``; not allowed with a loaded
+            configuration.
+        registry: Providers that the configuration may name, by default all installed providers.
+        on_event: Function that receives progress events, see :mod:`mpsfm_core.data.events`.
+
+    Returns:
+        Poses with covariance, and the reason for each photo without pose.
+
+    Raises:
+        InputError: model, photos, cameras, configuration, weights or output are wrong.
+        MpsfmError: a provider failed or violated the provider contract, or the disk is full.
+
+    Examples:
+        >>> located = mpsfm.localize("out/", "new_photos/", "located/")
+        >>> located.photos["a.jpg"].pose, located.photos["a.jpg"].covariance.shape
+    """
+    config, registry = configure(
+        config,
+        registry,
+        overrides,
+        masks=masks,
+        features=features,
+        matcher=matcher,
+        retrieval=retrieval,
+        camera=camera,
+        depth=depth,
+        normals=normals,
+    )
+    if cameras is not None and intrinsics is not None:
+        raise TypeError("give cameras or the file intrinsics, not both")
+    stages = Stages(registry, on_event)
+    folder = None if output is None else Path(output)
+    with ExitStack() as stack:
+        stack.enter_context(limit_threads(config.runtime.workers))
+        if folder is not None:
+            if Path(photos).is_dir():
+                check_output_folder(folder, Path(photos))
+            stack.enter_context(lock_output_folder(folder))
+        source = ExportSource.read(Path(model), None if images is None else Path(images))
+        with stages.stage("providers"):
+            config = config.model_copy(update={"fast_pass": None})
+            config = resolve_providers(config, registry, stages).config
+        run = _Localization(source, config, registry, stages)
+        queries = run.load_queries(Path(photos), cameras if intrinsics is None else intrinsics)
+        fixed = run.load_model(Path(database) if database else source.folder / DATABASE)
+        found: dict[str, LocalizedPhoto] = {}
+        reasons: dict[str, Reason] = {}
+        for batch in run.split(queries, sequence=sequence):
+            for name, outcome in run.localize(fixed, batch, sequence=sequence):
+                if isinstance(outcome, Reason):
+                    reasons[name] = outcome
+                else:
+                    found[name] = outcome
+        extended = extend_model(source.model, _with_free_names(source, found)) if extend else None
+        if folder is not None:
+            with replace_entries(folder, ENTRIES) as scratch:
+                described = {
+                    name: {**reason.to_json(), "text": explain(reason).text}
+                    for name, reason in reasons.items()
+                }
+                write_localization(scratch, found, described, extended)
+    return LocalizationResult(found, reasons, extended, folder)
+
+
+class _Localization:
+    """Localization of photos in one model."""
+
+    def __init__(
+        self, source: ExportSource, config: Config, registry: Registry, stages: Stages
+    ) -> None:
+        self._source, self._config = source, config
+        self._registry, self._stages = registry, stages
+        with stages.stage("inputs"):
+            self._references = self._load_references()
+
+    def _load_references(self) -> ImageSet:
+        """Load the images of the model, with the cameras of the model."""
+        source = self._source
+        if source.photos is None:
+            raise InputError(
+                f"{source.folder}: the folder of the model's images is unknown; give it with "
+                f"--images"
+            )
+        files = match_names(source.names, find_images(source.photos))
+        missing = [name for name in source.names if name not in files]
+        if missing:
+            raise InputError(
+                f"{source.photos}: {len(missing)} images of the model {source.folder} are not in "
+                f"this folder, such as {missing[0]!r}; give their folder with --images"
+            )
+        names = [files[name] for name in source.names]
+        if len(names) < 2:
+            raise InputError(f"{source.folder}: localization needs a model of two or more images")
+        folder = find_model_folder(source.folder)
+        return load_images(source.photos, folder, options=self._config.inputs, names=names)
+
+    def load_queries(self, photos: Path, cameras: PathLike | Cameras | None) -> ImageSet:
+        """Load the photos to localize, with known or estimated focal lengths."""
+        folder, names = (photos.parent, [photos.name]) if photos.is_file() else (photos, [])
+        names = names or find_images(photos)
+        if not names:
+            raise InputError(f"{photos}: the folder has no photos to localize")
+        given = Path(cameras) if isinstance(cameras, (str, Path)) else cameras
+        with self._stages.stage("inputs"):
+            queries = load_images(folder, given, options=self._config.inputs, names=names)
+        return estimate_focal_lengths(queries, self._config, self._registry, self._stages)
+
+    def split(self, queries: ImageSet, *, sequence: bool) -> Iterator[ImageSet]:
+        """Yield the photos in batches, or all photos of a sequence."""
+        size = len(queries) if sequence else BATCH_SIZE
+        for start in range(0, len(queries), size):
+            yield ImageSet(queries.images[start : start + size], self._config.inputs)
+
+    def load_model(self, path: Path) -> FixedModel:
+        """Load triangulated points and depth of the model, or compute and store them."""
+        poses = reconstruction_poses(self._source.model)
+        model_names = self._source.names
+        known = {
+            image.name: poses[name]
+            for image, name in zip(self._references, model_names, strict=True)
+        }
+        settings = self._config.model_dump(mode="json", exclude=_UNUSED_BLOCKS)
+        key = content_key(
+            FORMAT,
+            settings,
+            digest(tuple(known.values())),
+            [self._references.pixel_key(index) for index in range(len(self._references))],
+            [image.pinhole.params.tolist() for image in self._references],
+        )
+        stored = _read_database(path, key)
+        if stored is not None:
+            return replace(stored, problem=stored.problem.with_poses(known))
+        with self._stages.stage("extraction"):
+            extraction = extract(self._references, self._config, self._registry, self._stages)
+        with self._stages.stage("mapping"):
+            problem = extraction.problem.with_poses(known)
+            fixed = triangulate_model(problem, self._config.mapper_options())
+        _write_database(path, key, fixed)
+        return fixed
+
+    def localize(
+        self, model: FixedModel, queries: ImageSet, *, sequence: bool
+    ) -> Iterator[tuple[str, LocalizedPhoto | Reason]]:
+        """Yield the name of each photo with its pose, or with the reason without a pose."""
+        names = queries.names
+        renamed = [replace(q, name=QUERY_FOLDER + q.name) for q in queries]
+        photos = {query.name: query for query in renamed}
+        renamed_queries = ImageSet(renamed, self._config.inputs)
+        with self._stages.stage("extraction"):
+            problem = self._extend_problem(model, renamed_queries, sequence=sequence)
+        num_references = len(self._references)
+        rows = [num_references + row for row in range(len(names))]
+        with self._stages.stage("localization"):
+            localizer = Localizer(problem, model, self._config.mapper_options())
+            if sequence:
+                outcomes = localizer.localize_together(rows)
+            else:
+                outcomes = []
+                for done, row in enumerate(rows):
+                    outcomes.append(localizer.localize(row))
+                    self._stages.stage_progress("localization", done + 1, len(rows))
+        for name, outcome in zip(names, outcomes, strict=True):
+            if isinstance(outcome, Reason):
+                self._stages.image_rejected(name, outcome)
+                yield name, outcome
+            else:
+                self._stages.image_registered(name, num_references + 1, num_references + len(names))
+                yield name, self._convert(name, photos, outcome)
+
+    def _extend_problem(
+        self, model: FixedModel, queries: ImageSet, *, sequence: bool
+    ) -> MappingProblem:
+        """Add photos to the mapping problem of the model, with matches to images of the model."""
+        num_references = len(self._references)
+        joint = ImageSet([*self._references, *queries], self._config.inputs)
+        context = ExtractionContext(joint, self._config, self._registry, self._stages)
+        between = []
+        if sequence:
+            neighbors = numbered_neighbor_pairs(queries.names, self._config.pairs)
+            between = [(num_references + a, num_references + b) for a, b in neighbors]
+        with extraction_environment(context):
+            context.run_masks()
+            matches = match_queries(context, num_references, between)
+        context = ExtractionContext(queries, self._config, self._registry, self._stages)
+        with extraction_environment(context):
+            context.run_masks()
+            priors = predict_priors(context, None)
+        added = [_query_image(q, priors.depth[q.name], priors.normals[q.name]) for q in queries]
+        problem = replace(model.problem, images=(*model.problem.images, *added))
+        max_distance_px = self._config.extraction.dense_snap_px
+        return snap_to_observations(merge_matches(problem, matches), model, max_distance_px)
+
+    def _convert(
+        self, name: str, queries: Mapping[str, SourceImage], image: LocalizedImage
+    ) -> LocalizedPhoto:
+        """Convert a localized image to camera, keypoints and names of the original images."""
+        source = queries[image.name]
+        model_names = dict(zip(self._references.names, self._source.names, strict=True))
+        references = {reference.name: reference for reference in self._references}
+        matches = {
+            model_names[other]: (
+                source.original_pixels(xy),
+                references[other].original_pixels(other_xy),
+            )
+            for other, (xy, other_xy) in image.matches.items()
+            if other in references
+        }
+        return LocalizedPhoto(
+            name,
+            (image.rotation, image.translation),
+            image.covariance,
+            source.refined_camera(image.camera),
+            image.num_inliers,
+            image.num_matches,
+            matches,
+        )
+
+
+def _query_image(image: SourceImage, depth: Any, normals: Any) -> MappingImage:
+    """Build an image of the mapping problem without keypoints."""
+    return MappingImage(
+        image.name,
+        image.pinhole,
+        np.zeros((0, 2)),
+        depth,
+        normals,
+        focal_known=image.focal_known,
+        camera_id=image.camera.camera_id,
+        focal_log_std=image.focal_log_std,
+        camera_model=image.camera_model,
+    )
+
+
+def _with_free_names(
+    source: ExportSource, photos: Mapping[str, LocalizedPhoto]
+) -> dict[str, LocalizedPhoto]:
+    """Check that no localized photo has the name of an image of the model."""
+    taken = sorted(photos.keys() & set(source.names))
+    if taken:
+        raise InputError(
+            f"{source.folder}: the model already has an image {taken[0]!r}; rename this photo, or "
+            f"move the photos to a subfolder, to extend the model"
+        )
+    return dict(photos)
+
+
+def _write_database(path: Path, key: str, model: FixedModel) -> None:
+    """Write the triangulated model; its normals are not needed to localize images."""
+    images = tuple(
+        replace(image, normals=_flat_normals(image), known_pose=None)
+        for image in model.problem.images
+    )
+    arrays = {
+        VERSION: np.array(FORMAT),
+        "key": np.array(key),
+        **pack(replace(model.problem, images=images), "problem"),
+        **{f"state/{name}": array for name, array in flatten_state(model.state).items()},
+    }
+    try:
+        write_npz(path, **arrays)
+    except OSError as error:
+        raise InputError(
+            f"{path}: the database of the model cannot be written ({error}); choose another file "
+            f"with --database"
+        ) from error
+
+
+def _read_database(path: Path, key: str) -> FixedModel | None:
+    """Read the triangulated model, or return None if the file is missing or outdated."""
+    try:
+        arrays = read_npz(path)
+        if str(arrays["key"]) != key:
+            return None
+        problem = unpack(MappingProblem, arrays, "problem")
+        images = (
+            replace(image, camera_model=CameraModel.SIMPLE_RADIAL, distortion=NO_DISTORTION)
+            for image in problem.images
+        )
+        prefix = "state/"
+        state = {
+            name.removeprefix(prefix): array
+            for name, array in arrays.items()
+            if name.startswith(prefix)
+        }
+        return FixedModel(replace(problem, images=tuple(images)), unflatten_state(state))
+    except (OSError, ValueError, KeyError, DataError):
+        return None
+
+
+def _flat_normals(image: MappingImage) -> NormalPrior:
+    """Return normals that face the camera, which compress to few bytes."""
+    normals = np.zeros_like(image.normals.normals)
+    normals[..., 2] = -1
+    variance = np.ones(normals.shape[:2], np.float32)
+    return NormalPrior(normals, variance, image.normals.valid)
