@@ -28,6 +28,7 @@ from mpsfm_core.cli import (
     evaluate,
     export,
     import_capture,
+    localize,
     mesh,
     models,
     plugins,
@@ -67,6 +68,7 @@ def build_app() -> typer.Typer:
     app.command("extract")(work_folder.extract)
     app.command("match")(work_folder.match)
     app.command("map")(work_folder.map_images)
+    app.command("localize")(localize.localize)
     app.command("demo")(demo.demo)
     app.command("import")(import_capture.import_capture)
     app.command("dense")(dense.dense)

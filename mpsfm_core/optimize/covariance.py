@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +15,17 @@ from mpsfm_core.optimize.options import BundleOptions
 DAMPING = 1e-8
 """Damping of the information matrix of a point, which makes the matrix invertible. [COLMAP
 damping]"""
+
+
+class CalibrationStd(NamedTuple):
+    """Prior standard deviations of the intrinsics of a guessed camera."""
+
+    log_focal: float
+    """Of the log focal length, which is estimated together with the pose."""
+    center_px: float
+    """Of both coordinates of the principal point in pixels, which is not estimated."""
+    radial: float
+    """Of the distortion coefficient of SIMPLE_RADIAL, which is not estimated."""
 
 
 def compute_point_covariances(
@@ -74,13 +86,14 @@ def compute_pose_covariance(
     points: Float64,
     point_covariances: Float64,
     std_px: Float64,
-    log_focal_std: float = 0.0,
+    calibration: CalibrationStd | None = None,
 ) -> Float64:
     """Compute the covariance of a camera pose from observed points of uncertain position.
 
     The covariance is the inverse of ``sum(J^T S^-1 J)`` with the Jacobian ``J`` of a projection
     and ``S = std_px^2 I + P C P^T``, where ``P`` is the Jacobian of the projection with respect to
-    the point and ``C`` the covariance of the point.
+    the point and ``C`` the covariance of the point. Errors of intrinsics that are not estimated are
+    propagated to the pose (consider covariance, Schmidt 1966).
 
     Args:
         pose: ``cam_from_world``.
@@ -89,8 +102,7 @@ def compute_pose_covariance(
         point_covariances: (m, 3, 3) covariances of the points without the observations of this
             camera, in squared world units.
         std_px: (m,) standard deviation of the observations in pixels.
-        log_focal_std: Prior standard deviation of the log focal length, which is estimated together
-            with the pose, or 0 for a known focal length.
+        calibration: Uncertainty of a guessed camera, or None for a known camera.
 
     Returns:
         (6, 6) covariance of ``w`` and ``dt`` in ``R <- exp(w) R, t <- t + dt``, in radians and
@@ -105,18 +117,28 @@ def compute_pose_covariance(
     projection = projection.reshape(-1, 2, 3)
     a, b, c = turned.T
     rotating = np.stack([zero, c, -b, -c, zero, a, b, -a, zero], axis=1).reshape(-1, 3, 3)
-    zooming = np.stack([fx * x / z, fy * y / z], axis=1)[..., None]
+    rays = np.stack([x / z, y / z], axis=1)
+    zooming = (intrinsics[:2] * rays)[..., None]
     jacobian = np.concatenate([projection @ rotating, projection, zooming], axis=2)
     moving = projection @ rotation
     noise = moving @ point_covariances @ moving.transpose(0, 2, 1)
     noise += std_px[:, None, None] ** 2 * np.eye(2)
-    information = (jacobian.transpose(0, 2, 1) @ np.linalg.solve(noise, jacobian)).sum(axis=0)
-    if log_focal_std > 0:
-        information[6, 6] += 1.0 / log_focal_std**2
-    else:
-        information = information[:6, :6]
+    weighted = np.linalg.solve(noise, jacobian).transpose(0, 2, 1)
+    information = (weighted @ jacobian).sum(axis=0)
+    if calibration is None:
+        return _invert(information[:6, :6])
+    information[6, 6] += 1.0 / calibration.log_focal**2
+    covariance = _invert(information)
+    shifts = np.broadcast_to(calibration.center_px * np.eye(2), (len(z), 2, 2))
+    bending = calibration.radial * (rays**2).sum(axis=1)[:, None, None] * zooming
+    systematic = covariance @ (weighted @ np.concatenate([shifts, bending], axis=2)).sum(axis=0)
+    total: Float64 = covariance + systematic @ systematic.T
+    return total[:6, :6]
+
+
+def _invert(information: Float64) -> Float64:
+    """Invert an information matrix, and return infinite covariances if it is singular."""
     try:
-        covariance: Float64 = np.linalg.inv(information)[:6, :6]
+        return np.asarray(np.linalg.inv(information), dtype=np.float64)
     except np.linalg.LinAlgError:
-        return np.full((6, 6), np.inf)
-    return covariance
+        return np.full_like(information, np.inf)

@@ -1,4 +1,4 @@
-"""Localize photos in an existing model: match, register with fixed poses, and write the poses."""
+"""Localize photos in an existing model, and write their poses."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ DATABASE = "localization.npz"
 BATCH_SIZE = 50
 """Number of photos that are localized together, which bounds the memory."""
 QUERY_FOLDER = "query/"
-"""Prefix of the names of photos during localization, which images of the model do not have."""
+"""Prefix of the name of a photo during localization if an image of the model has the same name."""
 _UNUSED_BLOCKS = {"runtime", "results", "dense", "fast_pass", "description"}
 """Configuration blocks that do not change the database."""
 
@@ -184,6 +184,8 @@ def localize(
             config = resolve_providers(config, registry, stages).config
         run = _Localization(source, config, registry, stages)
         queries = run.load_queries(Path(photos), cameras if intrinsics is None else intrinsics)
+        if extend:
+            _require_new_names(source, queries)
         fixed = run.load_model(Path(database) if database else source.folder / DATABASE)
         found: dict[str, LocalizedPhoto] = {}
         reasons: dict[str, Reason] = {}
@@ -193,7 +195,7 @@ def localize(
                     reasons[name] = outcome
                 else:
                     found[name] = outcome
-        extended = extend_model(source.model, _with_free_names(source, found)) if extend else None
+        extended = extend_model(source.model, found) if extend else None
         if folder is not None:
             with replace_entries(folder, ENTRIES) as scratch:
                 described = {
@@ -285,11 +287,8 @@ class _Localization:
     ) -> Iterator[tuple[str, LocalizedPhoto | Reason]]:
         """Yield the name of each photo with its pose, or with the reason without a pose."""
         names = queries.names
-        renamed = [replace(q, name=QUERY_FOLDER + q.name) for q in queries]
-        photos = {query.name: query for query in renamed}
-        renamed_queries = ImageSet(renamed, self._config.inputs)
         with self._stages.stage("extraction"):
-            problem = self._extend_problem(model, renamed_queries, sequence=sequence)
+            problem = self._extend_problem(model, queries, sequence=sequence)
         num_references = len(self._references)
         rows = [num_references + row for row in range(len(names))]
         with self._stages.stage("localization"):
@@ -301,20 +300,25 @@ class _Localization:
                 for done, row in enumerate(rows):
                     outcomes.append(localizer.localize(row))
                     self._stages.stage_progress("localization", done + 1, len(rows))
-        for name, outcome in zip(names, outcomes, strict=True):
+        for query, outcome in zip(queries, outcomes, strict=True):
+            name = query.name
             if isinstance(outcome, Reason):
                 self._stages.image_rejected(name, outcome)
                 yield name, outcome
             else:
                 self._stages.image_registered(name, num_references + 1, num_references + len(names))
-                yield name, self._convert(name, photos, outcome)
+                yield name, self._convert(query, outcome)
 
     def _extend_problem(
         self, model: FixedModel, queries: ImageSet, *, sequence: bool
     ) -> MappingProblem:
         """Add photos to the mapping problem of the model, with matches to images of the model."""
         num_references = len(self._references)
-        joint = ImageSet([*self._references, *queries], self._config.inputs)
+        taken = set(self._references.names)
+        renamed = [
+            replace(q, name=QUERY_FOLDER + q.name) if q.name in taken else q for q in queries
+        ]
+        joint = ImageSet([*self._references, *renamed], self._config.inputs)
         context = ExtractionContext(joint, self._config, self._registry, self._stages)
         between = []
         if sequence:
@@ -327,16 +331,16 @@ class _Localization:
         with extraction_environment(context):
             context.run_masks()
             priors = predict_priors(context, None)
-        added = [_query_image(q, priors.depth[q.name], priors.normals[q.name]) for q in queries]
+        added = [
+            _query_image(photo, priors.depth[query.name], priors.normals[query.name])
+            for photo, query in zip(renamed, queries, strict=True)
+        ]
         problem = replace(model.problem, images=(*model.problem.images, *added))
         max_distance_px = self._config.extraction.dense_snap_px
         return snap_to_observations(merge_matches(problem, matches), model, max_distance_px)
 
-    def _convert(
-        self, name: str, queries: Mapping[str, SourceImage], image: LocalizedImage
-    ) -> LocalizedPhoto:
+    def _convert(self, source: SourceImage, image: LocalizedImage) -> LocalizedPhoto:
         """Convert a localized image to camera, keypoints and names of the original images."""
-        source = queries[image.name]
         model_names = dict(zip(self._references.names, self._source.names, strict=True))
         references = {reference.name: reference for reference in self._references}
         matches = {
@@ -348,7 +352,7 @@ class _Localization:
             if other in references
         }
         return LocalizedPhoto(
-            name,
+            source.name,
             (image.rotation, image.translation),
             image.covariance,
             source.refined_camera(image.camera),
@@ -373,17 +377,14 @@ def _query_image(image: SourceImage, depth: Any, normals: Any) -> MappingImage:
     )
 
 
-def _with_free_names(
-    source: ExportSource, photos: Mapping[str, LocalizedPhoto]
-) -> dict[str, LocalizedPhoto]:
-    """Check that no localized photo has the name of an image of the model."""
-    taken = sorted(photos.keys() & set(source.names))
+def _require_new_names(source: ExportSource, queries: ImageSet) -> None:
+    """Check that no photo has the name of an image of the model, which is to be extended."""
+    taken = sorted(set(queries.names) & set(source.names))
     if taken:
         raise InputError(
             f"{source.folder}: the model already has an image {taken[0]!r}; rename this photo, or "
             f"move the photos to a subfolder, to extend the model"
         )
-    return dict(photos)
 
 
 def _write_database(path: Path, key: str, model: FixedModel) -> None:

@@ -1,4 +1,4 @@
-"""Files of localized images: poses in hloc's format, COLMAP models and ``localization.json``."""
+"""Write poses of localized photos as text, COLMAP models and ``localization.json``."""
 
 from __future__ import annotations
 
@@ -64,6 +64,15 @@ class LocalizedPhoto:
         return center
 
     @property
+    def center_covariance(self) -> Float64:
+        """(3, 3) covariance of the camera center, in squared units of the model."""
+        rotation, (x, y, z) = self.pose[0], self.pose[1]
+        moving = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+        jacobian = -rotation.T @ np.hstack([moving, np.eye(3)])
+        covariance: Float64 = jacobian @ self.covariance @ jacobian.T
+        return covariance
+
+    @property
     def quaternion(self) -> Float64:
         """(4,) unit quaternion w, x, y, z of the rotation of the pose."""
         x, y, z, w = pycolmap.Rotation3d(self.pose[0]).quat
@@ -76,6 +85,7 @@ class LocalizedPhoto:
             "translation": self.pose[1].tolist(),
             "center": self.center.tolist(),
             "covariance": self.covariance.tolist(),
+            "center_std": np.sqrt(np.diag(self.center_covariance)).tolist(),
             "num_inliers": self.num_inliers,
             "num_matches": self.num_matches,
             "camera": {

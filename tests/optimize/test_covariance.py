@@ -9,7 +9,9 @@ import pytest
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem
 from mpsfm_core.optimize.covariance import (
     DAMPING,
+    CalibrationStd,
     compute_point_covariances,
+    compute_pose_covariance,
     propagate_depth_variance,
 )
 from tests.optimize.bundle_reference import (
@@ -119,3 +121,62 @@ def test_unobserved_directions_have_huge_but_finite_variance() -> None:
     ray = problem.points[1] / np.linalg.norm(problem.points[1])
     assert values[2] > 1e4 * values[1]
     assert abs(vectors[:, 2] @ ray) > 1 - 1e-6
+
+
+def pose_problem() -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
+    """Return the pose and intrinsics of a camera, and points (40, 3) in front of it."""
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-2, -2, 4], [2, 2, 9], (40, 3))
+    turn = rotation(np.array([0.1, -0.2, 0.3]))
+    return (turn, np.array([0.3, -0.1, 0.2])), np.array([500.0, 520.0, 320.0, 240.0]), points @ turn
+
+
+def test_pose_covariance_equals_scatter_of_refined_poses() -> None:
+    pose, intrinsics, points = pose_problem()
+    rng = np.random.default_rng(4)
+    noise = 1e-4 * np.einsum("nij,nkj->nik", *2 * [rng.normal(size=(40, 3, 3))])
+    covariance = compute_pose_covariance(pose, intrinsics, points, noise, np.ones(40))
+    jacobian = np.linalg.cholesky(noise)
+
+    def project(turned: np.ndarray, moved: np.ndarray, xyz: np.ndarray) -> np.ndarray:
+        camera = xyz @ (turned @ pose[0]).T + pose[1] + moved
+        return intrinsics[:2] * camera[:, :2] / camera[:, 2:]
+
+    def derivative(step: np.ndarray) -> np.ndarray:
+        change = rotation(step[:3]), step[3:]
+        return (project(*change, points) - project(np.eye(3), np.zeros(3), points)).ravel() / 1e-6
+
+    numeric = np.column_stack([derivative(1e-6 * axis) for axis in np.eye(6)])
+    errors = np.zeros((80, 80))
+    for row in range(40):
+        for axis in range(3):
+            shifted = points.copy()
+            shifted[row] += 1e-6 * jacobian[row, :, axis]
+            base = project(np.eye(3), np.zeros(3), points)
+            column = (project(np.eye(3), np.zeros(3), shifted) - base).ravel() / 1e-6
+            errors += np.outer(column, column)
+    expected = np.linalg.inv(numeric.T @ np.linalg.inv(errors + np.eye(80)) @ numeric)
+    scale = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    np.testing.assert_allclose(covariance / scale, expected / scale, atol=1e-4)
+
+
+def test_guessed_camera_increases_the_pose_covariance() -> None:
+    pose, intrinsics, points = pose_problem()
+    exact = np.zeros((40, 3, 3)), np.ones(40)
+    known = compute_pose_covariance(pose, intrinsics, points, *exact)
+    focal = compute_pose_covariance(
+        pose, intrinsics, points, *exact, CalibrationStd(0.7, 1e-9, 1e-9)
+    )
+    center = compute_pose_covariance(
+        pose, intrinsics, points, *exact, CalibrationStd(0.7, 10.0, 1e-9)
+    )
+    assert focal[5, 5] > 2 * known[5, 5]
+    assert np.sqrt(center[1, 1]) == pytest.approx(10.0 / 500.0, rel=0.5)
+
+
+def test_one_point_determines_no_pose() -> None:
+    pose, intrinsics, points = pose_problem()
+    covariance = compute_pose_covariance(
+        pose, intrinsics, points[:1], np.zeros((1, 3, 3)), np.ones(1)
+    )
+    assert not np.isfinite(covariance).all() or np.diag(covariance).max() > 1e6

@@ -35,6 +35,7 @@ from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, lift_low
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
 from mpsfm_core.optimize.calibration_errors import predict_calibration_errors
 from mpsfm_core.optimize.covariance import (
+    CalibrationStd,
     compute_point_covariances,
     compute_pose_covariance,
     propagate_depth_variance,
@@ -325,13 +326,19 @@ class Refiner:
         errors_px, _ = scene.project(keypoints, scene.tracks.xyz[scene.tracks.point_of[keypoints]])
         noise = max(1.0, float(np.median(errors_px / std_px)) / MEDIAN_ERROR)
         given = scene.problem.images[image]
+        prior_stds = compute_intrinsic_priors([given])[1][0]
+        guessed = CalibrationStd(
+            log_focal=float(prior_stds[IntrinsicParameter.FOCAL_LENGTH]),
+            center_px=float(prior_stds[IntrinsicParameter.PRINCIPAL_POINT_X]),
+            radial=float(prior_stds[IntrinsicParameter.RADIAL_DISTORTION]),
+        )
         return compute_pose_covariance(
             (scene.rotations[image], scene.translations[image]),
             scene.intrinsics[image],
             problem.points[rows],
             covariances[rows],
             noise * std_px,
-            0.0 if given.focal_known else given.focal_log_std,
+            None if given.focal_known else guessed,
         )
 
     def _scale_losses(

@@ -1,0 +1,137 @@
+"""Tests of the localization of images in a model with fixed poses."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.data.decisions import ImageReason, Reason
+from mpsfm_core.geometry import camera_center, rotation_angle_deg
+from mpsfm_core.mapping.localization import (
+    FixedModel,
+    LocalizedImage,
+    Localizer,
+    snap_to_observations,
+    triangulate_model,
+)
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+
+CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
+OPTIONS = MapperOptions()
+POSES = arc_poses(5, 14.0)
+QUERY = 4
+
+
+@pytest.fixture(scope="module")
+def problem() -> MappingProblem:
+    """Five images, of which all but the last have a known pose."""
+    made = make_mapping_problem(room_scene(), CAMERA, POSES)
+    known = {
+        image.name: (pose[:, :3].copy(), pose[:, 3].copy())
+        for image, pose in zip(made.images[:QUERY], POSES, strict=False)
+    }
+    return made.with_poses(known)
+
+
+@pytest.fixture(scope="module")
+def model(problem: MappingProblem) -> FixedModel:
+    names = [image.name for image in problem.images[:QUERY]]
+    return triangulate_model(
+        problem.subset(names).with_poses(
+            {image.name: image.known_pose for image in problem.images[:QUERY] if image.known_pose}
+        ),
+        OPTIONS,
+    )
+
+
+def locate(problem: MappingProblem, model: FixedModel) -> LocalizedImage:
+    """Return the localized query."""
+    outcome = Localizer(problem, model, OPTIONS).localize(QUERY)
+    assert isinstance(outcome, LocalizedImage)
+    return outcome
+
+
+def center_error(image: LocalizedImage) -> float:
+    """Return the distance in meters from the true camera center of the query."""
+    true_center = camera_center(POSES[QUERY][:, :3], POSES[QUERY][:, 3])
+    return float(np.linalg.norm(camera_center(image.rotation, image.translation) - true_center))
+
+
+def test_localize_query_gives_accurate_pose_with_covariance(
+    problem: MappingProblem, model: FixedModel
+) -> None:
+    image = locate(problem, model)
+    assert rotation_angle_deg(image.rotation @ POSES[QUERY][:, :3].T) < 0.05
+    assert center_error(image) < 0.01
+    assert 0.8 * image.num_matches < image.num_inliers <= image.num_matches
+    std = np.sqrt(np.diag(image.covariance))
+    assert (std > 0).all() and center_error(image) < 5 * np.linalg.norm(std[3:])
+    assert sum(len(rows) for rows, _ in image.matches.values()) >= image.num_inliers
+
+
+def test_localize_leaves_the_model_unchanged(problem: MappingProblem, model: FixedModel) -> None:
+    localizer = Localizer(problem, model, OPTIONS)
+    first, second = localizer.localize(QUERY), localizer.localize(QUERY)
+    assert isinstance(first, LocalizedImage) and isinstance(second, LocalizedImage)
+    assert np.array_equal(first.rotation, second.rotation)
+    assert np.array_equal(first.covariance, second.covariance)
+
+
+def test_localize_by_one_image_uses_points_lifted_from_its_depth(
+    problem: MappingProblem, model: FixedModel
+) -> None:
+    pairs = tuple(p for p in problem.pairs if p.image_b != QUERY or p.image_a == QUERY - 1)
+    untriangulated = {**model.state, "point_of": np.full_like(model.state["point_of"], -1)}
+    without_points = replace(model, state=untriangulated)
+    image = locate(replace(problem, pairs=pairs), without_points)
+    assert list(image.matches) == [problem.images[QUERY - 1].name]
+    assert center_error(image) < 0.1
+    exact = locate(problem, model)
+    assert np.trace(image.covariance) > np.trace(exact.covariance)
+
+
+def test_localize_estimates_a_guessed_focal_length(
+    problem: MappingProblem, model: FixedModel
+) -> None:
+    query = problem.images[QUERY]
+    guess = replace(CAMERA, fx=1.3 * CAMERA.fx, fy=1.3 * CAMERA.fy)
+    guessed = replace(query, camera=guess, focal_known=False, focal_log_std=0.7)
+    image = locate(replace(problem, images=(*problem.images[:QUERY], guessed)), model)
+    assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
+    assert center_error(image) < 0.05
+    assert np.trace(image.covariance) > np.trace(locate(problem, model).covariance)
+
+
+def test_localize_image_without_matches_returns_the_reason(
+    problem: MappingProblem, model: FixedModel
+) -> None:
+    pairs = tuple(pair for pair in problem.pairs if pair.image_b != QUERY)
+    outcome = Localizer(replace(problem, pairs=pairs), model, OPTIONS).localize(QUERY)
+    assert isinstance(outcome, Reason) and outcome.code == ImageReason.NO_VERIFIED_MATCHES
+
+
+def test_snapped_matches_observe_the_points_of_the_model(
+    problem: MappingProblem, model: FixedModel
+) -> None:
+    shift = len(problem.images[0].keypoints)
+    first = problem.images[0]
+    doubled = replace(first, keypoints=np.concatenate([first.keypoints, first.keypoints + 0.3]))
+    pairs = tuple(
+        replace(pair, matches=pair.matches + np.array([shift, 0]))
+        if (pair.image_a, pair.image_b) == (0, QUERY)
+        else pair
+        for pair in problem.pairs
+    )
+    images = (doubled, *problem.images[1:])
+    snapped = snap_to_observations(MappingProblem(images, pairs), model, 1.0)
+    observed = model.state["point_of"][:shift] >= 0
+    (pair,) = (p for p in snapped.pairs if (p.image_a, p.image_b) == (0, QUERY))
+    (original,) = (p for p in problem.pairs if (p.image_a, p.image_b) == (0, QUERY))
+    rows, original_rows = pair.matches[:, 0], original.matches[:, 0]
+    assert observed[original_rows].any()
+    assert np.array_equal(rows < shift, observed[original_rows])
