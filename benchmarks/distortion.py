@@ -1,22 +1,22 @@
-"""Accuracy of our defaults and COLMAP's defaults on photos with added radial distortion.
+"""Accuracy of our configurations and COLMAP's on photos with added radial distortion.
 
     python -m benchmarks.distortion [SCENE ...] [--lenses MODEL:K1,K2,... ...] [--width 640]
-        [--max-images N] [--seeds 1] [--without-colmap] [--set KEY=VALUE ...] [--folder FOLDER]
+        [--max-images N] [--config default] [--seeds 1] [--known-cameras] [--without-colmap]
+        [--set KEY=VALUE ...] [--folder FOLDER]
 
 The images of a scene are resampled to a camera with lens distortion and the principal point at the
 image center. A lens is a COLMAP camera model with its distortion coefficients, such as
 ``RADIAL:-0.2,0.05``. The focal length of the camera is the shortest one for which no pixel is
-blank. Both programs estimate the camera model of the lens, and get no intrinsics. COLMAP estimates
-one camera per photo by default, and one camera for all photos in an additional row of models other
-than SIMPLE_RADIAL. The result table has the columns of
-:mod:`benchmarks.real_photos`. Table rows are stored in ``--folder``, so that an interrupted
-benchmark continues.
+blank. Both programs estimate the camera model of the lens, and get no intrinsics; additional rows
+of ``--known-cameras`` have the true cameras. COLMAP estimates one camera per photo by default, and
+one camera for all photos in an additional row of models other than SIMPLE_RADIAL. The result table
+has the columns of :mod:`benchmarks.real_photos`. Table rows are stored in ``--folder``, so that an
+interrupted benchmark continues.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import tempfile
 from contextlib import nullcontext
 from pathlib import Path
@@ -26,7 +26,12 @@ import numpy as np
 import pycolmap
 
 from benchmarks._scenes import shared_folder
-from benchmarks.real_photos import format_table, reconstruct_and_measure
+from benchmarks.real_photos import (
+    add_method_arguments,
+    format_table,
+    list_methods,
+    reconstruct_or_read,
+)
 from mpsfm_core.data import Float64
 from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel
 from mpsfm_core.geometry import inside, pixel_centers
@@ -53,13 +58,10 @@ def main() -> None:
     parser.add_argument("--lenses", nargs="+", default=LENSES, metavar="MODEL:K1,K2,...")
     parser.add_argument("--width", type=int, default=640)
     parser.add_argument("--max-images", type=int, default=12)
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--without-colmap", action="store_true")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides")
+    add_method_arguments(parser)
     parser.add_argument("--folder", type=Path, help="folder of the resampled images and rows")
     arguments = parser.parse_args()
-    methods = [f"seed {seed}" for seed in range(arguments.seeds)]
-    methods += [] if arguments.without_colmap else ["COLMAP"]
+    methods = list_methods(arguments)
     kept = arguments.folder and nullcontext(str(arguments.folder))
     rows = []
     with kept or tempfile.TemporaryDirectory(prefix="mpsfm-distortion-") as folder:
@@ -72,12 +74,10 @@ def main() -> None:
                     size = arguments.width, arguments.max_images
                     distort_scene(source, target, model, coefficients, *size)
                 shared = [ONE_CAMERA] if "COLMAP" in methods and model != DEFAULT_MODEL else []
-                for method in methods + shared:
-                    stored = target / f"{method}.json"
-                    if not stored.exists():
-                        row = reconstruct_and_measure(target, method, arguments.overrides, model)
-                        stored.write_text(json.dumps(row), encoding="utf-8")
-                    rows.append(json.loads(stored.read_text(encoding="utf-8")))
+                rows += [
+                    reconstruct_or_read(target, method, arguments, target, model)
+                    for method in methods + shared
+                ]
     print(format_table(rows))
 
 

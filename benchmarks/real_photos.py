@@ -1,14 +1,17 @@
-"""Accuracy of our defaults and COLMAP's defaults on photos of unknown cameras.
+"""Accuracy of our configurations and COLMAP's defaults on photos of unknown cameras.
 
-    python -m benchmarks.real_photos [SET ...] [--photos FOLDER] [--seeds 1] [--without-colmap]
-        [--set KEY=VALUE ...] [--output FILE] [--json]
+    python -m benchmarks.real_photos [SET ...] [--photos FOLDER] [--config default] [--seeds 1]
+        [--known-cameras] [--without-colmap] [--set KEY=VALUE ...] [--folder FOLDER]
+        [--output FILE] [--json]
 
 Each photo set is a folder with ``images/`` and, if true poses are known, a COLMAP model ``gt/``.
-Neither program gets intrinsics. COLMAP uses SIFT, all pairs, the incremental mapper and one
-SIMPLE_RADIAL camera per image. Pose AUC counts all image pairs; a pair with an unregistered image
-has an error of 180 degrees. Rotation errors are measured after alignment to the image with the
-smallest median rotation error. Camera centers are compared with GPS after a similarity transform,
-horizontally. ``--json`` prints one JSON object as the last line.
+Neither program gets intrinsics; additional rows of ``--known-cameras`` have the cameras of ``gt/``.
+COLMAP uses SIFT, all pairs, the incremental mapper and one SIMPLE_RADIAL camera per image. Pose AUC
+counts all image pairs; a pair with an unregistered image has an error of 180 degrees. Rotation
+errors are measured after alignment to the image with the smallest median rotation error. Camera
+centers are compared with GPS after a similarity transform, horizontally. Table rows are stored in
+``--folder``, so that an interrupted benchmark continues; features, matches and depth are cached as
+in every run. ``--json`` prints one JSON object as the last line.
 """
 
 from __future__ import annotations
@@ -38,6 +41,7 @@ from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.report.verdict import judge
 
 SETS = ("sacre_coeur", "mobilebrick", "lund_door", "seneca")
+KNOWN_CAMERAS = ", known cameras"
 CONVENTION = CONVENTIONS["paper"]
 MAX_ROTATION_DEG = 2.0
 """Maximum rotation error in degrees of an image whose pose counts as correct. [ours]"""
@@ -53,19 +57,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("sets", nargs="*", default=list(SETS), metavar="SET")
     parser.add_argument("--photos", type=Path, default=Path("../shared/photos"))
-    parser.add_argument("--seeds", type=int, default=1)
-    parser.add_argument("--without-colmap", action="store_true")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides")
+    add_method_arguments(parser)
+    parser.add_argument("--folder", type=Path, help="folder of the table rows")
     parser.add_argument("--output", type=Path, help="also write the table to this file")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    methods = [f"seed {seed}" for seed in range(arguments.seeds)]
-    methods += [] if arguments.without_colmap else ["COLMAP"]
-    rows = [
-        reconstruct_and_measure(arguments.photos / name, method, arguments.overrides)
-        for name in arguments.sets
-        for method in methods
-    ]
+    rows = []
+    for name in arguments.sets:
+        photos = arguments.photos / name
+        stored = arguments.folder and arguments.folder / name
+        rows += [
+            reconstruct_or_read(photos, method, arguments, stored)
+            for method in list_methods(arguments)
+            if KNOWN_CAMERAS not in method or (photos / "gt").is_dir()
+        ]
     text = format_table(rows)
     print(text)
     if arguments.output:
@@ -74,9 +79,55 @@ def main() -> None:
         print(json.dumps({"rows": rows}))
 
 
+def add_method_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the command-line options that select reconstruction methods and settings."""
+    parser.add_argument("--config", default="default", help="our configuration")
+    parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--known-cameras", action="store_true", help="add rows with true cameras")
+    parser.add_argument("--without-colmap", action="store_true")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides")
+
+
+def list_methods(arguments: argparse.Namespace) -> list[str]:
+    """List the reconstruction methods that the command line selects, in the order of the table."""
+    seeds = [f"seed {seed}" for seed in range(arguments.seeds)]
+    known = [seed + KNOWN_CAMERAS for seed in seeds] if arguments.known_cameras else []
+    return [*seeds, *known, *([] if arguments.without_colmap else ["COLMAP"])]
+
+
+def reconstruct_or_read(
+    photos: Path,
+    method: str,
+    arguments: argparse.Namespace,
+    stored: Path | None,
+    camera_model: CameraModel = CameraModel.SIMPLE_RADIAL,
+) -> dict[str, Any]:
+    """Read the row of a reconstruction from a folder, or reconstruct the photos and store the row.
+
+    Args:
+        photos: Folder of the photo set.
+        method: Reconstruction method, see :func:`reconstruct_and_measure`.
+        arguments: Arguments with the configuration and the settings of our program.
+        stored: Folder of the rows of the photo set, None to store no row.
+        camera_model: Camera model that both programs estimate.
+    """
+    label = method if method.startswith("COLMAP") else f"{arguments.config} {method}"
+    file = stored and stored / f"{label}.json"
+    if file and file.is_file():
+        row: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+        return row
+    settings = (arguments.config, arguments.overrides)
+    row = reconstruct_and_measure(photos, method, *settings, camera_model)
+    if file:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(json.dumps(row), encoding="utf-8")
+    return row
+
+
 def reconstruct_and_measure(
     folder: Path,
     method: str,
+    config: str,
     overrides: Sequence[str],
     camera_model: CameraModel = CameraModel.SIMPLE_RADIAL,
 ) -> dict[str, Any]:
@@ -85,7 +136,9 @@ def reconstruct_and_measure(
     Args:
         folder: Folder of the photo set.
         method: Reconstruction method, either ``COLMAP``, ``COLMAP, one camera`` for all images, or
-            ``seed`` and the random seed of our mapper.
+            ``seed`` and the random seed of our mapper, with the suffix ``, known cameras`` if the
+            cameras are those of ``gt/``.
+        config: Our configuration.
         overrides: Settings ``KEY=VALUE`` that override our configuration.
         camera_model: Camera model that both programs estimate.
     """
@@ -94,28 +147,32 @@ def reconstruct_and_measure(
         is_shared = method.endswith("one camera")
         models = reconstruct_with_colmap(folder / "images", camera_model, is_shared=is_shared)
     else:
-        settings = [
-            f"runtime.seed={method.split()[1]}",
-            f"inputs.camera_model={camera_model.value}",
-        ]
-        models, verdict = reconstruct_with_defaults(folder / "images", [*settings, *overrides])
+        seed, _, known = method.removeprefix("seed ").partition(",")
+        settings = [f"runtime.seed={seed}", f"inputs.camera_model={camera_model.value}"]
+        models, verdict = reconstruct_with_mpsfm(
+            folder / "images", config, [*settings, *overrides], folder / "gt" if known else None
+        )
+        method = f"`{config}` {method}"
     row = {"set": folder.name, "method": method, **measure(models, folder), "verdict": verdict}
     row["seconds"] = time.perf_counter() - start
     print(json.dumps(row), file=sys.stderr, flush=True)
     return row
 
 
-def reconstruct_with_defaults(
-    images: Path, overrides: Sequence[str]
+def reconstruct_with_mpsfm(
+    images: Path, config: str, overrides: Sequence[str], cameras: Path | None = None
 ) -> tuple[list[pycolmap.Reconstruction], str]:
     """Return the models of ``mpsfm reconstruct IMAGES``, largest first, and the verdict.
 
     The returned verdict string includes the names of the reasons for doubt. The list of models is
-    empty if the reconstruction fails.
+    empty if the reconstruction fails. ``cameras`` is the folder of a COLMAP model with the known
+    cameras.
     """
     offline = ["runtime.offline=true", "dense.enabled=false"]
     try:
-        result = reconstruct(images, overrides=[*offline, *overrides])
+        result = reconstruct(
+            images, config=config, intrinsics=cameras, overrides=[*offline, *overrides]
+        )
     except MpsfmError as error:
         print(f"{images}: {error}", file=sys.stderr)
         return [], "failed"
