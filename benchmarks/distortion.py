@@ -1,8 +1,8 @@
 """Accuracy of our configurations and COLMAP's on photos with added radial distortion.
 
     python -m benchmarks.distortion [SCENE ...] [--lenses MODEL:K1,K2,... ...] [--width 640]
-        [--max-images N] [--config default] [--seeds 1] [--known-cameras] [--without-colmap]
-        [--set KEY=VALUE ...] [--folder FOLDER]
+        [--max-images N | --buckets BUCKET ...] [--max-sets N] [--config default] [--seeds 1]
+        [--known-cameras] [--without-colmap] [--set KEY=VALUE ...] [--folder FOLDER]
 
 The images of a scene are resampled to a camera with lens distortion and the principal point at the
 image center. A lens is a COLMAP camera model with its distortion coefficients, such as
@@ -10,7 +10,9 @@ image center. A lens is a COLMAP camera model with its distortion coefficients, 
 blank. Both programs estimate the camera model of the lens, and get no intrinsics; additional rows
 of ``--known-cameras`` have the true cameras. COLMAP estimates one camera per photo by default, and
 one camera for all photos in an additional row of models other than SIMPLE_RADIAL. The result table
-has the columns of :mod:`benchmarks.real_photos`. Table rows are stored in ``--folder``, so that an
+has the columns of :mod:`benchmarks.real_photos`. With ``--buckets``, the photos are those of the
+test sets of each bucket, such as ``minimal`` or ``leq30``, and a table row is the mean of the first
+``--max-sets`` test sets. Table rows are stored in ``--folder``, so that an
 interrupted benchmark continues.
 """
 
@@ -18,8 +20,12 @@ from __future__ import annotations
 
 import argparse
 import tempfile
+from collections.abc import Sequence
 from contextlib import nullcontext
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -30,10 +36,12 @@ from benchmarks.real_photos import (
     add_method_arguments,
     format_table,
     list_methods,
+    pool_rows,
     reconstruct_or_read,
 )
 from mpsfm_core.data import Float64
 from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel
+from mpsfm_core.evaluation.scene_folder import read_scene
 from mpsfm_core.geometry import inside, pixel_centers
 from mpsfm_core.inputs.undistortion import resize_camera
 from mpsfm_core.results.colmap_model import write_model
@@ -57,28 +65,76 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", default=["fountain", "rendered_kitchen"])
     parser.add_argument("--lenses", nargs="+", default=LENSES, metavar="MODEL:K1,K2,...")
     parser.add_argument("--width", type=int, default=640)
-    parser.add_argument("--max-images", type=int, default=12)
+    parser.add_argument("--max-images", type=int, default=12, help="evenly spaced images")
+    parser.add_argument("--buckets", nargs="+", help="use the test sets of these buckets")
+    parser.add_argument("--max-sets", type=int, help="number of test sets of a bucket")
     add_method_arguments(parser)
     parser.add_argument("--folder", type=Path, help="folder of the resampled images and rows")
     arguments = parser.parse_args()
-    methods = list_methods(arguments)
     kept = arguments.folder and nullcontext(str(arguments.folder))
     rows = []
     with kept or tempfile.TemporaryDirectory(prefix="mpsfm-distortion-") as folder:
         for scene in arguments.scenes:
-            for lens in arguments.lenses:
-                target = Path(folder) / f"{scene} {lens.replace(':', ' ')}"
-                model, coefficients = parse_lens(lens)
-                if not (target / "gt").is_dir():
-                    source = shared_folder() / "data" / scene
-                    size = arguments.width, arguments.max_images
-                    distort_scene(source, target, model, coefficients, *size)
-                shared = [ONE_CAMERA] if "COLMAP" in methods and model != DEFAULT_MODEL else []
-                rows += [
-                    reconstruct_or_read(target, method, arguments, target, model)
-                    for method in methods + shared
-                ]
+            source = shared_folder() / "data" / scene
+            for label, sets in list_photo_sets(source, arguments).items():
+                for lens in arguments.lenses:
+                    rows += measure_lens(source, label, sets, lens, arguments, Path(folder))
     print(format_table(rows))
+
+
+def list_photo_sets(
+    source: Path, arguments: argparse.Namespace
+) -> dict[str, list[tuple[str, ...]]]:
+    """Return the image names of the photo sets of a scene, by label of the table row.
+
+    Args:
+        source: Scene folder.
+        arguments: Arguments with the number of images, or with the buckets and the number of test
+            sets of each bucket.
+    """
+    scene = read_scene(source, with_sets=arguments.buckets is not None)
+    if arguments.buckets is None:
+        names = sorted(scene.sets[0].images)
+        return {source.name: [tuple(names[:: -(-len(names) // arguments.max_images)])]}
+    sets = {
+        bucket: [item.images for item in items]
+        for bucket, items in groupby(scene.select_sets(arguments.buckets), attrgetter("bucket"))
+    }
+    return {f"{source.name} {bucket}": of[: arguments.max_sets] for bucket, of in sets.items()}
+
+
+def measure_lens(
+    source: Path,
+    label: str,
+    sets: Sequence[Sequence[str]],
+    lens: str,
+    arguments: argparse.Namespace,
+    folder: Path,
+) -> list[dict[str, Any]]:
+    """Resample photo sets to a lens, and return a table row of each reconstruction method.
+
+    Args:
+        source: Scene folder.
+        label: Name of the photo sets in the table.
+        sets: Image names of each photo set.
+        lens: Camera model with its distortion coefficients.
+        arguments: Arguments with the methods and settings of :mod:`benchmarks.real_photos`.
+        folder: Folder of the resampled photos and of the rows.
+    """
+    model, coefficients = parse_lens(lens)
+    methods = list_methods(arguments)
+    if "COLMAP" in methods and model != DEFAULT_MODEL:
+        methods.append(ONE_CAMERA)
+    name = f"{label} {lens.replace(':', ' ')}"
+    targets = [folder / (f"{name} {i}" if arguments.buckets else name) for i in range(len(sets))]
+    for target, images in zip(targets, sets, strict=True):
+        if not (target / "gt").is_dir():
+            distort_scene(source, target, model, coefficients, arguments.width, images)
+    rows = []
+    for method in methods:
+        of = [reconstruct_or_read(at, method, arguments, at, model) for at in targets]
+        rows.append(pool_rows(name, of) if arguments.buckets else of[0])
+    return rows
 
 
 def parse_lens(text: str) -> tuple[CameraModel, Float64]:
@@ -96,7 +152,7 @@ def distort_scene(
     model: CameraModel,
     coefficients: Float64,
     width: int,
-    max_images: int,
+    names: Sequence[str],
 ) -> None:
     """Write a scene with images resampled to a camera with lens distortion.
 
@@ -106,12 +162,11 @@ def distort_scene(
         model: Camera model of the new camera.
         coefficients: (4,) distortion coefficients of the new camera.
         width: Width of the new images in pixels.
-        max_images: Maximum number of images; the selected images are evenly spaced in the order of
-            their names.
+        names: Names of the images.
     """
     truth = pycolmap.Reconstruction(source / "gt")
-    images = sorted(truth.images.values(), key=lambda image: str(image.name))
-    images = images[:: -(-len(images) // max_images)]
+    images = [image for image in truth.images.values() if image.name in names]
+    images.sort(key=lambda image: str(image.name))
     distorted_truth = pycolmap.Reconstruction()
     (target / "images").mkdir(parents=True, exist_ok=True)
     for number, image in enumerate(images, start=1):

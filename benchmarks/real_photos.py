@@ -28,7 +28,6 @@ from typing import Any
 import numpy as np
 import pycolmap
 
-from benchmarks._scenes import percent
 from mpsfm_core import reconstruct
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.data.camera_models import CameraModel
@@ -246,13 +245,44 @@ def measure(models: Sequence[pycolmap.Reconstruction], folder: Path) -> dict[str
     )
     true_distortion = np.median([get_distortion(camera) for camera in true_cameras.values()])
     return row | {
-        "auc_percent": percent(area),
+        "auc_percent": [100 * value for value in area.values()],
         "num_correct": int((rotation_errors < MAX_ROTATION_DEG).sum()),
         "max_rotation_deg": float(rotation_errors.max(initial=0.0)),
         "focal_median_error": float(np.median(np.abs(focal_errors))),
         "focal_max_error": float(np.abs(focal_errors).max()),
         "true_distortion": float(true_distortion),
     }
+
+
+def pool_rows(name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return one table row for several photo sets with true poses and the same method.
+
+    Counts of images and seconds are sums, pose AUC is the mean, focal length errors and distortion
+    are medians, and maximum errors are maxima. The verdict is the number of sets called "good".
+
+    Args:
+        name: Name of the photo sets together.
+        rows: Rows of the photo sets; a photo set without a model has a pose AUC of zero.
+    """
+    measured = [row for row in rows if "auc_percent" in row]
+    areas = np.zeros((len(rows), 3))
+    areas[: len(measured)] = [row["auc_percent"] for row in measured]
+    num_good = sum(row["verdict"] == "good" for row in rows)
+    pooled: dict[str, Any] = {
+        "set": name,
+        "method": rows[0]["method"],
+        "images": sum(row["images"] for row in rows),
+        "registered": [sum(row["registered"][0] for row in rows if row["registered"])],
+        "auc_percent": areas.mean(axis=0).tolist(),
+        "num_correct": sum(row["num_correct"] for row in measured),
+        "verdict": f"{num_good} of {len(rows)} good" if rows[0]["verdict"] else "",
+        "seconds": sum(row["seconds"] for row in rows),
+    }
+    for key in ("focal_median_error", "distortion", "true_distortion"):
+        pooled[key] = float(np.median([row[key] for row in measured] or [np.nan]))
+    for key in ("focal_max_error", "max_rotation_deg"):
+        pooled[key] = max((row[key] for row in measured), default=np.nan)
+    return pooled
 
 
 def measure_rotation_errors_deg(
@@ -307,7 +337,8 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
         registered = " + ".join(map(str, row["registered"])) or "0"
         cells = [row["set"], row["method"], f"{registered} of {row['images']}"]
         if "auc_percent" in row:
-            cells += [row["auc_percent"], row["num_correct"], f"{row['max_rotation_deg']:.2f}"]
+            cells += [" / ".join(f"{value:.1f}" for value in row["auc_percent"])]
+            cells += [row["num_correct"], f"{row['max_rotation_deg']:.2f}"]
             cells += [f"{row['focal_median_error']:.1%} / {row['focal_max_error']:.1%}"]
         else:
             cells += ["-"] * 4

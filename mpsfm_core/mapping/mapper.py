@@ -40,6 +40,7 @@ from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.events import MappingEvents, NullMappingEvents
 from mpsfm_core.mapping.initialization.initial_pair import InitialPairSelector
 from mpsfm_core.mapping.initialization.refined_focal_lengths import apply_refined_focal_lengths
+from mpsfm_core.mapping.initialization.view_graph_calibration import calibrate_view_graph
 from mpsfm_core.mapping.model_selection import (
     MapperRun,
     compute_explained_ratios,
@@ -66,7 +67,8 @@ def reconstruct(
 ) -> MappingResult:
     """Reconstruct poses, points and refined depth of all images that can be verified.
 
-    If many matches observe no common 3D point, the mapper runs again with other random seeds. If
+    Guessed focal lengths that the relative poses of image pairs contradict are replaced first. If
+    many matches observe no common 3D point, the mapper runs again with other random seeds. If
     guessed focal lengths were far off, the mapper runs again with the refined focal lengths. The
     run with the most matches that observe common 3D points is kept. The same problem, options and
     machine give bit-identical results, also if an interrupted run continues from a checkpoint.
@@ -85,7 +87,8 @@ def reconstruct(
     runs, interrupted = checkpointer.load()
     is_complete = bool(runs) and interrupted is None
     pair_weights = None
-    initial_problem = problem
+    refine_focal = options.refinement.refine_focal
+    initial_problem = calibrate_view_graph(problem, options.seed) if refine_focal else problem
     for run in runs:  # completed mapper runs, oldest first
         initial_problem = _apply_refined_focals(initial_problem, run, options) or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):

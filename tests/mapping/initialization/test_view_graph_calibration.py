@@ -1,0 +1,86 @@
+"""Tests that relative poses of image pairs determine a guessed focal length."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.data.camera_models import CameraModel
+from mpsfm_core.mapping.initialization.view_graph_calibration import (
+    calibrate_view_graph,
+    estimate_shared_focal,
+)
+from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
+from mpsfm_core.testing.synthetic.scenes import room_scene
+from tests.mapping.focal_scenes import CAMERA, POSES, distort, scale_focal
+
+
+def make_problem(distance_changes: Sequence[float]) -> MappingProblem:
+    """Return images of an orbit around a room, with changes of the distances to the center."""
+    poses = [pose.copy() for pose in POSES]
+    for pose, change in zip(poses, distance_changes, strict=True):
+        pose[2, 3] += change
+    noise = SyntheticNoise(keypoints_px=0.5)
+    return make_mapping_problem(
+        room_scene(), CAMERA, poses, points_per_view=60, map_width=40, noise=noise
+    )
+
+
+def guess_focal(problem: MappingProblem, ratio: float) -> MappingProblem:
+    """Return the problem with a guessed focal length of ``ratio`` times the true one."""
+    camera = scale_focal(CAMERA, ratio)
+    images = tuple(replace(i, camera=camera, focal_known=False) for i in problem.images)
+    return replace(problem, images=images)
+
+
+@pytest.fixture(scope="module")
+def room() -> MappingProblem:
+    return make_problem([0.0, 0.3, -0.3, 0.4, -0.2])
+
+
+@pytest.mark.parametrize(("ratio", "k1"), [(1.6, 0.0), (0.6, 0.0), (1.6, -0.15)])
+def test_estimate_shared_focal_finds_the_focal_length_of_distorted_images(
+    room: MappingProblem, ratio: float, k1: float
+) -> None:
+    problem = guess_focal(distort(room, k1), ratio)
+    focal_px = estimate_shared_focal(problem, problem.pairs)
+    assert focal_px == pytest.approx(CAMERA.fx, rel=0.04)
+
+
+def test_calibrate_view_graph_keeps_the_prior_and_updates_relative_poses(
+    room: MappingProblem,
+) -> None:
+    problem = guess_focal(room, 1.6)
+    calibrated = calibrate_view_graph(problem, seed=0)
+    for image in calibrated.images:
+        assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.04)
+        assert image.focal_prior_px == pytest.approx(1.6 * CAMERA.fx)
+    for true, pair in zip(room.pairs, calibrated.pairs, strict=True):
+        np.testing.assert_allclose(pair.rotation, true.rotation, atol=0.02)
+
+
+@pytest.mark.parametrize("ratio", [1.0, 1.05])
+def test_calibrate_view_graph_keeps_guesses_that_are_nearly_right(
+    room: MappingProblem, ratio: float
+) -> None:
+    problem = guess_focal(room, ratio)
+    assert calibrate_view_graph(problem, seed=0) is problem
+
+
+def test_calibrate_view_graph_keeps_cameras_without_pairs_of_their_own(
+    room: MappingProblem,
+) -> None:
+    images = guess_focal(room, 1.6).images
+    own = tuple(replace(image, camera_id=row) for row, image in enumerate(images))
+    fisheye = tuple(replace(i, camera_model=CameraModel.OPENCV_FISHEYE) for i in images)
+    for problem in (room, replace(room, images=own), replace(room, images=fisheye)):
+        assert calibrate_view_graph(problem, seed=0) is problem
+
+
+def test_estimate_shared_focal_of_an_orbit_at_constant_distance_keeps_the_guess() -> None:
+    problem = guess_focal(make_problem([0.0] * 5), 1.6)
+    assert estimate_shared_focal(problem, problem.pairs) == 1.6 * CAMERA.fx
