@@ -5,8 +5,10 @@ matrix has seven. Therefore the matches of an image pair constrain a focal lengt
 share (view graph calibration; Sweeney et al., "Optimizing the Viewing Graph for
 Structure-from-Motion", ICCV 2015). For each focal length of a grid, the relative poses of all pairs
 are refined to the smallest robust Sampson errors. The sum over the pairs is the profile likelihood
-of the focal length. In contrast to focal lengths from fundamental matrices, the likelihood is flat
-for a degenerate motion, and needs no selection of pairs.
+of the focal length. The lens of each pair has a shift of the principal point and a radial
+distortion with zero-mean priors, because both would bias the focal length. In contrast to focal
+lengths from fundamental matrices, the likelihood is flat for critical motions, and needs no
+selection of pairs.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from mpsfm_core.mapping.initialization.refined_focal_lengths import (
     MIN_FOCAL_CHANGE,
     estimate_relative_poses,
 )
+from mpsfm_core.mapping.refinement.self_calibration import PRINCIPAL_POINT_PRIOR_STD
 from mpsfm_core.mapping.registration.pose_hypotheses import FOCAL_STEP, sample_focal_lengths
 
 MAX_PAIRS, MAX_MATCHES = 20, 100
@@ -36,17 +39,16 @@ MIN_EVIDENCE = 3.0
 """Smallest difference of the log-posteriors of the best and the guessed focal length that replaces
 the guess, strong evidence on the scale of Kass and Raftery ("Bayes Factors", 1995). The difference
 is small for critical motions, such as an orbit at constant distance."""
-MIN_NOISE_PX = 0.1
+MIN_NOISE_PX = 0.5
 """Smallest Sampson error in standard deviations of the keypoints that a match has by chance.
 [tuned: benchmarks.distortion --buckets]"""
-PRIOR_CURVATURE = 0.1
-"""Curvature of the radial distortion that costs as much as one match with an error of one standard
-deviation. [ours]"""
+DIVISION_PRIOR_STD = 0.1
+"""Standard deviation of the zero-mean prior on the coefficient of the division model, for radii in
+half image diagonals. [ours]"""
 MIN_DIVISOR = 0.3
 """Smallest divisor of the division model, which prevents infinite offsets. [ours]"""
-NUM_PARAMETERS = 7
-"""Number of parameters of a relative pose, its distortion and a focal length, which explain as many
-matches."""
+NUM_PARAMETERS = 6
+"""Number of parameters of a relative pose and a focal length, which explain as many matches."""
 NUM_FINE_STEPS = 6
 """Number of steps between the two neighbors of the best focal length of the grid. [ours]"""
 NUM_ITERATIONS = 8
@@ -121,8 +123,8 @@ def estimate_shared_focal(problem: MappingProblem, pairs: Sequence[VerifiedPair]
     best = int(np.argmax(posterior))
     if posterior[best] - posterior[start] < MIN_EVIDENCE:
         return image.camera.fx
-    reach = FOCAL_STEP ** np.array([-1.0, 1.0])
-    fine = np.geomspace(*(coarse[best] * reach), NUM_FINE_STEPS + 1)
+    low_px, high_px = coarse[best] / FOCAL_STEP, coarse[best] * FOCAL_STEP
+    fine = np.geomspace(low_px, high_px, NUM_FINE_STEPS + 1)
     fine_costs = np.array([_refine_poses(solutions[best], matches, focal)[1] for focal in fine])
     posterior = _log_posterior(image, fine, fine_costs, costs, matches)
     return float(fine[np.argmax(posterior)])
@@ -139,6 +141,8 @@ class _Matches(NamedTuple):
     """(p, m) standard deviation of the keypoints in pixels, infinite for unused elements."""
     radius: float
     """Half of the image diagonal in pixels."""
+    lens_stds: Float64
+    """(3,) standard deviations of the priors on principal point and radial distortion."""
 
     @property
     def counts(self) -> Float64:
@@ -148,12 +152,15 @@ class _Matches(NamedTuple):
 
 
 class _RelativePoses(NamedTuple):
-    """Relative poses ``cam_b_from_cam_a`` of p image pairs, with unit translations."""
+    """Relative poses ``cam_b_from_cam_a`` of p image pairs, and the lens of each pair."""
 
     rotations: Float64
+    """(p, 3, 3) rotations."""
     translations: Float64
-    curvatures: Float64
-    """(p,) coefficients c of the division model of radial distortion; see :func:`_undistort`."""
+    """(p, 3) translations of unit length."""
+    lenses: Float64
+    """(p, 3) shift of the principal point in pixels, and coefficient of the division model of
+    radial distortion (see :func:`_undistort`), of the camera of each pair."""
 
     @classmethod
     def of(cls, pairs: Sequence[VerifiedPair]) -> _RelativePoses:
@@ -162,14 +169,14 @@ class _RelativePoses(NamedTuple):
         translations[~translations.any(axis=1)] = 1.0, 0.0, 0.0
         lengths = np.linalg.norm(translations, axis=1, keepdims=True)
         rotations = np.array([pair.rotation for pair in pairs])
-        return cls(rotations, translations / lengths, np.zeros(len(pairs)))
+        return cls(rotations, translations / lengths, np.zeros((len(pairs), 3)))
 
     def where(self, mask: Bool, other: _RelativePoses) -> _RelativePoses:
         """Return the poses of the pairs in the mask (p,), and those of ``other`` elsewhere."""
         return _RelativePoses(
             np.where(mask[:, None, None], self.rotations, other.rotations),
             np.where(mask[:, None], self.translations, other.translations),
-            np.where(mask, self.curvatures, other.curvatures),
+            np.where(mask[:, None], self.lenses, other.lenses),
         )
 
     def tangents(self) -> Float64:
@@ -180,11 +187,11 @@ class _RelativePoses(NamedTuple):
         return np.stack([first, np.cross(self.translations, first)], axis=1)
 
     def moved(self, step: Float64) -> _RelativePoses:
-        """Return the poses after a step (p, 5) of rotation vector and translation direction."""
+        """Return the poses after a step (p, 8) of rotation, translation direction and lens."""
         rotations = Rotation.from_rotvec(step[:, :3]).as_matrix() @ self.rotations
         moved = self.translations + np.einsum("pk,pki->pi", step[:, 3:5], self.tangents())
         moved /= np.linalg.norm(moved, axis=1, keepdims=True)
-        return _RelativePoses(rotations, moved, self.curvatures + step[:, 5])
+        return _RelativePoses(rotations, moved, self.lenses + step[:, 5:])
 
 
 def _collect_matches(problem: MappingProblem, pairs: Sequence[VerifiedPair]) -> _Matches:
@@ -201,7 +208,10 @@ def _collect_matches(problem: MappingProblem, pairs: Sequence[VerifiedPair]) -> 
             offsets[side, row, : len(matches)] = (xy - (cx, cy)) * (1.0, fx / fy)
         images = problem.images[pair.image_a], problem.images[pair.image_b]
         std_px[row, : len(matches)] = max(image.keypoint_std_px for image in images)
-    return _Matches(*offsets, std_px, 0.5 * float(np.hypot(*image.camera.size)))
+    center_std = PRINCIPAL_POINT_PRIOR_STD * max(image.camera.size)
+    lens_stds = np.array([center_std, center_std, DIVISION_PRIOR_STD])
+    radius = 0.5 * float(np.hypot(*image.camera.size))
+    return _Matches(offsets[0], offsets[1], std_px, radius, lens_stds)
 
 
 def _refine_poses(
@@ -213,20 +223,20 @@ def _refine_poses(
         The refined relative poses, and the cost (p,) of each pair.
     """
     damping = np.full(len(matches.std_px), 1e-3)
-    prior = PRIOR_CURVATURE**-2
+    prior = matches.lens_stds**-2
+    diagonal_prior = np.diag([0.0] * 5 + prior.tolist())
     errors, jacobian = _linearize(poses, matches, focal_px)
-    cost = np.log1p(errors**2).sum(axis=1) + prior * poses.curvatures**2
+    cost = np.log1p(errors**2).sum(axis=1) + poses.lenses**2 @ prior
     for _ in range(NUM_ITERATIONS):
         weighted = jacobian / (1.0 + errors**2)[:, None]
-        hessian = weighted @ jacobian.transpose(0, 2, 1)
+        hessian = weighted @ jacobian.transpose(0, 2, 1) + diagonal_prior
         gradient = np.einsum("pkm,pm->pk", weighted, errors)
-        hessian[:, 5, 5] += prior
-        gradient[:, 5] += prior * poses.curvatures
+        gradient[:, 5:] += prior * poses.lenses
         diagonal = np.einsum("pii->pi", hessian) + 1e-9
-        hessian += (damping[:, None] * diagonal)[:, :, None] * np.eye(6)
+        hessian += (damping[:, None] * diagonal)[:, :, None] * np.eye(8)
         moved = poses.moved(-np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0])
         moved_errors, moved_jacobian = _linearize(moved, matches, focal_px)
-        moved_cost = np.log1p(moved_errors**2).sum(axis=1) + prior * moved.curvatures**2
+        moved_cost = np.log1p(moved_errors**2).sum(axis=1) + moved.lenses**2 @ prior
         decrease = cost - moved_cost
         is_better = decrease > 0
         poses = moved.where(is_better, poses)
@@ -245,11 +255,11 @@ def _linearize(
     """Measure and differentiate the Sampson errors of all matches.
 
     Returns:
-        Sampson errors (p, m) in standard deviations of the keypoints, and their derivatives (p, 6,
-        m) by rotation, translation direction and curvature, with constant norms of the gradients.
+        Sampson errors (p, m) in standard deviations of the keypoints, and their derivatives (p, 8,
+        m) by rotation, translation direction and lens, with constant norms of the gradients.
     """
-    rays_a, bends_a = _undistort(matches.offsets_a, poses.curvatures, matches.radius, focal_px)
-    rays_b, bends_b = _undistort(matches.offsets_b, poses.curvatures, matches.radius, focal_px)
+    rays_a, by_lens_a = _undistort(matches.offsets_a, poses.lenses, matches.radius, focal_px)
+    rays_b, by_lens_b = _undistort(matches.offsets_b, poses.lenses, matches.radius, focal_px)
     rotated = rays_a @ poses.rotations.transpose(0, 2, 1)
     essential = _cross_matrices(poses.translations) @ poses.rotations
     lines_b = rays_a @ essential.transpose(0, 2, 1)
@@ -260,29 +270,30 @@ def _linearize(
     normals = np.cross(rays_b, poses.translations[:, None])
     by_rotation = np.cross(rotated, normals).transpose(0, 2, 1)
     by_translation = poses.tangents() @ np.cross(rotated, rays_b).transpose(0, 2, 1)
-    by_curvature = ((lines_a * bends_a).sum(axis=2) + (lines_b * bends_b).sum(axis=2))[:, None]
-    jacobian = np.concatenate([by_rotation, by_translation, by_curvature], axis=1)
+    by_lens = np.einsum("pmi,pkmi->pkm", lines_a[..., :2], by_lens_a)
+    by_lens += np.einsum("pmi,pkmi->pkm", lines_b[..., :2], by_lens_b)
+    jacobian = np.concatenate([by_rotation, by_translation, by_lens], axis=1)
     return slopes * (rays_b * lines_b).sum(axis=2), jacobian * slopes[:, None]
 
 
 def _undistort(
-    offsets: Float64, curvatures: Float64, radius_px: float, focal_px: float
+    offsets: Float64, lenses: Float64, radius_px: float, focal_px: float
 ) -> tuple[Float64, Float64]:
-    """Undistort offsets from the principal point by the division model.
+    """Undistort offsets from the image center by the division model.
 
-    The undistorted offset is ``d / (1 + c r^2)`` with the distorted offset d, its length r in units
-    of ``radius_px``, and the curvature c (Fitzgibbon, CVPR 2001).
+    The undistorted offset is ``d / (1 + c r^2)`` with the distorted offset d from the principal
+    point, its length r in units of ``radius_px``, and the coefficient c (Fitzgibbon, CVPR 2001).
 
     Returns:
-        Rays (p, m, 3) with z = 1, and their derivatives (p, m, 3) by the curvature.
+        Rays (p, m, 3) with z = 1, and the derivatives (p, 3, m, 2) of their x and y by the lens.
     """
-    squared = (offsets**2).sum(axis=2, keepdims=True) / radius_px**2
-    divisor = np.maximum(1.0 + curvatures[:, None, None] * squared, MIN_DIVISOR)
-    rays = np.concatenate([offsets / divisor / focal_px, np.ones_like(squared)], axis=2)
-    bends = np.concatenate(
-        [-offsets * squared / divisor**2 / focal_px, np.zeros_like(squared)], axis=2
-    )
-    return rays, bends
+    shifted = offsets - lenses[:, None, :2]
+    squared = (shifted**2).sum(axis=2, keepdims=True) / radius_px**2
+    divisor = np.maximum(1.0 + lenses[:, None, 2:] * squared, MIN_DIVISOR)
+    rays = np.concatenate([shifted / divisor / focal_px, np.ones_like(squared)], axis=2)
+    by_center = -np.eye(2)[None, :, None] / (divisor * focal_px)[:, None]
+    by_coefficient = -rays[:, None, :, :2] * (squared / divisor)[:, None]
+    return rays, np.concatenate([by_center, by_coefficient], axis=1)
 
 
 def _cross_matrices(vectors: Float64) -> Float64:

@@ -81,6 +81,11 @@ def test_calibrate_view_graph_keeps_cameras_without_pairs_of_their_own(
         assert calibrate_view_graph(problem, seed=0) is problem
 
 
-def test_estimate_shared_focal_of_an_orbit_at_constant_distance_keeps_the_guess() -> None:
+@pytest.mark.parametrize("shift", [(0, 0), (10, -6)])
+def test_estimate_shared_focal_of_an_orbit_at_constant_distance_keeps_the_guess(
+    shift: tuple[int, int],
+) -> None:
     problem = guess_focal(make_problem([0.0] * 5), 1.6)
+    images = tuple(replace(i, keypoints=i.keypoints + shift) for i in problem.images)
+    problem = replace(problem, images=images)
     assert estimate_shared_focal(problem, problem.pairs) == 1.6 * CAMERA.fx
