@@ -11,6 +11,19 @@ import pytest
 from mpsfm_core import ProviderContext
 from mpsfm_core.providers.weights import WeightStore
 
+SLOW_CHECKS = frozenset({"second-process", "memory-released"})
+"""Contract checks of providers that need seconds, because a process imports all libraries again or
+a provider is called many times."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the contract checks in ``SLOW_CHECKS`` as slow."""
+    for item in items:
+        callspec = getattr(item, "callspec", None)
+        if callspec is not None and callspec.id in SLOW_CHECKS:
+            item.add_marker(pytest.mark.slow)
+
 
 @pytest.fixture(scope="session")
 def context(tmp_path_factory: pytest.TempPathFactory) -> ProviderContext:

@@ -80,9 +80,8 @@ def installed_plugins(
     Yields:
         One loaded plugin per entry point, with a ``fault`` if loading the plugin failed.
     """
-    entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
-    for entry in sorted(entries, key=lambda e: (_distribution(e)[0], e.name)):
-        name, version = _distribution(entry)
+    entries = [(*_distribution(e), e) for e in metadata.entry_points(group=ENTRY_POINT_GROUP)]
+    for name, version, entry in sorted(entries, key=lambda e: (e[0], e[2].name)):
         if (entry.name, entry.value) in crashing:
             hint = f"reinstall or uninstall {name}"
             fault = "ends the whole process when it is loaded"
@@ -158,7 +157,9 @@ def _distribution(entry: metadata.EntryPoint) -> tuple[str, str]:
     """
     try:
         if entry.dist is not None:
-            return str(entry.dist.name), str(entry.dist.version)
+            # Each access to ``entry.dist.metadata`` parses the metadata file again.
+            fields = entry.dist.metadata
+            return str(fields["Name"]), str(fields["Version"])
     except Exception as error:
         _log.info("the package metadata of plugin %s cannot be read: %s", entry.name, error)
     return "unknown distribution", "unknown"

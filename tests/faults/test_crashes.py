@@ -13,7 +13,7 @@ from mpsfm_core.data.result_layout import REPORT
 from .conftest import Scene, content
 
 KILLS, FAULTS = 120, 120
-QUICK = 6
+QUICK = 3
 ERRORS = (errno.ENOSPC, errno.EIO, errno.EACCES, errno.EROFS, errno.EMFILE)
 
 

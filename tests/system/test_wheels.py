@@ -98,8 +98,13 @@ def test_wheels_of_all_packages_run_the_demo(
         assert {name for name in names if "__pycache__" not in name} <= packed, folder.name
         assert f"{package.name}/py.typed" in packed, folder.name
     for name, wheel in wheels.items():
-        packed = set(zipfile.ZipFile(wheel).namelist())
+        archive = zipfile.ZipFile(wheel)
+        packed = set(archive.namelist())
         assert any(entry.endswith(".dist-info/licenses/LICENSE") for entry in packed), name
+        metadata = next(entry for entry in packed if entry.endswith(".dist-info/METADATA"))
+        # A package index cannot show files of the repository.
+        links = re.findall(r"\]\((?!https?:)[^)]*\)", archive.read(metadata).decode())
+        assert links == [], name
     core = zipfile.ZipFile(wheels["mpsfm-core"]).namelist()
     assert "mpsfm_core/py.typed" in core
     check_metadata(wheels, tmp_path)

@@ -6,14 +6,6 @@ The module imports no provider code, so that listing the providers is fast.
 from __future__ import annotations
 
 from mpsfm_core.providers import ProviderSpec, hookimpl
-from mpsfm_core.providers.builtin.options import (
-    DepthFileOptions,
-    MaskFileOptions,
-    MutualNearestOptions,
-    NormalFileOptions,
-    NormalsFromDepthOptions,
-    SiftOptions,
-)
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
 FLAT_CALIBRATION = DepthCalibration(relative_std=0.5)
@@ -38,7 +30,7 @@ def _matching() -> list[ProviderSpec]:
             kind="features",
             name="sift",
             factory="mpsfm_core.providers.builtin.sift:Sift",
-            options=SiftOptions,
+            options="mpsfm_core.providers.builtin.options:SiftOptions",
             summary="RootSIFT of COLMAP on the CPU",
             requires=("pycolmap",),
             code_license=_LICENSE,
@@ -48,7 +40,7 @@ def _matching() -> list[ProviderSpec]:
             kind="matcher",
             name="mutual-nearest",
             factory="mpsfm_core.providers.builtin.mutual_nearest:MutualNearest",
-            options=MutualNearestOptions,
+            options="mpsfm_core.providers.builtin.options:MutualNearestOptions",
             capabilities=frozenset({"sparse"}),
             summary="mutual nearest descriptors with ratio test, for any features",
             code_license=_LICENSE,
@@ -62,7 +54,7 @@ def _depth() -> list[ProviderSpec]:
             kind="depth",
             name="files",
             factory="mpsfm_core.providers.builtin.files:DepthFiles",
-            options=DepthFileOptions,
+            options="mpsfm_core.providers.builtin.options:DepthFileOptions",
             capabilities=frozenset({"uncached"}),
             summary="depth maps of a sensor or any network, read from files",
             code_license=_LICENSE,
@@ -109,7 +101,7 @@ def _normals() -> list[ProviderSpec]:
             kind="normals",
             name="files",
             factory="mpsfm_core.providers.builtin.files:NormalFiles",
-            options=NormalFileOptions,
+            options="mpsfm_core.providers.builtin.options:NormalFileOptions",
             capabilities=frozenset({"uncached"}),
             summary="normal maps read from files",
             code_license=_LICENSE,
@@ -120,7 +112,7 @@ def _normals() -> list[ProviderSpec]:
             kind="normals",
             name="from-depth",
             factory="mpsfm_core.providers.builtin.normals_from_depth:NormalsFromDepth",
-            options=NormalsFromDepthOptions,
+            options="mpsfm_core.providers.builtin.options:NormalsFromDepthOptions",
             capabilities=frozenset({"needs-depth", "variance", "intrinsics-aware"}),
             summary="normals of planes fitted to the depth prior",
             code_license=_LICENSE,
@@ -136,7 +128,7 @@ def _masks() -> list[ProviderSpec]:
             kind="mask",
             name="files",
             factory="mpsfm_core.providers.builtin.files:MaskFiles",
-            options=MaskFileOptions,
+            options="mpsfm_core.providers.builtin.options:MaskFileOptions",
             capabilities=frozenset({"uncached"}),
             summary="masks read from image files",
             code_license=_LICENSE,

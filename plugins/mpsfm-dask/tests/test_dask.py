@@ -33,10 +33,12 @@ def test_lost_worker_loses_no_results(executor: DaskExecutor, tmp_path: Path) ->
     executor_contract.check_lost_worker(executor, tmp_path / "items")
 
 
+@pytest.mark.slow
 def test_extraction(tmp_path: Path) -> None:
     executor_contract.check_extraction("dask", {"workers": 2}, tmp_path)
 
 
+@pytest.mark.slow
 def test_a_failing_provider(tmp_path: Path) -> None:
     executor_contract.check_failing_provider("dask", {"workers": 2}, tmp_path)
 

@@ -18,7 +18,9 @@ registry.add(*(replace(spec, requires=("torch",)) for spec in mpsfm_providers())
 
 test_dense = contract_tests("matcher", "vismatch", registry=registry)
 test_sparse = contract_tests("matcher", "vismatch-sparse", registry=registry)
-test_roma = contract_tests("matcher", "vismatch-roma", registry=registry)
-test_roma_sparse = contract_tests("matcher", "vismatch-roma-sparse", registry=registry)
-test_mast3r = contract_tests("matcher", "vismatch-mast3r", registry=registry)
+test_roma = pytest.mark.slow(contract_tests("matcher", "vismatch-roma", registry=registry))
+test_roma_sparse = pytest.mark.slow(
+    contract_tests("matcher", "vismatch-roma-sparse", registry=registry)
+)
+test_mast3r = pytest.mark.slow(contract_tests("matcher", "vismatch-mast3r", registry=registry))
 test_mast3r_sparse = contract_tests("matcher", "vismatch-mast3r-sparse", registry=registry)
