@@ -64,6 +64,9 @@ class MappingImage:
     number (None), the depth map of the image has its own scale."""
     proposed_pose: Pose | None = None
     """Pose ``cam_from_group`` that a multi-view network predicts, in the unit of its depth maps."""
+    duplicate_of: str | None = None
+    """Name of an earlier image with the same view (a copy, an exposure bracket or a frame of a
+    camera at rest), or None."""
 
     def __post_init__(self) -> None:
         require_array(self, "keypoints", np.float64, (None, 2))

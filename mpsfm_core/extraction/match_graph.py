@@ -45,6 +45,8 @@ class MatchGraph:
     """Number of selected image pairs before plugins filter the pairs."""
     matcher: PairMatcher | None = None
     """Matchers of the run, which also give the depth that a matcher predicts, or None."""
+    duplicates: Mapping[str, str] = field(default_factory=dict)
+    """Name of the original image by name of the duplicate, which shows the same view."""
 
     @property
     def keypoints(self) -> dict[str, Float64]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -39,7 +39,7 @@ from mpsfm_core.extraction.matching.pair_matching import (
     merge_matches,
 )
 from mpsfm_core.extraction.output_checks import find_meaningless_scores, find_partial_coverage
-from mpsfm_core.extraction.pairs.duplicates import find_duplicates, restrict_matches
+from mpsfm_core.extraction.pairs.duplicates import find_duplicates
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.extraction.pairs.selection import PairSelection
 from mpsfm_core.extraction.priors.multiview import GroupPriors
@@ -233,9 +233,6 @@ def match_images(
         candidates += matcher.match(further_pairs, located)
         geometries += verifier.verify(candidates[len(geometries) :])
     assembled = adjust_assembled(context, assemble_matches(candidates, geometries, located))
-    min_inliers = context.config.verification.min_inliers
-    restricted = restrict_matches(assembled.pairs, duplicates, min_inliers)
-    assembled = replace(assembled, pairs=restricted)
     names = context.images.names
     features = {} if source is None else FeatureSet(names, source, context.config.features)
     proposed = selection.proposed if pairs is None else len(pairs)
@@ -245,9 +242,10 @@ def match_images(
         assembled,
         tuple(candidates),
         tuple(geometries),
-        min_inliers,
+        context.config.verification.min_inliers,
         proposed,
         matcher,
+        {names[image]: names[original] for image, original in duplicates.items()},
     )
 
 
@@ -338,6 +336,7 @@ def assemble_problem(images: ImageSet, graph: MatchGraph, priors: Priors) -> Map
                 camera_model=image.camera_model,
                 depth_group=priors.groups.get(image.name),
                 proposed_pose=priors.proposed_poses.get(image.name),
+                duplicate_of=graph.duplicates.get(image.name),
             )
             for index, image in enumerate(images)
         ),

@@ -22,12 +22,14 @@ The steps of :func:`reconstruct`, compared with COLMAP's ``IncrementalMapper``::
         stop if enough matches are explained, no guessed focal length was far off, and no image
             deviates from the focal length of its shared camera
     select the run that explains the most matches
+    register duplicates in the poses of their originals
     register the remaining images tentatively           # if this option is set
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -49,6 +51,11 @@ from mpsfm_core.mapping.model_selection import (
     sum_run_times,
 )
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.registration.duplicate_registration import (
+    register_duplicates,
+    remove_duplicates,
+    report_duplicates,
+)
 from mpsfm_core.mapping.registration.tentative_registration import register_tentatively
 from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
@@ -87,8 +94,9 @@ def reconstruct(
     runs, interrupted = checkpointer.load()
     is_complete = bool(runs) and interrupted is None
     pair_weights = None
+    distinct = remove_duplicates(problem, options)
     refine_focal = options.refinement.refine_focal
-    initial_problem = calibrate_view_graph(problem, options.seed) if refine_focal else problem
+    initial_problem = calibrate_view_graph(distinct, options.seed) if refine_focal else distinct
     for run in runs:  # completed mapper runs, oldest first
         initial_problem = _apply_refined_focals(initial_problem, run, options) or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):
@@ -114,8 +122,12 @@ def reconstruct(
     selected = select_run(runs, options.consistency)
     models = list(selected.models)
     if models and options.register_tentatively:
-        models[0] = register_tentatively(models[0], models[1:], problem, options)
-    return MappingResult(tuple(models), sum_run_times(selected.report, runs))
+        models[0] = register_tentatively(models[0], models[1:], distinct, options)
+    report = sum_run_times(selected.report, runs)
+    if distinct is not problem:
+        models = [register_duplicates(model, problem) for model in models]
+        report = replace(report, image_reasons=report_duplicates(report, models, problem))
+    return MappingResult(tuple(models), report)
 
 
 def _apply_refined_focals(

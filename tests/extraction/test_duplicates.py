@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import mpsfm_core as mpsfm
-from mpsfm_core.data import Features, Float64, VerifiedPair
-from mpsfm_core.extraction.pairs.duplicates import find_duplicates, restrict_matches
+from mpsfm_core.data import Features, Float64
+from mpsfm_core.extraction.pairs.duplicates import find_duplicates
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 SIZE = (640, 480)
@@ -52,21 +52,6 @@ def test_find_duplicates_ignores_chance_and_few_keypoints() -> None:
     assert find(np.empty((0, 2)), np.empty((0, 2))) == {}
 
 
-def make_pair(image_a: int, image_b: int, keypoints: list[int]) -> VerifiedPair:
-    matches = np.stack([keypoints, keypoints], axis=1).astype(np.int64)
-    scores = np.ones(len(keypoints), np.float32)
-    return VerifiedPair(image_a, image_b, matches, scores, np.eye(3), np.zeros(3))
-
-
-def test_restrict_matches_keeps_keypoints_that_other_images_match() -> None:
-    pairs = (make_pair(0, 1, [2, 3, 5]), make_pair(0, 2, [1, 2, 3, 4]))
-    kept = restrict_matches(pairs, {2: 0}, 2)
-    assert kept[0] is pairs[0]
-    assert kept[1].matches[:, 0].tolist() == [2, 3] and len(kept[1].scores) == 2
-    assert restrict_matches(pairs, {2: 0}, 3)[1] is pairs[1]
-    assert restrict_matches(pairs, {}, 2) == pairs
-
-
 @pytest.mark.slow
 def test_match_images_matches_a_brightened_copy_with_its_original_only() -> None:
     camera = mpsfm.PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
@@ -78,4 +63,5 @@ def test_match_images_matches_a_brightened_copy_with_its_original_only() -> None
         config="sift",
         overrides=["adjustment.enabled=false"],
     )
+    assert graph.duplicates == {"d": "b"}
     assert set(graph.verified) == {("a", "b"), ("a", "c"), ("b", "c"), ("b", "d")}

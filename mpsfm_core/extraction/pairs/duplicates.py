@@ -6,13 +6,12 @@ time, because a duplicate adds no parallax.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from mpsfm_core.data import Bool, Features, Float64, Int64, VerifiedPair
+from mpsfm_core.data import Bool, Features, Float64
 
 MIN_SHARED_RATIO = 0.3
 """Minimum ratio of the keypoints of two duplicates that are at equal pixels, beyond chance. The
@@ -47,35 +46,6 @@ def find_duplicates(
                 duplicates[images[number]] = images[same_view[0]]
                 originals[number] = False
     return dict(sorted(duplicates.items()))
-
-
-def restrict_matches(
-    pairs: Sequence[VerifiedPair], duplicates: Mapping[int, int], min_matches: int
-) -> tuple[VerifiedPair, ...]:
-    """Remove matches of duplicates with their originals that no other image can triangulate.
-
-    An original and its duplicate have no parallax. A match between an original and its duplicate is
-    kept if the keypoint of the original also has a match in another image.
-
-    Args:
-        pairs: Verified pairs of all images.
-        duplicates: Original image by index of the duplicate.
-        min_matches: Minimum number of matches that remain; a pair with fewer remaining matches
-            keeps all its matches.
-    """
-    matched: dict[int, list[Int64]] = {}
-    for pair in pairs:
-        if duplicates.get(pair.image_b) != pair.image_a:
-            matched.setdefault(pair.image_a, []).append(pair.matches[:, 0])
-            matched.setdefault(pair.image_b, []).append(pair.matches[:, 1])
-    restricted = []
-    for pair in pairs:
-        if duplicates.get(pair.image_b) == pair.image_a and pair.image_a in matched:
-            is_kept = np.isin(pair.matches[:, 0], np.concatenate(matched[pair.image_a]))
-            if is_kept.sum() >= min_matches:
-                pair = replace(pair, matches=pair.matches[is_kept], scores=pair.scores[is_kept])
-        restricted.append(pair)
-    return tuple(restricted)
 
 
 def _measure_shared_ratios(
