@@ -75,7 +75,7 @@ def pose_errors_deg(problem: MappingProblem, *, weigh_by_score: bool) -> list[fl
 def test_match_scores_reduce_pose_errors() -> None:
     weighted: list[float] = []
     unweighted: list[float] = []
-    for seed in range(12):
+    for seed in range(6):
         problem = problem_with_inaccurate_matches(seed)
         weighted += pose_errors_deg(problem, weigh_by_score=True)
         unweighted += pose_errors_deg(problem, weigh_by_score=False)

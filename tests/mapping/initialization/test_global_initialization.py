@@ -167,6 +167,7 @@ def test_global_initialization_is_as_accurate_as_initial_pair(hall: HallProblem)
     assert errors[True] < 1.1 * errors[False]
 
 
+@pytest.mark.slow
 def test_unexplained_matches_fall_back_to_initial_pair(hall: HallProblem) -> None:
     rng = np.random.default_rng(0)
     pairs = []
