@@ -38,6 +38,9 @@ class FixedModel:
     """Images of the model with known poses, keypoints and priors, and their verified pairs."""
     state: StateDict
     """State of :class:`~mpsfm_core.mapping.scene.scene.Scene` with points and refined depth."""
+    wrong_depth: tuple[int, ...] = ()
+    """Images whose depth contradicts other images of the model, so that no new image is rejected
+    because of their depth."""
 
     @property
     def num_points(self) -> int:
@@ -87,7 +90,8 @@ def triangulate_model(
         problem, options, EventLog(problem, events or NullMappingEvents())
     )
     component.initialize_from_known_poses(np.ones(len(problem.images), dtype=np.bool_))
-    return FixedModel(problem, component.scene.state_dict())
+    wrong_depth = component.maintenance.find_wrong_depth()
+    return FixedModel(problem, component.scene.state_dict(), tuple(wrong_depth))
 
 
 def snap_to_observations(
@@ -207,6 +211,7 @@ class Localizer:
         refiner = self._component.refiner
         refiner.fixed[:num_images] = True
         refiner.refine_depth([])
+        self._component.maintenance.exclude_depth(model.wrong_depth)
 
     def _refine(self, images: list[int]) -> None:
         """Refine poses, guessed focal lengths and depth scales of newly registered images."""

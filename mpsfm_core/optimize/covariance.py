@@ -87,13 +87,14 @@ def compute_pose_covariance(
     point_covariances: Float64,
     std_px: Float64,
     calibration: CalibrationStd | None = None,
+    point_shifts: Float64 | None = None,
 ) -> Float64:
     """Compute the covariance of a camera pose from observed points of uncertain position.
 
     The covariance is the inverse of ``sum(J^T S^-1 J)`` with the Jacobian ``J`` of a projection
     and ``S = std_px^2 I + P C P^T``, where ``P`` is the Jacobian of the projection with respect to
-    the point and ``C`` the covariance of the point. Errors of intrinsics that are not estimated are
-    propagated to the pose (consider covariance, Schmidt 1966).
+    the point and ``C`` the covariance of the point. Errors that are not estimated (of intrinsics,
+    or shared by several points) are propagated to the pose (consider covariance, Schmidt 1966).
 
     Args:
         pose: ``cam_from_world``.
@@ -103,6 +104,8 @@ def compute_pose_covariance(
             camera, in squared world units.
         std_px: (m,) standard deviation of the observations in pixels.
         calibration: Uncertainty of a guessed camera, or None for a known camera.
+        point_shifts: (m, 3, k) shifts of the points in world units by one standard deviation of
+            each of k errors that move several points.
 
     Returns:
         (6, 6) covariance of ``w`` and ``dt`` in ``R <- exp(w) R, t <- t + dt``, in radians and
@@ -125,14 +128,18 @@ def compute_pose_covariance(
     noise += std_px[:, None, None] ** 2 * np.eye(2)
     weighted = np.linalg.solve(noise, jacobian).transpose(0, 2, 1)
     information = (weighted @ jacobian).sum(axis=0)
+    systematic = [np.zeros((len(z), 2, 0)) if point_shifts is None else moving @ point_shifts]
     if calibration is None:
-        return _invert(information[:6, :6])
-    information[6, 6] += 1.0 / calibration.log_focal**2
-    covariance = _invert(information)
-    shifts = np.broadcast_to(calibration.center_px * np.eye(2), (len(z), 2, 2))
-    bending = calibration.radial * (rays**2).sum(axis=1)[:, None, None] * zooming
-    systematic = covariance @ (weighted @ np.concatenate([shifts, bending], axis=2)).sum(axis=0)
-    total: Float64 = covariance + systematic @ systematic.T
+        covariance = _invert(information[:6, :6])
+    else:
+        information[6, 6] += 1.0 / calibration.log_focal**2
+        covariance = _invert(information)
+        systematic.append(np.broadcast_to(calibration.center_px * np.eye(2), (len(z), 2, 2)))
+        bending = calibration.radial * (rays**2).sum(axis=1)
+        systematic.append(bending[:, None, None] * zooming)
+    weighted = weighted[:, : len(covariance)]
+    errors = covariance @ (weighted @ np.concatenate(systematic, axis=2)).sum(axis=0)
+    total: Float64 = covariance + errors @ errors.T
     return total[:6, :6]
 
 

@@ -396,6 +396,7 @@ def _write_database(path: Path, key: str, model: FixedModel) -> None:
     arrays = {
         VERSION: np.array(FORMAT),
         "key": np.array(key),
+        "wrong_depth": np.array(model.wrong_depth, dtype=np.int64),
         **pack(replace(model.problem, images=images), "problem"),
         **{f"state/{name}": array for name, array in flatten_state(model.state).items()},
     }
@@ -425,7 +426,9 @@ def _read_database(path: Path, key: str) -> FixedModel | None:
             for name, array in arrays.items()
             if name.startswith(prefix)
         }
-        return FixedModel(replace(problem, images=tuple(images)), unflatten_state(state))
+        problem = replace(problem, images=tuple(images))
+        wrong_depth = tuple(map(int, arrays["wrong_depth"]))
+        return FixedModel(problem, unflatten_state(state), wrong_depth)
     except (OSError, ValueError, KeyError, DataError):
         return None
 

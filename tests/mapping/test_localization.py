@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.data import MappingProblem, PinholeCamera, VerifiedPair
 from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
 from mpsfm_core.mapping.localization import (
@@ -40,13 +40,13 @@ def problem() -> MappingProblem:
 
 @pytest.fixture(scope="module")
 def model(problem: MappingProblem) -> FixedModel:
-    names = [image.name for image in problem.images[:QUERY]]
-    return triangulate_model(
-        problem.subset(names).with_poses(
-            {image.name: image.known_pose for image in problem.images[:QUERY] if image.known_pose}
-        ),
-        OPTIONS,
-    )
+    return triangulate(problem)
+
+
+def triangulate(problem: MappingProblem) -> FixedModel:
+    """Return the model of the images with a known pose."""
+    known = {image.name: image.known_pose for image in problem.images if image.known_pose}
+    return triangulate_model(problem.subset(list(known)).with_poses(known), OPTIONS)
 
 
 def locate(problem: MappingProblem, model: FixedModel) -> LocalizedImage:
@@ -105,6 +105,29 @@ def test_localize_estimates_a_guessed_focal_length(
     assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
     assert center_error(image) < 0.05
     assert np.trace(image.covariance) > np.trace(locate(problem, model).covariance)
+
+
+def test_wrong_depth_of_an_image_of_the_model_rejects_no_query(problem: MappingProblem) -> None:
+    """The depth of one image is half of the true depth, where the image has no matches."""
+    last = problem.images[QUERY - 1]
+    wrong = last.depth.depth.copy()
+    wrong[: len(wrong) // 2] *= np.float32(0.5)
+    changed = replace(last, depth=replace(last.depth, depth=wrong))
+    is_low = last.keypoints[:, 1] > CAMERA.height / 2 + 20
+
+    def without_upper_half(pair: VerifiedPair) -> VerifiedPair:
+        ends = zip((pair.image_a, pair.image_b), pair.matches.T, strict=True)
+        kept = [is_low[rows] for image, rows in ends if image == QUERY - 1]
+        rows = np.logical_and.reduce([np.ones(len(pair), np.bool_), *kept])
+        return replace(pair, matches=pair.matches[rows], scores=pair.scores[rows])
+
+    images = (*problem.images[: QUERY - 1], changed, problem.images[QUERY])
+    problem = MappingProblem(images, tuple(map(without_upper_half, problem.pairs)))
+    model = triangulate(problem)
+    assert model.wrong_depth == (QUERY - 1,)
+    assert center_error(locate(problem, model)) < 0.01
+    outcome = Localizer(problem, replace(model, wrong_depth=()), OPTIONS).localize(QUERY)
+    assert isinstance(outcome, Reason)
 
 
 def test_localize_image_without_matches_returns_the_reason(

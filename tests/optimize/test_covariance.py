@@ -174,6 +174,17 @@ def test_guessed_camera_increases_the_pose_covariance() -> None:
     assert np.sqrt(center[1, 1]) == pytest.approx(10.0 / 500.0, rel=0.5)
 
 
+def test_scale_error_of_all_points_moves_the_camera() -> None:
+    pose, intrinsics, points = pose_problem()
+    exact = np.zeros((40, 3, 3)), np.full(40, 1e-3)
+    origin = np.array([1.0, 2.0, 3.0])
+    shifts = 0.1 * (points - origin)[..., None]
+    covariance = compute_pose_covariance(pose, intrinsics, points, *exact, None, shifts)
+    center = -pose[0].T @ pose[1]
+    expected = 0.1 * np.linalg.norm(pose[0] @ (center - origin))
+    assert np.sqrt(np.trace(covariance[3:, 3:])) == pytest.approx(expected, rel=0.01)
+
+
 def test_one_point_determines_no_pose() -> None:
     pose, intrinsics, points = pose_problem()
     covariance = compute_pose_covariance(

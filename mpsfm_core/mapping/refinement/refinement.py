@@ -339,7 +339,38 @@ class Refiner:
             covariances[rows],
             noise * std_px,
             None if given.focal_known else guessed,
+            self._compute_scale_errors(problem, own, bundle.images)[rows],
         )
+
+    def _compute_scale_errors(self, problem: BundleProblem, own: Bool, images: Int64) -> Float64:
+        """Compute the shifts of points that a standard deviation of a depth scale causes.
+
+        A scale error of the depth map of an image moves all points that only this image observes.
+        Points that other images observe, too, determine the scale.
+
+        Args:
+            problem: Bundle adjustment problem of a new image with points of other images.
+            own: (m,) bool mask of the observations of the new image.
+            images: (n,) scene index of each image of the problem.
+
+        Returns:
+            (p, 3, n) shift of each point in the world frame, for each depth scale.
+        """
+        scene, tracks = self.scene, self.scene.tracks
+        lengths = np.bincount(problem.obs_point[~own], minlength=len(problem.points))
+        is_single = ~own & (lengths[problem.obs_point] == 1)
+        points, rows = problem.obs_point[is_single], problem.obs_image[is_single]
+        track_lengths = tracks.lengths()
+        shifts = np.zeros((len(problem.points), 3, len(images)))
+        for row in map(int, np.unique(rows)):
+            image = int(images[row])
+            observed = tracks.point_of[scene.graph.keypoints_of(image)]
+            num_shared = np.count_nonzero(track_lengths[observed[observed >= 0]] > 2)
+            std = np.nan_to_num(self.noise.multiplier * scene.maps[image].typical_log_std)
+            std /= np.sqrt(1 + num_shared / self.noise.design_effect)
+            of_image = points[rows == row]
+            shifts[of_image, :, row] = std * (problem.points[of_image] - scene.centers()[image])
+        return shifts
 
     def _scale_losses(
         self, reprojection_scale: float = 1.0, depth_scale: float = 1.0
