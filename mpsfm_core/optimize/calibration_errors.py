@@ -11,8 +11,9 @@ predicts the remaining uncertainty.
 The prior of an image's deviations is a mixture of small deviations of a lens, and large deviations
 of an edited image that was zoomed or cropped ("spike and slab"; George and McCulloch, "Variable
 Selection via Gibbs Sampling", 1993). The probability that an image is edited follows from the Bayes
-factor of both priors with even prior odds (Kass and Raftery, "Bayes Factors", 1995). The Newton
-step uses a normal prior with the variance of the mixture.
+factor of both priors with even prior odds (Kass and Raftery, "Bayes Factors", 1995). Errors of
+poses are predicted with a normal prior with the variance of the mixture. Errors of intrinsics,
+which all images of a camera share, are predicted with the deviations of a lens.
 
 With the Gauss-Newton matrix ``H`` and gradient ``g`` of the reprojection errors, those of depth
 ``D`` and ``d``, and the precision ``P`` of the priors, the Newton step is ``-C (c g / v + d + P
@@ -133,23 +134,25 @@ def predict_calibration_errors(
     extended = not known.all()
     equations = _linearize(problem, options, columns, extended=extended)
     offsets = _prior_offsets(problem, columns)
-    stds, edit_stds = (
+    lens_stds, edit_stds = (
         _prior_stds(problem, columns, known, longer_sides, deviation_stds)
         for deviation_stds in (LENS_DEVIATIONS, EDIT_DEVIATIONS)
     )
+    mixed_stds = lens_stds
     if extended:
-        stds = _mix_prior_stds(equations, offsets, stds, edit_stds, columns)
+        mixed_stds = _mix_prior_stds(equations, offsets, lens_stds, edit_stds, columns)
     else:
         # The solution is the minimum for known intrinsics.
         equations = equations._replace(gradient=np.zeros(columns.point))
-    step, covariance = _compute_posterior(equations, stds, offsets)
+    pose_step, pose_covariance = _compute_posterior(equations, mixed_stds, offsets)
+    step, covariance = _compute_posterior(equations, lens_stds, offsets)
     focal = columns.focal + np.asarray(problem.camera_of_image)
     deviation = columns.focal_deviation + np.arange(num_images)
-    log_focal = (step[focal] + step[deviation]) ** 2 + covariance[focal, focal]
+    log_focal = step[focal] ** 2 + covariance[focal, focal]
     log_focal += covariance[deviation, deviation] + 2 * covariance[focal, deviation]
     radial = columns.radial + np.arange(num_cameras)
     return CalibrationErrors(
-        pose_deg=_measure_pose_errors(problem, step[: 6 * num_images], covariance),
+        pose_deg=_measure_pose_errors(problem, pose_step[: 6 * num_images], pose_covariance),
         log_focal=np.sqrt(np.maximum(log_focal, 0.0)),
         radial=np.sqrt(step[radial] ** 2 + covariance[radial, radial]),
     )
