@@ -230,28 +230,28 @@ def _cameras(
 
 def make_table(records: Sequence[Record]) -> str:
     """Return a table in Markdown with recall and median errors of both methods."""
-    groups: dict[tuple[Any, ...], dict[str, list[Record]]] = defaultdict(lambda: defaultdict(list))
+    groups: dict[tuple[str, int], list[Record]] = defaultdict(list)
     for record in records:
-        key = record["scene"], record["size"], record["known"]
-        groups[key][record["method"]].append(record)
+        groups[record["scene"], record["size"]].append(record)
     lines = [
-        "| scene | model | camera | recall MP-SfM | recall hloc | median MP-SfM | median hloc | "
+        "| scene | model | known: MP-SfM | hloc | median | unknown: MP-SfM | hloc | median | "
         "other place | CPU s |",
-        "| --- | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |",
+        "| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
     ]
-    for (scene, size, known), methods in sorted(groups.items(), key=lambda item: _rank(item[0])):
-        ours, theirs = methods["localize_with_mpsfm"], methods["localize_with_hloc"]
-        cells = [scene, str(size or "half"), "known" if known else "unknown"]
-        cells += [_recall(ours), _recall(theirs), _median(ours), _median(theirs)]
-        cells += [f"{_false(ours)} / {_false(theirs)}"]
-        cells += [f"{np.mean([r['seconds'] for r in ours]):.1f}"]
+    for scene, size in sorted(groups, key=lambda key: (SCENES.index(key[0]), key[1] or 1000)):
+        cells = [scene, str(size or "half")]
+        rows = groups[scene, size]
+        ours, theirs = (
+            [row for row in rows if row["method"] == method.__name__]
+            for method in (localize_with_mpsfm, localize_with_hloc)
+        )
+        for known in (True, False):
+            pair = [[row for row in part if row["known"] == known] for part in (ours, theirs)]
+            cells += [*map(_recall, pair), ", ".join(map(_median, pair))]
+        cells += [f"{_count_false(ours)}, {_count_false(theirs)}"]
+        cells += [f"{np.mean([row['seconds'] for row in ours]):.1f}"]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
-
-
-def _rank(key: tuple[Any, ...]) -> tuple[Any, ...]:
-    scene, size, known = key
-    return not known, SCENES.index(scene), size or 1000
 
 
 def _recall(records: Sequence[Record]) -> str:
@@ -265,15 +265,12 @@ def _recall(records: Sequence[Record]) -> str:
 
 
 def _median(records: Sequence[Record]) -> str:
-    """Return the median errors of the localized queries."""
-    found = [record for record in records if record["found"] and not record["is_other"]]
-    if not found:
-        return "none"
-    position = np.median([record["position"] for record in found])
-    return f"{100 * position:.1f} cm, {np.median([r['rotation'] for r in found]):.2f} deg"
+    """Return the median position error in centimeters of the localized queries."""
+    found = [row["position"] for row in records if row["found"] and not row["is_other"]]
+    return f"{100 * np.median(found):.1f}" if found else "none"
 
 
-def _false(records: Sequence[Record]) -> str:
+def _count_false(records: Sequence[Record]) -> str:
     """Return how many photos of another place have a pose."""
     other = [record["found"] for record in records if record["is_other"]]
     return f"{sum(other)} of {len(other)}"
