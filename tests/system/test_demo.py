@@ -9,6 +9,8 @@ import pytest
 
 from mpsfm_core.evaluation import evaluate, read_poses
 
+from .conftest import POSES_ONLY
+
 ROOT = Path(__file__).resolve().parents[2]
 SCENE = ROOT / "examples" / "sample_scene"
 PRIOR_FILES = [
@@ -19,7 +21,6 @@ PRIOR_FILES = [
         *("--set", f"{kind}.options.directory={SCENE / 'priors' / kind}"),
     )
 ]
-POSES_ONLY = ("--set", "dense.enabled=false", "--set", "results.report=false")
 
 
 def test_demo_needs_only_photos(mpsfm, tmp_path: Path) -> None:

@@ -14,15 +14,18 @@ from mpsfm_core.data import PinholeCamera
 from mpsfm_core.evaluation import evaluate, read_poses
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
+from .conftest import POSES_ONLY
+
 
 def test_exported_database_imports_the_same_matches(photo_scene, mpsfm, tmp_path: Path) -> None:
-    first = mpsfm(*photo_scene.arguments, "--output", tmp_path / "first")
+    first = mpsfm(*photo_scene.arguments, "--output", tmp_path / "first", *POSES_ONLY)
     assert first.code == 0, first.err
     written = mpsfm("export", tmp_path / "first", "--to", "colmap-db")
     assert written.code == 0, written.err
     database = tmp_path / "first" / "exports" / "colmap-db" / "database.db"
     output = tmp_path / "second"
-    second = mpsfm(*photo_scene.arguments, "--database", database, "--output", output)
+    imported = ("--database", database, "--output", output)
+    second = mpsfm(*photo_scene.arguments, *imported, *POSES_ONLY)
     assert second.code == 0, second.err
     assert "5 of 5 images" in second.out
     summary = json.loads((output / "summary.json").read_text())

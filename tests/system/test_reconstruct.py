@@ -18,6 +18,8 @@ from mpsfm_core.evaluation import evaluate, read_poses, reconstruction_poses
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, MappingResult
 from mpsfm_core.results.transforms_json import write_transforms
 
+from .conftest import POSES_ONLY
+
 
 @pytest.fixture(scope="module")
 def output(photo_scene, mpsfm, tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -89,6 +91,7 @@ def test_default_focal_length_is_refined_and_reported(photo_scene, mpsfm, tmp_pa
         tmp_path / "out",
         "--set",
         f"inputs.default_focal_ratio={guess / camera.width}",
+        *POSES_ONLY,
     )
     assert ended.code == 0, ended.err
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
@@ -116,6 +119,7 @@ def test_radial_distortion_is_estimated_for_all_results(photo_scene, mpsfm, tmp_
         output,
         "--set",
         f"inputs.default_focal_ratio={1.06 * 280 / 320}",
+        *POSES_ONLY,
     )
     assert ended.code == 0, ended.err
     assert "radial distortion estimated as -0." in ended.out
@@ -176,7 +180,7 @@ def test_python_api_without_output_gives_same_poses(
         photo_scene.images,
         config=photo_scene.config,
         intrinsics=photo_scene.intrinsics,
-        overrides=["runtime.seed=0"],
+        overrides=["runtime.seed=0", "dense.enabled=false"],
     )
     assert result.output is None
     assert result.summary["status"] == "success"
@@ -193,7 +197,9 @@ def test_image_list_selects_photos_and_quiet_prints_nothing(
     listed = tmp_path / "list.txt"
     listed.write_text("1.png\n2.png\n3.png\n")
     output = tmp_path / "out"
-    ended = mpsfm(*photo_scene.arguments, "--output", output, "--image-list", listed, "--quiet")
+    ended = mpsfm(
+        *photo_scene.arguments, "--output", output, "--image-list", listed, "--quiet", *POSES_ONLY
+    )
     assert (ended.code, ended.out, ended.err) == (0, "", "")
     model = pycolmap.Reconstruction(str(output / "sparse"))
     assert {image.name for image in model.images.values()} == {"1.png", "2.png", "3.png"}
@@ -235,7 +241,7 @@ def test_known_poses_stay_fixed_and_give_consistent_depth(
     model.write_text(str(tmp_path))
     write_transforms(tmp_path / "transforms.json", model, names)
     poses = ("--poses", tmp_path / file, "--set", "mapping.known_poses=fixed")
-    ended = mpsfm(*photo_scene.without_intrinsics, "--output", output, *poses)
+    ended = mpsfm(*photo_scene.without_intrinsics, "--output", output, *poses, *POSES_ONLY)
     assert ended.code == 0, ended.err
     (camera,) = pycolmap.Reconstruction(str(output / "sparse")).cameras.values()
     assert camera.params.tolist() == [280, 280, 160, 120]
@@ -252,7 +258,8 @@ def test_partial_model_is_extended_with_its_camera(photo_scene, mpsfm, tmp_path:
         model.deregister_frame(number)
     model.write_text(str(tmp_path))
     output = tmp_path / "out"
-    ended = mpsfm(*photo_scene.without_intrinsics, "--output", output, "--poses", tmp_path)
+    poses = ("--poses", tmp_path)
+    ended = mpsfm(*photo_scene.without_intrinsics, "--output", output, *poses, *POSES_ONLY)
     assert ended.code == 0, ended.err
     report = evaluate(read_poses(output), read_poses(photo_scene.truth))
     assert (report["registered"], len(read_poses(tmp_path))) == (5, 3)
@@ -291,7 +298,7 @@ def test_poses_without_photo_are_reported(
         config=photo_scene.config,
         image_list=listed,
         poses=photo_scene.truth,
-        overrides=["mapping.known_poses=fixed"],
+        overrides=["mapping.known_poses=fixed", "dense.enabled=false"],
     )
     assert result.model.num_images() == 3
     assert "2 of its 5 images are not among the photos: 3.png, 4.png" in caplog.text
