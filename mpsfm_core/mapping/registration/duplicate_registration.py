@@ -11,14 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpsfm_core.data import MappingProblem, VerifiedPair
+from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.decisions import Reason
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.scene.reconstruction import (
-    MappingReport,
-    Reconstruction,
-    RegisteredImage,
-)
+from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
 
 
 def remove_duplicates(problem: MappingProblem, options: MapperOptions) -> MappingProblem:
@@ -40,12 +36,16 @@ def remove_duplicates(problem: MappingProblem, options: MapperOptions) -> Mappin
     return MappingProblem(originals, pairs)
 
 
-def register_duplicates(model: Reconstruction, problem: MappingProblem) -> Reconstruction:
+def register_duplicates(
+    model: Reconstruction, problem: MappingProblem, max_error_px: float
+) -> Reconstruction:
     """Register the duplicates of the registered images in the poses of their originals.
 
     Args:
         model: Reconstruction without some or all duplicates.
         problem: Mapping problem with the matches of duplicates and originals.
+        max_error_px: Maximum distance in pixels of matched keypoints that observe the same point,
+            for keypoints with a standard deviation of 1 px.
     """
     registered = {image.name: image for image in model.images}
     pairs = {(pair.image_a, pair.image_b): pair for pair in problem.pairs}
@@ -54,8 +54,13 @@ def register_duplicates(model: Reconstruction, problem: MappingProblem) -> Recon
         original = registered.get(image.duplicate_of or "")
         pair = pairs.get((original.index, index)) if original else None
         if original and pair and image.name not in registered:
-            count = problem.num_keypoints(index)
-            duplicates.append(_copy_registration(original, pair, image.name, count))
+            ends = image.keypoints[pair.matches[:, 1]]
+            offsets = ends - problem.images[original.index].keypoints[pair.matches[:, 0]]
+            is_near = (offsets**2).sum(axis=1) <= (max_error_px * image.keypoint_std_px) ** 2
+            point_ids = np.full(len(image.keypoints), -1, dtype=np.int64)
+            point_ids[pair.matches[is_near, 1]] = original.point_ids[pair.matches[is_near, 0]]
+            copy = replace(original, index=index, name=image.name, point_ids=point_ids)
+            duplicates.append(copy)
     images = sorted([*model.images, *duplicates], key=lambda image: image.index)
     return replace(model, images=tuple(images))
 
@@ -79,19 +84,3 @@ def report_duplicates(
         elif original and image.name in registered:
             del reasons[image.name]
     return reasons
-
-
-def _copy_registration(
-    original: RegisteredImage, pair: VerifiedPair, name: str, num_keypoints: int
-) -> RegisteredImage:
-    """Return the registration of a duplicate that observes the points of matched keypoints.
-
-    Args:
-        original: Registered original image.
-        pair: Matches of the original and the duplicate.
-        name: Name of the duplicate.
-        num_keypoints: Number of keypoints of the duplicate.
-    """
-    point_ids = np.full(num_keypoints, -1, dtype=np.int64)
-    point_ids[pair.matches[:, 1]] = original.point_ids[pair.matches[:, 0]]
-    return replace(original, index=pair.image_b, name=name, point_ids=point_ids)
