@@ -265,15 +265,15 @@ def pool_rows(name: str, rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         rows: Rows of the photo sets; a photo set without a model has a pose AUC of zero.
     """
     measured = [row for row in rows if "auc_percent" in row]
-    areas = np.zeros((len(rows), 3))
-    areas[: len(measured)] = [row["auc_percent"] for row in measured]
+    areas = [row["auc_percent"] for row in measured]
+    areas += [[0.0, 0.0, 0.0]] * (len(rows) - len(measured))
     num_good = sum(row["verdict"] == "good" for row in rows)
     pooled: dict[str, Any] = {
         "set": name,
         "method": rows[0]["method"],
         "images": sum(row["images"] for row in rows),
         "registered": [sum(row["registered"][0] for row in rows if row["registered"])],
-        "auc_percent": areas.mean(axis=0).tolist(),
+        "auc_percent": np.mean(areas, axis=0).tolist(),
         "num_correct": sum(row["num_correct"] for row in measured),
         "verdict": f"{num_good} of {len(rows)} good" if rows[0]["verdict"] else "",
         "seconds": sum(row["seconds"] for row in rows),

@@ -49,7 +49,7 @@ MIN_DIVISOR = 0.3
 """Smallest divisor of the division model, which prevents infinite offsets. [ours]"""
 NUM_PARAMETERS = 6
 """Number of parameters of a relative pose and a focal length, which explain as many matches."""
-NUM_FINE_STEPS = 6
+NUM_FINE_STEPS = 12
 """Number of steps between the two neighbors of the best focal length of the grid. [ours]"""
 NUM_ITERATIONS = 8
 """Maximum number of Levenberg-Marquardt iterations for the relative poses at a focal length."""
