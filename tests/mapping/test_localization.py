@@ -158,3 +158,19 @@ def test_snapped_matches_observe_the_points_of_the_model(
     rows, original_rows = pair.matches[:, 0], original.matches[:, 0]
     assert observed[original_rows].any()
     assert np.array_equal(rows < shift, observed[original_rows])
+
+
+def test_localize_together_reaches_an_image_by_another_query(problem: MappingProblem) -> None:
+    """The last image matches only the image before it, which is a query, too."""
+    chain = QUERY - 1
+    images = [
+        replace(i, known_pose=i.known_pose if k < chain else None)
+        for k, i in enumerate(problem.images)
+    ]
+    pairs = tuple(p for p in problem.pairs if p.image_b != QUERY or p.image_a == chain)
+    problem = MappingProblem(tuple(images), pairs)
+    localizer = Localizer(problem, triangulate(problem), OPTIONS)
+    outcomes = localizer.localize_together([chain, QUERY])
+    assert all(isinstance(outcome, LocalizedImage) for outcome in outcomes)
+    assert isinstance(outcomes[1], LocalizedImage) and center_error(outcomes[1]) < 0.05
+    assert isinstance(localizer.localize(QUERY), Reason)
