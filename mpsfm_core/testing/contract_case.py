@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
-from collections.abc import Callable, Mapping
+import pickle
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, fields, is_dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
-from weakref import WeakKeyDictionary, WeakSet
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core.data import DepthPrior, Features, MultiViewPrior, View
+from mpsfm_core.data import DepthPrior, Features, MultiViewPrior, PinholeCamera, View
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.providers import (
     PROVIDER_KINDS,
@@ -29,6 +32,7 @@ from mpsfm_core.providers.kinds.normals import run_normals
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
+from mpsfm_core.support.lru_cache import LruCache
 from mpsfm_core.testing.examples import Appearance, Example, indoor_example, outdoor_example
 from mpsfm_core.testing.ground_truth_provider import (
     GROUND_TRUTH_SPECS,
@@ -41,6 +45,10 @@ from mpsfm_core.testing.process_state import read_process_settings
 TruthSource = Literal["painted", "prepared", "image", "none"]
 """Source of the ground truth for a provider under test, see :class:`ContractSetup`."""
 
+_NUM_DETECTIONS = 96
+"""Number of views whose features a process stores for sparse matchers with the same detector."""
+_NUM_ANSWERS = 8
+"""Number of outputs of a provider that later checks reuse."""
 AUXILIARY_RELATIVE_STD = 0.02
 """Relative std of the exact depth prior that a normals provider with ``needs-depth`` receives."""
 
@@ -127,8 +135,8 @@ class ContractCase:
         self._provider: Any = None
         self._prepared: WeakSet[Example] = WeakSet()
         self._detector: Any = None
-        self._features: WeakKeyDictionary[View, Features] = WeakKeyDictionary()
         self._example: Example | None = None
+        self._answers: LruCache[Hashable, Any] = LruCache(_NUM_ANSWERS, lambda _: 1)
         self.process_before = read_process_settings()
         """Global settings of this process before the first instance of the provider was created."""
 
@@ -217,8 +225,11 @@ class ContractCase:
         Args:
             example: The example. Matchers and multi-view providers also receive the view
                 ``example.partner``.
-            provider: Provider instance to use instead of the one that all checks share.
+            provider: Provider instance to call. By default, the instance that all checks share is
+                called once per synthetic view, and later checks get the same output.
         """
+        if provider is None:
+            return self._answers.get(example.key, lambda: self.run(example, self.provider))
         uses_pair = self.kind in ("matcher", "multiview")
         self.prepare(example, *([example.partner] if uses_pair else []))
         return self.run_on_view(example.view, example, provider)
@@ -339,13 +350,18 @@ class ContractCase:
         return replace(self.spec, capabilities=frozenset({"needs-depth"}))
 
     def _detect(self, view: View) -> Features:
-        if view not in self._features:
-            spec = self._choose_detector()
-            if self._detector is None:
-                options = load_setup(spec, self._folder).options
-                self._detector = self._create(self.registry, "features", spec.name, options)
-            self._features[view] = run_features(spec, self._detector, view)
-        return self._features[view]
+        spec = self._choose_detector()
+        digest = hashlib.blake2b(view.image.tobytes()).digest()
+        detection = _Detection(spec, digest, view.camera, self._device, view, self._create_detector)
+        features: Features = pickle.loads(_detect_once(detection))
+        return features
+
+    def _create_detector(self, spec: ProviderSpec) -> Any:
+        """Return the detector of a sparse matcher, which all detections of the case share."""
+        if self._detector is None:
+            options = load_setup(spec, self._folder).options
+            self._detector = self._create(self.registry, "features", spec.name, options)
+        return self._detector
 
     def _choose_detector(self) -> ProviderSpec:
         """Choose a detector of the matcher's family and plugin, or SIFT without a family."""
@@ -373,6 +389,25 @@ class ContractCase:
     ) -> Any:
         context = ProviderContext(WeightStore().resolve, device=self._device)
         return registry.create(kind, name, options, context, wrap)
+
+
+@dataclass(frozen=True)
+class _Detection:
+    """Input of a feature detector, which is equal for equal pixels, camera and detector."""
+
+    spec: ProviderSpec
+    digest: bytes
+    camera: PinholeCamera
+    device: str
+    view: View = field(compare=False)
+    create: Callable[[ProviderSpec], Any] = field(compare=False)
+
+
+@lru_cache(maxsize=_NUM_DETECTIONS)
+def _detect_once(detection: _Detection) -> bytes:
+    """Detect the features of a view, and return pickled features that no provider can modify."""
+    detector = detection.create(detection.spec)
+    return pickle.dumps(run_features(detection.spec, detector, detection.view))
 
 
 def restore_case(

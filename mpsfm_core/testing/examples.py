@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Literal
+from functools import cached_property, lru_cache
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -38,6 +39,9 @@ _SKY = ((120, 170, 235), (200, 220, 245))
 _HOLES = ((-0.42, -0.05, -0.28, 0.12), (0.33, 0.21, 0.52, 0.34), (-0.1, 0.38, 0.04, 0.47))
 """Rectangles (left, top, right, bottom) without ground truth in example views, in normalized image
 coordinates x / z and y / z."""
+_NUM_CACHED = 96
+"""Number of images, and of ground-truth maps, that a process stores. Many contract checks and all
+providers of a kind use the same synthetic views of about 1 MB each."""
 _COS_MAX_CREASE = np.cos(np.deg2rad(20.0))
 """Smallest cosine of the angle between neighboring normals on a smooth surface, for 20 degrees."""
 
@@ -80,42 +84,28 @@ class Example:
     @cached_property
     def view(self) -> View:
         """View that the provider under test receives."""
-        if self.look == "painted":
-            truth = self.truth()
-            return View(self.name, paint(truth.depth, truth.normals, truth.valid), self.camera)
-        rendering = self.scene.render(self._unmirrored_camera, self.pose)
-        image = _with_sky(rendering.rgb, rendering.depth > 0)
-        return View(self.name, np.ascontiguousarray(self._flip_if_mirrored(image)), self.camera)
+        # A provider may modify the image in place, so each example has an image of its own.
+        return View(self.name, _render(self._content).copy(), self.camera)
 
     def truth(
-        self, shape: tuple[int, int] | None = None, offset_px: tuple[float, float] = (0.0, 0.0)
+        self,
+        shape: tuple[int, int] | None = None,
+        offset_px: tuple[float, float] = (0.0, 0.0),
+        step: int = 1,
     ) -> TrueMaps:
         """Compute the ground truth of the synthetic view on a grid.
 
         Args:
             shape: Numbers of rows and columns of the grid, by default those of the image.
             offset_px: Translation of the grid in pixels of the view (x, y).
+            step: Distance of the computed rows and columns; 2 omits every second row and column.
 
         Returns:
-            Ground-truth depth, normals and masks at the centers of the grid cells.
+            Ground-truth depth, normals and masks at the centers of the grid cells, as read-only
+            arrays.
         """
         rows, columns = shape or (self.camera.height, self.camera.width)
-        scale = self.camera.width / columns, self.camera.height / rows
-        offset = (-offset_px[0] if self.mirrored else offset_px[0], offset_px[1])
-        xy = pixel_centers(columns, rows) * scale + offset
-        seen = self.scene.sample(self._unmirrored_camera, self.pose, xy)
-        valid = seen.valid.reshape(rows, columns) & ~self._is_hole(xy).reshape(rows, columns)
-        surface = np.where(valid, seen.surface.reshape(rows, columns), -1)
-        normals = seen.normals.reshape(rows, columns, 3)
-        steep = np.abs(normals[..., :2]).max(axis=-1) > 0.9 * MAX_SLOPE * -normals[..., 2]
-        smooth = valid & _is_smooth(surface, normals) & ~steep
-        depth = np.where(valid, seen.depth.reshape(rows, columns), 0.0)
-        normals = np.where(valid[..., None], normals, 0)
-        edge_free = _is_smooth(valid.astype(np.int64), np.zeros_like(normals))
-        if self.mirrored:
-            normals = normals * (-1.0, 1.0, 1.0)
-        parts = (depth, normals, valid, smooth, edge_free)
-        return TrueMaps(*(np.ascontiguousarray(self._flip_if_mirrored(part)) for part in parts))
+        return _compute_truth(self._content, rows, columns, offset_px, step)
 
     def correspondences(self, other: Example, xy: Float64) -> TrueCorrespondences:
         """Project the points seen at pixels (n, 2) of this view into another synthetic view."""
@@ -180,9 +170,43 @@ class Example:
         )
         return replace(self, name=f"{left}-{top}-{width}x{height}/{self.name}", camera=cropped)
 
-    def _is_hole(self, xy: Float64) -> Bool:
+    @property
+    def key(self) -> Hashable:
+        """Value that is equal for synthetic views of the same name, image and ground truth."""
+        return self.name, self._content
+
+    @property
+    def _content(self) -> _Content:
+        """Hashable values that determine the image and the ground truth."""
+        parts = self.scene, self.camera, self.pose.tobytes(), self.look, self.mirrored, self.holes
+        return _Content(*parts)
+
+
+class _Content(NamedTuple):
+    """Fields of an :class:`Example` that determine its image and ground truth."""
+
+    scene: AnalyticScene
+    camera: PinholeCamera
+    pose_data: bytes
+    look: Appearance
+    mirrored: bool
+    holes: bool
+
+    @property
+    def pose(self) -> Float64:
+        """Pose ``cam_from_world`` (3, 4)."""
+        return np.frombuffer(self.pose_data).reshape(3, 4)
+
+    @property
+    def unmirrored_camera(self) -> PinholeCamera:
+        """Camera of the synthetic view before left and right are swapped."""
+        if not self.mirrored:
+            return self.camera
+        return replace(self.camera, cx=self.camera.width - self.camera.cx)
+
+    def is_hole(self, xy: Float64) -> Bool:
         """Return a mask (n,) of the pixels (n, 2) in rectangles without ground truth."""
-        camera = self._unmirrored_camera
+        camera = self.unmirrored_camera
         slopes = (xy.reshape(-1, 2) - (camera.cx, camera.cy)) / (camera.fx, camera.fy)
         inside = [
             ((slopes >= (left, top)) & (slopes < (right, bottom))).all(axis=1)
@@ -190,15 +214,48 @@ class Example:
         ]
         return np.any(inside, axis=0) if inside else np.zeros(len(slopes), np.bool_)
 
-    @property
-    def _unmirrored_camera(self) -> PinholeCamera:
-        """Camera of the synthetic view before left and right are swapped."""
-        if not self.mirrored:
-            return self.camera
-        return replace(self.camera, cx=self.camera.width - self.camera.cx)
+    def flip_if_mirrored(self, values: np.ndarray) -> np.ndarray:
+        """Swap left and right of an array (h, w, ...) if the synthetic view is mirrored."""
+        return np.ascontiguousarray(values[:, ::-1] if self.mirrored else values)
 
-    def _flip_if_mirrored(self, values: np.ndarray) -> np.ndarray:
-        return values[:, ::-1] if self.mirrored else values
+
+@lru_cache(maxsize=_NUM_CACHED)
+def _render(content: _Content) -> UInt8:
+    """Render the image (h, w, 3) of a synthetic view."""
+    camera = content.camera
+    if content.look == "painted":
+        truth = _compute_truth(content, camera.height, camera.width, (0.0, 0.0), 1)
+        return paint(truth.depth, truth.normals, truth.valid)
+    rendering = content.scene.render(content.unmirrored_camera, content.pose)
+    return content.flip_if_mirrored(_with_sky(rendering.rgb, rendering.depth > 0))
+
+
+@lru_cache(maxsize=_NUM_CACHED)
+def _compute_truth(
+    content: _Content, rows: int, columns: int, offset_px: tuple[float, float], step: int
+) -> TrueMaps:
+    """Compute the ground truth of a synthetic view on a grid, see :meth:`Example.truth`."""
+    camera = content.camera
+    offset = (-offset_px[0] if content.mirrored else offset_px[0], offset_px[1])
+    xy = pixel_centers(columns, rows) * (camera.width / columns, camera.height / rows) + offset
+    xy = xy[::step, ::step]
+    rows, columns = xy.shape[:2]
+    seen = content.scene.sample(content.unmirrored_camera, content.pose, xy)
+    valid = seen.valid.reshape(rows, columns) & ~content.is_hole(xy).reshape(rows, columns)
+    surface = np.where(valid, seen.surface.reshape(rows, columns), -1)
+    normals = seen.normals.reshape(rows, columns, 3)
+    x, y, z = np.moveaxis(normals, -1, 0)
+    steep = np.maximum(abs(x), abs(y)) > 0.9 * MAX_SLOPE * -z
+    smooth = valid & _is_smooth(surface, normals) & ~steep
+    depth = np.where(valid, seen.depth.reshape(rows, columns), 0.0)
+    normals = np.where(valid[..., None], normals, 0)
+    edge_free = _is_smooth(valid.astype(np.int64))
+    if content.mirrored:
+        normals = normals * (-1.0, 1.0, 1.0)
+    maps = [content.flip_if_mirrored(part) for part in (depth, normals, valid, smooth, edge_free)]
+    for part in maps:
+        part.flags.writeable = False
+    return TrueMaps(*maps)
 
 
 def outdoor_example(
@@ -288,23 +345,20 @@ def _shift_right(pose: Float64) -> Float64:
     return turn @ moved
 
 
-def _is_smooth(surface: Int64, normals: Float64) -> Bool:
+def _is_smooth(surface: Int64, normals: Float64 | None = None) -> Bool:
     """Return the pixels (h, w) with no surface border or normal edge within two pixels."""
     same = np.ones(surface.shape, dtype=np.bool_)
-    rows, columns = surface.shape
-    for axis, size in ((0, rows), (1, columns)):
-        for distance in (1, 2):
-            if distance >= size:
-                continue
-            near = np.arange(size - distance)
-            here, there = (np.take(surface, i, axis) for i in (near, near + distance))
-            cosine = (np.take(normals, near, axis) * np.take(normals, near + distance, axis)).sum(
-                -1
-            )
-            joined = (here == there) & ((cosine > _COS_MAX_CREASE) | (cosine == 0))
-            for index in (near, near + distance):
-                place = (index, slice(None)) if axis == 0 else (slice(None), index)
-                same[place] &= joined
+    for axis, size in enumerate(surface.shape):
+        for distance in range(1, min(3, size)):
+            parts = [slice(0, size - distance), slice(distance, size)]
+            near, far = (part if axis == 0 else (slice(None), part) for part in parts)
+            joined = surface[near] == surface[far]
+            if normals is not None:
+                x, y, z = np.moveaxis(normals[near] * normals[far], -1, 0)
+                cosine = x + y + z
+                joined &= (cosine > _COS_MAX_CREASE) | (cosine == 0)
+            same[near] &= joined
+            same[far] &= joined
     return same
 
 

@@ -106,33 +106,44 @@ def estimate_ray_exponent(prior: DepthPrior, example: Example) -> float:
 
 def estimate_depth_shift(prior: DepthPrior, example: Example) -> MapShift:
     """Estimate the shift of a depth map from pixels where the true depth changes."""
-    truth = example.truth(prior.shape)
+    step = _choose_step(prior.shape, example)
+    truth = example.truth(prior.shape, step=step)
     moved = [
-        [example.truth(prior.shape, (s * x, s * y)).depth for s in (1, -1)]
+        [example.truth(prior.shape, (s * x, s * y), step).depth for s in (1, -1)]
         for x, y in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX))
     ]
     # On a grid finer than the view, half a pixel of the view can cross the border of a surface.
-    where = select_comparable(prior.valid, truth) & (np.min(moved, axis=(0, 1)) > 0)
-    error = np.log(prior.depth[where].astype(np.float64) / truth.depth[where])
+    where = select_comparable(prior.valid[::step, ::step], truth)
+    where &= np.min(moved, axis=(0, 1)) > 0
+    error = np.log(prior.depth[::step, ::step][where].astype(np.float64) / truth.depth[where])
     slopes = [np.log(after[where] / before[where])[:, None] for after, before in moved]
-    return _solve_shift(error[:, None], slopes, _normalized_positions(prior.shape)[where])
+    return _solve_shift(error[:, None], slopes, _normalized_positions(prior.shape, step)[where])
 
 
 def estimate_normals_shift(prior: NormalPrior, example: Example) -> MapShift:
     """Estimate the shift of a normal map from pixels where the true normals change."""
-    truth = example.truth(prior.shape)
-    where = select_comparable(prior.valid, truth)
-    error = prior.normals[where].astype(np.float64) - truth.normals[where]
+    step = _choose_step(prior.shape, example)
+    truth = example.truth(prior.shape, step=step)
+    where = select_comparable(prior.valid[::step, ::step], truth)
+    error = prior.normals[::step, ::step][where].astype(np.float64) - truth.normals[where]
     slopes = []
-    for step in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX)):
-        after = example.truth(prior.shape, step).normals[where]
-        slopes.append(after - example.truth(prior.shape, (-step[0], -step[1])).normals[where])
-    return _solve_shift(error, slopes, _normalized_positions(prior.shape)[where])
+    for x, y in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX)):
+        after, before = (example.truth(prior.shape, (s * x, s * y), step) for s in (1, -1))
+        slopes.append(after.normals[where] - before.normals[where])
+    return _solve_shift(error, slopes, _normalized_positions(prior.shape, step)[where])
 
 
-def _normalized_positions(shape: tuple[int, int]) -> Float64:
-    """Return the x and y positions (h, w, 2) of all pixels, scaled to [-1, 1]."""
-    return pixel_centers(shape[1], shape[0]) / (shape[1] / 2, shape[0] / 2) - 1
+def _choose_step(shape: tuple[int, int], example: Example) -> int:
+    """Return the distance of the rows and columns that suffice to estimate the shift of a map.
+
+    A map finer than its view has more pixels than the estimate needs.
+    """
+    return max(1, min(shape[0] // example.camera.height, shape[1] // example.camera.width))
+
+
+def _normalized_positions(shape: tuple[int, int], step: int) -> Float64:
+    """Return the x and y positions of every ``step``-th row and column, scaled to [-1, 1]."""
+    return pixel_centers(shape[1], shape[0])[::step, ::step] / (shape[1] / 2, shape[0] / 2) - 1
 
 
 def _solve_shift(error: Float64, slopes: list[Float64], positions: Float64) -> MapShift:

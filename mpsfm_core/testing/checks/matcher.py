@@ -25,7 +25,7 @@ from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUndecided
 
 NUM_MANY_FEATURES = 4096
 """Number of features per view that every sparse matcher has to accept."""
-LARGE_SIZE = (1200, 900)
+_MANY_SIZE = (480, 360)
 """Width and height in pixels of the views with many features."""
 MIN_COVERING = 40
 """Minimum number of matches for which the coverage of the views is checked."""
@@ -169,7 +169,7 @@ def check_matcher_few_features(case: ContractCase) -> None:
 
 
 def check_matcher_many_features(case: ContractCase) -> str:
-    """Require correct matches of 4096 and 4200 features in views of 1200 x 900 pixels.
+    """Require correct matches of 4096 and 4200 features in views of 480 x 360 pixels.
 
     Real images have about 4096 features each. A fixed buffer or a size limit of the matching
     network must not end a run, and must not leave the last features without matches.
@@ -347,10 +347,10 @@ def _match_with_noise(case: ContractCase, a: Example, b: Example, amplitude: int
 
 
 def _noise_views(shift: Float64) -> tuple[View, View]:
-    """Return two views of 1200 x 900 pixels of one random texture, shifted by ``shift``."""
+    """Return two views of 480 x 360 pixels of one random texture, shifted by ``shift``."""
     import cv2  # The import is local, because pytest loads this module when it collects tests.
 
-    width, height = LARGE_SIZE
+    width, height = _MANY_SIZE
     x, y = map(int, shift)
     noise = np.random.default_rng(0).normal(size=(height + y, width + x, 3))
     fine, coarse = (cv2.GaussianBlur(noise, (0, 0), sigma) * sigma for sigma in (1.5, 5.0))

@@ -70,15 +70,17 @@ class Box:
         start = (origin - np.asarray(self.center)) @ world_from_box
         all_rays = _away_from_zero(directions @ world_from_box)
         near = self._may_hit(start, all_rays)
-        rays = all_rays[near]
-        t_low = (-np.sign(rays) * self.half_size - start) / rays
-        t_high = (np.sign(rays) * self.half_size - start) / rays
-        t_enter, t_leave = t_low.max(1), t_high.min(1)
+        # Each row is one component of all rays, because numpy reduces long axes faster.
+        rays = np.ascontiguousarray(all_rays[near].T)
+        half_size, start = np.asarray(self.half_size)[:, None], start[:, None]
+        t_low = (-np.sign(rays) * half_size - start) / rays
+        t_high = (np.sign(rays) * half_size - start) / rays
+        t_enter, t_leave = t_low.max(0), t_high.min(0)
         outside = t_enter > _EPSILON
-        axis = np.where(outside, t_low.argmax(1), t_high.argmin(1))
+        axis = np.where(outside, t_low.argmax(0), t_high.argmin(0))
         t = np.where(outside, t_enter, t_leave)
         t = np.where((t_leave >= t_enter) & (t > _EPSILON), t, np.inf)
-        facing = -np.sign(np.take_along_axis(rays, axis[:, None], 1))
+        facing = -np.sign(np.take_along_axis(rays, axis[None], 0))[0][:, None]
         found, normals = np.full(len(all_rays), np.inf), np.zeros_like(all_rays)
         found[near], normals[near] = t, facing * world_from_box.T[axis]
         return found, normals
