@@ -98,7 +98,7 @@ class Example:
         Args:
             shape: Numbers of rows and columns of the grid, by default those of the image.
             offset_px: Translation of the grid in pixels of the view (x, y).
-            step: Distance of the computed rows and columns; 2 omits every second row and column.
+            step: Mean distance of the computed rows and columns, see :func:`thin`.
 
         Returns:
             Ground-truth depth, normals and masks at the centers of the grid cells, as read-only
@@ -238,7 +238,7 @@ def _compute_truth(
     camera = content.camera
     offset = (-offset_px[0] if content.mirrored else offset_px[0], offset_px[1])
     xy = pixel_centers(columns, rows) * (camera.width / columns, camera.height / rows) + offset
-    xy = xy[::step, ::step]
+    xy = thin(xy, step)
     rows, columns = xy.shape[:2]
     seen = content.scene.sample(content.unmirrored_camera, content.pose, xy)
     valid = seen.valid.reshape(rows, columns) & ~content.is_hole(xy).reshape(rows, columns)
@@ -256,6 +256,17 @@ def _compute_truth(
     for part in maps:
         part.flags.writeable = False
     return TrueMaps(*maps)
+
+
+def thin(values: np.ndarray, step: int) -> np.ndarray:
+    """Return one of ``step`` rows and columns of an array (h, w, ...).
+
+    The rows and columns are not equidistant, because each pixel of a network's output is repeated
+    in an enlarged map, and equidistant rows would be the upper row of each repetition.
+    """
+    rows, columns = (np.arange(count // step) for count in values.shape[:2])
+    thinned: np.ndarray = values[np.ix_(rows * step + rows % step, columns * step + columns % step)]
+    return thinned
 
 
 def outdoor_example(

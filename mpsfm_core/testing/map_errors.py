@@ -8,7 +8,7 @@ import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float64, NormalPrior
 from mpsfm_core.geometry import angle_between_deg, pixel_centers
-from mpsfm_core.testing.examples import Example, TrueMaps
+from mpsfm_core.testing.examples import Example, TrueMaps, thin
 from mpsfm_core.testing.outcome import CheckFailed
 
 _MIN_PIXELS = 40
@@ -113,9 +113,9 @@ def estimate_depth_shift(prior: DepthPrior, example: Example) -> MapShift:
         for x, y in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX))
     ]
     # On a grid finer than the view, half a pixel of the view can cross the border of a surface.
-    where = select_comparable(prior.valid[::step, ::step], truth)
+    where = select_comparable(thin(prior.valid, step), truth)
     where &= np.min(moved, axis=(0, 1)) > 0
-    error = np.log(prior.depth[::step, ::step][where].astype(np.float64) / truth.depth[where])
+    error = np.log(thin(prior.depth, step)[where].astype(np.float64) / truth.depth[where])
     slopes = [np.log(after[where] / before[where])[:, None] for after, before in moved]
     return _solve_shift(error[:, None], slopes, _normalized_positions(prior.shape, step)[where])
 
@@ -124,8 +124,8 @@ def estimate_normals_shift(prior: NormalPrior, example: Example) -> MapShift:
     """Estimate the shift of a normal map from pixels where the true normals change."""
     step = _choose_step(prior.shape, example)
     truth = example.truth(prior.shape, step=step)
-    where = select_comparable(prior.valid[::step, ::step], truth)
-    error = prior.normals[::step, ::step][where].astype(np.float64) - truth.normals[where]
+    where = select_comparable(thin(prior.valid, step), truth)
+    error = thin(prior.normals, step)[where].astype(np.float64) - truth.normals[where]
     slopes = []
     for x, y in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX)):
         after, before = (example.truth(prior.shape, (s * x, s * y), step) for s in (1, -1))
@@ -142,8 +142,8 @@ def _choose_step(shape: tuple[int, int], example: Example) -> int:
 
 
 def _normalized_positions(shape: tuple[int, int], step: int) -> Float64:
-    """Return the x and y positions of every ``step``-th row and column, scaled to [-1, 1]."""
-    return pixel_centers(shape[1], shape[0])[::step, ::step] / (shape[1] / 2, shape[0] / 2) - 1
+    """Return the x and y positions of the pixels of a thinned map, scaled to [-1, 1]."""
+    return thin(pixel_centers(shape[1], shape[0]), step) / (shape[1] / 2, shape[0] / 2) - 1
 
 
 def _solve_shift(error: Float64, slopes: list[Float64], positions: Float64) -> MapShift:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -180,3 +181,35 @@ def test_find_providers_of_a_distribution_never_returns_another_ones_provider() 
     with pytest.raises(ProviderError, match="needs no_such_pkg"):
         find_providers(registry, "this process")
     assert ("depth", "flat") in find_providers(registry, "mpsfm-core")
+
+
+class FailsInSecondProcess(PaintedDepth):
+    """Depth provider that raises in a second process, or ends the second process."""
+
+    def predict(self, view: View) -> Any:
+        if os.environ["PYTHONHASHSEED"] == "4321":
+            self.fail()
+        return super().predict(view)
+
+    def fail(self) -> None:
+        raise RuntimeError("no display")
+
+
+class EndsSecondProcess(FailsInSecondProcess):
+    def fail(self) -> None:
+        os.write(2, b"Segmentation fault\n")
+        os._exit(1)
+
+
+@pytest.mark.parametrize(
+    ("factory", "message"),
+    [(FailsInSecondProcess, "no display"), (EndsSecondProcess, "Segmentation fault")],
+)
+def test_second_process_failure_is_reported_and_later_providers_are_checked(
+    factory: type, message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PYTHONHASHSEED", "0")
+    status, text = outcomes(factory, PAINTED, "second-process")["second-process"]
+    assert status == "fail"
+    assert text.startswith("the provider fails in a second process") and text.endswith(message)
+    assert outcomes(PaintedDepth, PAINTED, "second-process")["second-process"][0] == "pass"

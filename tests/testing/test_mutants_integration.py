@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core import (
+    DenseMatches,
     DepthPrior,
     Features,
     MultiViewPrior,
@@ -285,6 +286,29 @@ class FirstThousand(Nearest):
 class DistanceScores(Nearest):
     def change(self, found: SparseMatches, views: Any, features: Any) -> tuple[Any, Any]:
         return slice(None), 1 - found.scores
+
+
+class InventsMatches(MutualNearest):
+    """Fault: matches the same pixels of both images if too few matches are found."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(MutualNearestOptions(), context)
+        self.detector = Sift(SiftOptions(), context)
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        features = self.detector.extract(a), self.detector.extract(b)
+        sparse = super().match(a, b, *features).sparse
+        assert sparse is not None
+        points = [f.keypoints[sparse.indices[:, i]] for i, f in enumerate(features)]
+        if len(sparse) >= 30:
+            return PairMatches(dense=DenseMatches(*points, sparse.scores))
+        grid = np.random.default_rng(0).uniform(0, 100, (50, 2))
+        return PairMatches(dense=DenseMatches(grid, grid, np.ones(50, np.float32)))
+
+
+def test_matcher_that_invents_matches_fails_its_check(caught: Callable[..., None]) -> None:
+    message = "50 matches with a view without texture score 1.00"
+    caught("matcher", InventsMatches, "matcher-scores", message, None, "dense")
 
 
 @pytest.mark.parametrize(

@@ -194,6 +194,13 @@ class FocalRatio(PaintedDepth):
         return 0.75
 
 
+class FocalOfCamera(PaintedDepth):
+    """Fault: the estimate repeats the focal length of the camera, which is a guess."""
+
+    def estimate_focal(self, view: View) -> float:
+        return view.camera.fx
+
+
 class InvertedMask(PaintedDepth):
     """Fault: the provider marks depth as valid at masked-out pixels only."""
 
@@ -248,6 +255,7 @@ def test_depth_provider_may_reject_distant_pixels() -> None:
         ),
         (FocalRatio, "depth-focal", "is 1 px, and 1 px", ("estimates-focal",)),
         (FocalOfNetwork, "depth-focal", "is 40 px, the truth is 144 px", ("estimates-focal",)),
+        (FocalOfCamera, "depth-focal", "144 px, and 288 px if the camera", ("estimates-focal",)),
         (FocalOfWidth, "depth-focal", "144 x 192 view is 108 px", ("estimates-focal",)),
     ],
 )

@@ -249,6 +249,14 @@ class Rows(Thumbnail):
         return profile / np.linalg.norm(profile)
 
 
+class Collapsed(Thumbnail):
+    """Fault: the bias of the last layer dominates all descriptors."""
+
+    def describe(self, view: View) -> np.ndarray:
+        vector = 1 + np.float32(1e-6) * super().describe(view)
+        return vector / np.linalg.norm(vector)
+
+
 class NotNormalised(Thumbnail):
     def describe(self, view: View) -> np.ndarray:
         return view.image[:8, :8].astype(np.float32).ravel()
@@ -270,6 +278,7 @@ class Hash(Thumbnail):
         (Rows, "retrieval-dimension", "descriptors have .* and .* values"),
         (NotNormalised, "retrieval-self-similarity", "lengths of descriptors are"),
         (Hash, "retrieval-overlap", "to a neighboring view"),
+        (Collapsed, "retrieval-overlap", "1 to a neighboring view, but 1 to another"),
     ],
 )
 @pytest.mark.filterwarnings("ignore:divide by zero", "ignore:invalid value")

@@ -268,7 +268,8 @@ def check_depth_joint(case: ContractCase) -> str:
 def check_depth_focal(case: ContractCase) -> str:
     """Require that ``estimate_focal`` returns a focal length in pixels of the view.
 
-    If the view has twice the size, the estimated focal length has to be about twice as long.
+    If the view has twice the size, the estimated focal length has to be about twice as long. The
+    estimate must not depend on the camera of the view, which is a guess.
     """
     if not case.declares("estimates-focal"):
         raise CheckSkipped("the provider does not declare 'estimates-focal'")
@@ -288,6 +289,13 @@ def check_depth_focal(case: ContractCase) -> str:
         raise CheckFailed(
             f"the estimated focal length is {found[0]:.0f} px, and {found[1]:.0f} px at twice the "
             f"image size"
+        )
+    longer = replace(common.camera, fx=2 * common.camera.fx, fy=2 * common.camera.fy)
+    guessed = run_focal(case.spec, case.provider, replace(common.view, camera=longer))
+    if guessed is None or abs(np.log(guessed / found[0])) > np.log(_MAX_FOCAL_FACTOR):
+        raise CheckFailed(
+            f"the estimated focal length is {found[0]:.0f} px, and {guessed or 0:.0f} px if the "
+            "camera of the view has twice the focal length"
         )
     angle = float(np.rad2deg(2 * np.arctan(width / 2 / found[0])))
     if not _ANGLE_RANGE_DEG[0] < angle < _ANGLE_RANGE_DEG[1]:

@@ -6,7 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpsfm_core.data import DenseMatches, DepthPrior, Features, Float64, Int64, PinholeCamera, View
+from mpsfm_core.data import (
+    DenseMatches,
+    DepthPrior,
+    Features,
+    Float32,
+    Float64,
+    Int64,
+    PinholeCamera,
+    View,
+)
 from mpsfm_core.providers.kinds.matcher import run_matcher
 from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.accuracy import (
@@ -20,7 +29,7 @@ from mpsfm_core.testing.accuracy import (
 from mpsfm_core.testing.checks.depth import RAY_TOLERANCE
 from mpsfm_core.testing.checks.features import order_probability
 from mpsfm_core.testing.contract_case import ContractCase
-from mpsfm_core.testing.examples import Example
+from mpsfm_core.testing.examples import Example, outdoor_example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUndecided, CheckUnmeasured
 
 NUM_MANY_FEATURES = 4096
@@ -35,6 +44,9 @@ _MIN_USED_RATIO = 0.9
 _MAX_SCORE_LOSS = 0.01
 """Largest accepted excess of the mean score of unreliable matches over that of reliable ones. The
 score excess is 0 for meaningless scores, and negative for all tested matchers."""
+_MIN_FOREIGN_ORDER = 0.25
+"""Smallest accepted probability that a correct match scores higher than a match of unrelated views.
+Meaningless scores give a probability of 0.5."""
 _MIN_CORRECT_RATIO_OF_HARD_PAIRS = 0.3
 """Smallest accepted ratio of correct matches for views of different sizes, which a matcher resizes
 by different factors, and for many features, which are repeated. The ratio of correct matches is
@@ -204,7 +216,8 @@ def check_matcher_scores(case: ContractCase) -> str:
 
     One half of the second view has strong noise. Scores of matches in the noisy half, and of wrong
     matches, must not be higher than scores of other matches. Equal scores of all matches are
-    allowed.
+    allowed. Matches with a view without texture or of another scene must not score higher than
+    correct matches.
     """
     case.require_truth("image")
     a, b = case.example, case.example.partner
@@ -231,6 +244,7 @@ def check_matcher_scores(case: ContractCase) -> str:
     )
     if means[0] < means[1] - _MAX_SCORE_LOSS and better < 0.5:
         raise CheckFailed(text)
+    _require_low_scores_of_unrelated(case, samples[0][0])
     return text
 
 
@@ -333,6 +347,22 @@ def _match_rotated(case: ContractCase) -> DenseMatches:
     answer = run_matcher(case.spec, case.provider, (view, rotated), None)
     assert answer.dense is not None  # The validator guarantees that the field is present.
     return answer.dense
+
+
+def _require_low_scores_of_unrelated(case: ContractCase, correct: Float32) -> None:
+    """Require that matches with unrelated views do not score higher than correct matches."""
+    view = case.example.view
+    flat = View("flat.png", np.full_like(view.image, 128), view.camera)
+    foreign = outdoor_example("textured").view
+    for what, other in (("without texture", flat), ("of another scene", foreign)):
+        features = case.extract_features(view, other)
+        answer = run_matcher(case.spec, case.provider, (view, other), features)
+        scores = point_matches(answer, features).scores
+        if len(scores) >= MIN_MATCHES and order_probability(correct, scores) < _MIN_FOREIGN_ORDER:
+            raise CheckFailed(
+                f"{len(scores)} matches with a view {what} score {scores.mean():.2f}, correct "
+                f"matches {correct.mean():.2f}"
+            )
 
 
 def _match_with_noise(case: ContractCase, a: Example, b: Example, amplitude: int) -> DenseMatches:

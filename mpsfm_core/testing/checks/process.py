@@ -9,7 +9,6 @@ from __future__ import annotations
 import gc
 import os
 import pickle
-import subprocess
 import sys
 import tempfile
 import time
@@ -17,10 +16,8 @@ import tracemalloc
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
-from mpsfm_core.support.child_process import subprocess_environment
 from mpsfm_core.testing.contract_case import ContractCase, describe_difference
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.leak_probe import measure_usage
@@ -30,6 +27,7 @@ from mpsfm_core.testing.process_state import (
     read_process_settings,
     read_process_state,
 )
+from mpsfm_core.testing.second_process import run_in_second_process
 
 MAX_CONSTRUCTION_S = 20.0
 """Time limit in seconds to construct a provider. Networks with 1 GB of weights need 5 s on a CPU;
@@ -66,42 +64,13 @@ def check_second_process(case: ContractCase) -> str:
         data = pickle.dumps((case.to_pickle(), example, auxiliary))
     except Exception as error:
         raise CheckSkipped(f"the provider cannot be sent to a process: {error}") from error
-    with tempfile.TemporaryDirectory(prefix="mpsfm-second-process-") as folder:
-        path = Path(folder, "input")
-        path.write_bytes(data)
-        environment = {**subprocess_environment(), "PYTHONHASHSEED": "4321"}
-        command = [sys.executable, "-c", _PROCESS_SCRIPT, str(path)]
-        process = subprocess.run(command, env=environment, capture_output=True, text=True)
-        answer_path = path.with_suffix(".answer")
-        if not answer_path.exists():
-            last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
-            raise CheckFailed(f"the provider fails in a second process: {last_line}")
-        answer, seconds = pickle.loads(answer_path.read_bytes())
+    answer, seconds = pickle.loads(run_in_second_process(data))
     if isinstance(answer, str):
         raise CheckSkipped(answer)
     difference = describe_difference(expected, answer)
     if difference:
         raise CheckFailed(f"the output in a second process differs: {difference}")
     return f"{seconds:.2f} s to import and construct"
-
-
-_PROCESS_SCRIPT = """
-import pathlib, pickle, sys, time
-from mpsfm_core.testing.contract_case import restore_case
-path = pathlib.Path(sys.argv[1])
-try:
-    state, example, auxiliary = pickle.loads(path.read_bytes())
-except Exception as error:
-    found = f"the provider cannot be imported in a second process: {error}", 0.0
-else:
-    started = time.perf_counter()
-    case = restore_case(*state)
-    case.prepare(example, example.partner)
-    case.provider
-    seconds = time.perf_counter() - started
-    found = case.run_on_view(example.view, example, auxiliary=auxiliary), seconds
-path.with_suffix(".answer").write_bytes(pickle.dumps(found))
-"""
 
 
 def check_global_state(case: ContractCase) -> None:
