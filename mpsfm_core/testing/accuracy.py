@@ -164,6 +164,21 @@ def match_errors_px(a: Example, b: Example, matches: DenseMatches) -> Float64:
     return errors
 
 
+def require_correct_matches(case: ContractCase, answer: PairMatches) -> None:
+    """Require that matches of the example view and its partner are correct, if there are several.
+
+    Raises:
+        CheckFailed: more than half of the matches are wrong.
+    """
+    if case.truth_source == "painted":  # Painted views have no texture to match.
+        return
+    matches = match_points(case, case.example, case.example.partner, answer)
+    limit = MATCH_TOLERANCE_STD * max(1.0, matches.std_px)
+    is_wrong = match_errors_px(case.example, case.example.partner, matches) > limit
+    if len(matches) >= MIN_MATCHES and is_wrong.mean() > 0.5:
+        raise CheckFailed(f"{is_wrong.mean():.0%} of {len(matches)} matches are wrong")
+
+
 def _compare_matches(case: ContractCase, example: Example, answer: PairMatches) -> str:
     partner = example.partner
     matches = match_points(case, example, partner, answer)

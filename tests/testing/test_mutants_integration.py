@@ -135,6 +135,15 @@ class ShiftedMask(PaintedMask):
         return np.roll(super().mask(view), 2, axis=0)
 
 
+class StretchedMask(PaintedMask):
+    """Fault: the probability of sky is stretched to 0 to 1, as if each image had sky."""
+
+    def mask(self, view: View) -> np.ndarray:
+        depth = read_depth(view.image)
+        sky = (depth.max() - depth) / max(float(np.ptp(depth)), 1e-6)
+        return np.asarray(sky <= 0.5)
+
+
 class UpperLeft(Thumbnail):
     """Fault: describes 100 x 100 pixels instead of the whole view."""
 
@@ -165,6 +174,7 @@ def _camera_of(view: View, image: np.ndarray) -> Any:
         ("depth", "depth-variance", "belongs to other pixels", MirroredVariance, ()),
         ("depth", "depth-intrinsics", "but its std 1.00", StdWithoutFocal, ("intrinsics-aware",)),
         ("mask", "mask-place", r"shifted by \(\+0, \+2\) px", ShiftedMask, ()),
+        ("mask", "mask-polarity", "pixels of a room are usable", StretchedMask, ()),
         ("retrieval", "retrieval-sizes", "but .* to another scene", UpperLeft, ()),
     ],
 )
@@ -283,13 +293,34 @@ class FirstThousand(Nearest):
         return (found.indices < 1024).all(axis=1), found.scores
 
 
+class LogScores(Nearest):
+    """Fault: log probabilities are clipped to 0."""
+
+    def change(self, found: SparseMatches, views: Any, features: Any) -> tuple[Any, Any]:
+        return slice(None), np.clip(np.log(found.scores), 0, 1)
+
+
+class FiltersByMask(Nearest):
+    """Fault: the indices belong to the keypoints inside of the mask."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        if a.mask is not None:
+            columns, rows = fa.keypoints.astype(int).T.clip(0, 143)
+            inside = a.mask[rows, columns]
+            fa = Features(fa.keypoints[inside], fa.descriptors[inside])
+        return super().match(a, b, fa, fb)
+
+    def change(self, found: SparseMatches, views: Any, features: Any) -> tuple[Any, Any]:
+        return slice(None), found.scores
+
+
 class DistanceScores(Nearest):
     def change(self, found: SparseMatches, views: Any, features: Any) -> tuple[Any, Any]:
         return slice(None), 1 - found.scores
 
 
-class InventsMatches(MutualNearest):
-    """Fault: matches the same pixels of both images if too few matches are found."""
+class DenseSift(MutualNearest):
+    """Correct dense matcher, which detects features inside."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
         super().__init__(MutualNearestOptions(), context)
@@ -300,15 +331,44 @@ class InventsMatches(MutualNearest):
         sparse = super().match(a, b, *features).sparse
         assert sparse is not None
         points = [f.keypoints[sparse.indices[:, i]] for i, f in enumerate(features)]
-        if len(sparse) >= 30:
-            return PairMatches(dense=DenseMatches(*points, sparse.scores))
+        return PairMatches(dense=DenseMatches(*points, sparse.scores))
+
+
+class InventsMatches(DenseSift):
+    """Fault: matches the same pixels of both images if too few matches are found."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        found = super().match(a, b)
+        if found.dense is not None and len(found.dense) >= 30:
+            return found
         grid = np.random.default_rng(0).uniform(0, 100, (50, 2))
         return PairMatches(dense=DenseMatches(grid, grid, np.ones(50, np.float32)))
 
 
-def test_matcher_that_invents_matches_fails_its_check(caught: Callable[..., None]) -> None:
-    message = "50 matches with a view without texture score 1.00"
-    caught("matcher", InventsMatches, "matcher-scores", message, None, "dense")
+class CropsToStride(DenseSift):
+    """Fault: crops both images to multiples of 32 and does not add the offset of the crop."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        return super().match(self.crop(a), self.crop(b))
+
+    def crop(self, view: View) -> View:
+        height, width = (max(1, side // 32 * 32) for side in view.image.shape[:2])
+        top, left = (view.camera.height - height) // 2, (view.camera.width - width) // 2
+        image = np.ascontiguousarray(view.image[top : top + height, left : left + width])
+        return View(view.name, image, _camera_of(view, image))
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [
+        (InventsMatches, "matcher-scores", "50 matches with a view without texture score 1.00"),
+        (CropsToStride, "matcher-pixel-convention", r"3/4 of the size are shifted by \(\+10"),
+    ],
+)
+def test_faulty_dense_matcher_fails_its_check(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
+    caught("matcher", factory, check, message, None, "dense")
 
 
 @pytest.mark.parametrize(
@@ -318,6 +378,8 @@ def test_matcher_that_invents_matches_fails_its_check(caught: Callable[..., None
         (LeftOnly, "matcher-coverage", "cover only 3 of 9"),
         (FirstThousand, "matcher-many-features", "use only the first 2.%"),
         (DistanceScores, "matcher-scores", "reliable matches score"),
+        (LogScores, "matcher-scores", "all matches have the score 0.00"),
+        (FiltersByMask, "masked", "matches are wrong"),
     ],
 )
 def test_faulty_matcher_fails_its_check(

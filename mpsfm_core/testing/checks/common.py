@@ -29,10 +29,10 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.data import DepthPrior, MultiViewPrior, NormalPrior, UInt8, View
+from mpsfm_core.data import DepthPrior, MultiViewPrior, NormalPrior, PairMatches, UInt8, View
 from mpsfm_core.providers import ENTRY_POINT_GROUP
 from mpsfm_core.providers.discovery import find_spec_fault
-from mpsfm_core.testing.accuracy import compare_with_truth
+from mpsfm_core.testing.accuracy import compare_with_truth, require_correct_matches
 from mpsfm_core.testing.checks.process import PROCESS_CHECKS
 from mpsfm_core.testing.contract_case import ContractCase, describe_difference
 from mpsfm_core.testing.examples import Example
@@ -367,13 +367,16 @@ def check_flat(case: ContractCase) -> None:
 def check_masked(case: ContractCase) -> None:
     """Require valid output for a view whose mask is partly or completely False.
 
-    A depth or normal map must keep most of its values where the mask is True.
+    A depth or normal map must keep most of its values where the mask is True. Matches must remain
+    correct.
     """
     whole = case.run(case.example)
     for num_visible_columns in (case.example.camera.width // 2, 0):
         mask = np.zeros(case.example.view.image.shape[:2], np.bool_)
         mask[:, :num_visible_columns] = True
         answer = case.run_on_view(replace(case.example.view, mask=mask), case.example)
+        if isinstance(answer, PairMatches):
+            require_correct_matches(case, answer)
         if not isinstance(answer, (DepthPrior, NormalPrior)) or answer.shape != whole.shape:
             continue
         columns = answer.shape[1] * num_visible_columns // case.example.camera.width

@@ -10,12 +10,20 @@ import numpy as np
 from mpsfm_core.testing.accuracy import MASK_TOLERANCE, compare_with_truth
 from mpsfm_core.testing.checks.maps import swap_painted_channels
 from mpsfm_core.testing.contract_case import ContractCase
+from mpsfm_core.testing.examples import indoor_example
 from mpsfm_core.testing.outcome import CheckFailed
 from mpsfm_core.testing.painted_views import read_depth
 
+_MIN_USABLE_ROOM = 0.7
+"""Smallest accepted ratio of usable pixels in a view without sky. Simple rules take bright surfaces
+for sky."""
+
 
 def check_mask_polarity(case: ContractCase) -> str:
-    """Require a mask that is True for usable pixels and False for the sky."""
+    """Require a mask that is True for usable pixels and False for the sky.
+
+    In a view of a room, which shows no sky, most pixels are usable.
+    """
     case.require_truth("painted", "prepared", "image")
     answer, truth = case.run(case.example), case.example.truth()
     agreement = float((answer == truth.valid)[truth.edge_free].mean())
@@ -23,6 +31,9 @@ def check_mask_polarity(case: ContractCase) -> str:
         raise CheckFailed(
             f"the mask is inverted: {1 - agreement:.0%} of the pixels have the wrong value"
         )
+    room = float(np.mean(case.run(indoor_example(case.example.look))))
+    if room < _MIN_USABLE_ROOM:
+        raise CheckFailed(f"only {room:.0%} of the pixels of a room are usable")
     return f"{agreement:.1%} of the pixels agree"
 
 
