@@ -73,6 +73,8 @@ class HookCase:
         try:
             with redirect_stdout(printed):
                 answer = caller(**arguments)
+        except ModuleNotFoundError as error:
+            raise CheckFailed(f"{hook} needs {error.name!r}, which is not installed") from error
         except Exception as error:
             raise CheckFailed(f"{hook} raises {type(error).__name__}: {error}") from error
         if printed.getvalue():
