@@ -165,7 +165,7 @@ def match_errors_px(a: Example, b: Example, matches: DenseMatches) -> Float64:
 
 
 def require_correct_matches(case: ContractCase, answer: PairMatches) -> None:
-    """Require that matches of the example view and its partner are correct, if there are several.
+    """Require that most matches of the example view and its partner are correct.
 
     Raises:
         CheckFailed: more than half of the matches are wrong.
