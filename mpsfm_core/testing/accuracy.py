@@ -170,7 +170,7 @@ def require_correct_matches(case: ContractCase, answer: PairMatches) -> None:
     Raises:
         CheckFailed: more than half of the matches are wrong.
     """
-    if case.truth_source == "painted":  # Painted views have no texture to match.
+    if case.truth_source not in ("image", "prepared"):
         return
     matches = match_points(case, case.example, case.example.partner, answer)
     limit = MATCH_TOLERANCE_STD * max(1.0, matches.std_px)
