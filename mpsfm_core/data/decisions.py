@@ -171,6 +171,11 @@ class DoubtReason(ReasonCode):
     UNCERTAIN_POSES = ("uncertain-poses", "num_images", "error_deg")
     """Other focal lengths, principal points and distortions fit the matches as well or better. They
     change the relative poses of ``num_images`` images by up to ``error_deg`` degrees."""
+    PARTIAL_COVERAGE = ("partial-coverage", "provider", "num_images", "width_ratio", "height_ratio")
+    """The keypoints of a features provider cover only the upper left part of all images, up to the
+    ratios ``width_ratio`` and ``height_ratio`` of the image size."""
+    MEANINGLESS_SCORES = ("meaningless-scores", "provider", "num_pairs")
+    """The match scores of a matcher are not higher for inliers than for outliers."""
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,16 @@ from collections.abc import Sequence
 import numpy as np
 
 from mpsfm_core.data import Bool, Float32
+from mpsfm_core.data.decisions import DoubtReason, Reason
 from mpsfm_core.data.mapping_problem import MappingImage
 
 _MIN_IMAGES = 3
 _MIN_KEYPOINTS = 50
 _MAX_EXTENT = 0.8
-"""Maximum right and lower end of all keypoints, relative to image size, that causes a warning."""
+"""Maximum right and lower end of all keypoints, relative to image size, that causes a doubt."""
 _MAX_MARGIN = 0.1
-"""Maximum left and upper margin of the keypoints, relative to image size, that causes a warning.
-An object in the image center has a larger margin, and therefore causes no warning."""
+"""Maximum left and upper margin of the keypoints, relative to image size, that causes a doubt.
+An object in the image center has a larger margin, and therefore causes no doubt."""
 _MIN_PAIRS = 3
 _MIN_MATCHES = 30
 """Minimum number of inliers and of outliers of a pair whose scores are compared."""
@@ -23,18 +24,18 @@ _CHANCE_AUC = 0.5
 """Probability that an inlier has a higher score than an outlier if scores mean nothing."""
 
 
-def find_partial_coverage(images: Sequence[MappingImage], provider: str) -> str:
-    """Describe keypoints that cover only the upper left part of every image.
+def find_partial_coverage(images: Sequence[MappingImage], provider: str) -> Reason | None:
+    """Find out whether keypoints cover only the upper left part of every image.
 
     A wrong provider returns keypoints in pixels of a reduced or cropped image, or only of the first
     tile of an image. Keypoints in wrong pixels give wrong poses of all images.
 
     Args:
         images: Images with their keypoints.
-        provider: Name of the features provider, for the text.
+        provider: Name of the features provider.
 
     Returns:
-        Warning for the user, or an empty text.
+        Reason (``DoubtReason``) to doubt the run, or None.
     """
     extents = [
         np.stack([image.keypoints.min(axis=0), image.keypoints.max(axis=0)]) / image.camera.size
@@ -42,31 +43,32 @@ def find_partial_coverage(images: Sequence[MappingImage], provider: str) -> str:
         if len(image.keypoints) >= _MIN_KEYPOINTS
     ]
     if len(extents) < _MIN_IMAGES:
-        return ""
+        return None
     first, last = np.min(extents, axis=0)[0], np.max(extents, axis=0)[1]
     if first.max() > _MAX_MARGIN or last.max() > _MAX_EXTENT:
-        return ""
-    return (
-        f"the features provider {provider!r} finds keypoints only in the upper left "
-        f"{last[0]:.0%} x {last[1]:.0%} of all {len(extents)} images: keypoints may be in pixels "
-        f"of a reduced image; test the provider with 'mpsfm plugins check {provider}'"
+        return None
+    return DoubtReason.PARTIAL_COVERAGE.because(
+        provider=provider,
+        num_images=len(extents),
+        width_ratio=round(float(last[0]), 3),
+        height_ratio=round(float(last[1]), 3),
     )
 
 
-def find_meaningless_scores(pairs: Sequence[tuple[Float32, Bool]], provider: str) -> str:
-    """Describe scores of matches that are not higher for inliers than for outliers.
+def find_meaningless_scores(pairs: Sequence[tuple[Float32, Bool]], provider: str) -> Reason | None:
+    """Find out whether the scores of matches are not higher for inliers than for outliers.
 
     Best scores select matches of a keypoint and points of dense matches, so inverted scores select
     outliers. The criterion is the median over pairs of the area under the ROC curve. Equal scores
-    of all matches cause no warning.
+    of all matches cause no doubt.
 
     Args:
         pairs: Scores (m,) float32 of the matches of each verified pair, and mask (m,) bool of the
             inliers.
-        provider: Name of the matcher, for the text.
+        provider: Name of the matcher.
 
     Returns:
-        Warning for the user, or an empty text.
+        Reason (``DoubtReason``) to doubt the run, or None.
     """
     areas = [
         _roc_area(scores[inlier], scores[~inlier])
@@ -74,12 +76,8 @@ def find_meaningless_scores(pairs: Sequence[tuple[Float32, Bool]], provider: str
         if min(inlier.sum(), (~inlier).sum()) >= _MIN_MATCHES and np.ptp(scores) > 0
     ]
     if len(areas) < _MIN_PAIRS or np.median(areas) > _CHANCE_AUC:
-        return ""
-    return (
-        f"the scores of the matcher {provider!r} are not higher for inliers than for outliers in "
-        f"{len(areas)} image pairs: scores may be inverted or random; test the matcher with "
-        f"'mpsfm plugins check {provider}'"
-    )
+        return None
+    return DoubtReason.MEANINGLESS_SCORES.because(provider=provider, num_pairs=len(areas))
 
 
 def _roc_area(inliers: Float32, outliers: Float32) -> float:

@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from mpsfm_core.config import Config
 from mpsfm_core.data import Features, MappingImage, MappingProblem, SparseMatches, VerifiedPair
+from mpsfm_core.data.decisions import Reason
 from mpsfm_core.extraction.active_provider import thread_count
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.events import ExtractionEvents, NullExtractionEvents
@@ -61,8 +62,8 @@ class Extraction:
     """Input of the mapper, with the images in the order of the image set."""
     report: ExtractionReport
     """Outcomes of image pairs, statistics of images and usage of providers for ``summary.json``."""
-    warnings: tuple[str, ...] = ()
-    """Warnings about providers whose output is wrong for all images or pairs."""
+    doubts: tuple[Reason, ...] = ()
+    """Reasons (``DoubtReason``) to doubt the output of a provider for all images or pairs."""
 
 
 def extract(
@@ -172,17 +173,17 @@ def _extract(context: ExtractionContext, imported: ImportedMatches | None) -> Ex
         graph = verify_imported(context, imported)
     priors = predict_priors(context, graph)
     problem = assemble_problem(context.images, graph, priors)
-    warnings = () if imported is not None else _find_wrong_providers(context.config, graph, problem)
-    return Extraction(problem, describe(context, problem, graph), warnings)
+    doubts = () if imported is not None else _find_wrong_providers(context.config, graph, problem)
+    return Extraction(problem, describe(context, problem, graph), doubts)
 
 
 def _find_wrong_providers(
     config: Config, graph: MatchGraph, problem: MappingProblem
-) -> tuple[str, ...]:
-    """Return warnings about a features provider or matcher that is wrong for all images."""
-    warnings = []
+) -> tuple[Reason, ...]:
+    """Return reasons to doubt a features provider or matcher that is wrong for all images."""
+    doubts = []
     if config.features is not None:
-        warnings.append(find_partial_coverage(problem.images, config.features.use))
+        doubts.append(find_partial_coverage(problem.images, config.features.use))
     pairs = []
     for matches, geometry in zip(graph.candidates, graph.geometries, strict=True):
         if not geometry.dropped:
@@ -192,8 +193,8 @@ def _find_wrong_providers(
             pairs.append((scores, inlier))
     matcher = config.matcher or config.dense_matcher
     if matcher is not None:
-        warnings.append(find_meaningless_scores(pairs, matcher.use))
-    return tuple(warning for warning in warnings if warning)
+        doubts.append(find_meaningless_scores(pairs, matcher.use))
+    return tuple(doubt for doubt in doubts if doubt is not None)
 
 
 def feature_table(context: ExtractionContext) -> FeatureTable | None:

@@ -53,6 +53,7 @@ from mpsfm_core.providers.provider_config import FROM_MATCHER
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.report.page import write_report
+from mpsfm_core.report.reasons import explain
 from mpsfm_core.results.georeference import georeference
 from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.refined_views import (
@@ -270,6 +271,7 @@ class _Run:
         self._known_poses: dict[str, Pose] = {}
         self._georeference_report: dict[str, object] | None = None
         self._dense_reports: list[dict[str, Any]] | None = None
+        self._doubts: tuple[Reason, ...] = ()
         self._estimate = resources.ResourceEstimate(0, 0, 0)
         self._children = ChildMemoryMonitor()
         self._checkpoints: list[MappingCheckpoints | DenseCheckpoints] = []
@@ -389,8 +391,10 @@ class _Run:
             images = estimate_focal_lengths(images, self._config, self._registry, self._stages)
             config = self._config.fast_pass_config() or self._config
             extraction = extract(images, config, self._registry, self._stages, self._imported)
-            for warning in extraction.warnings:
-                self._stages.warn(warning)
+            self._doubts = extraction.doubts
+            for doubt in extraction.doubts:
+                explanation = explain(doubt)
+                self._stages.warn(f"{explanation.text} {explanation.remedy}")
         return images, extraction
 
     def _start_compilation(self) -> None:
@@ -595,6 +599,7 @@ class _Run:
             "format_version": SUMMARY_FORMAT,
             "status": status,
             "warnings": list(stages.warnings),
+            "doubts": [doubt.to_json() for doubt in self._doubts],
             "stages": {
                 name: {"seconds": record.seconds, "peak_memory_mb": record.peak_memory_mb}
                 for name, record in stages.report().items()

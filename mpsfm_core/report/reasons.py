@@ -258,6 +258,19 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "Zoomed or cropped photos cause such errors, and so does little parallax.",
         "Use photos as they come from the camera, or give the true camera with --intrinsics.",
     ),
+    DoubtReason.PARTIAL_COVERAGE: (
+        "keypoints in a part of the photos only",
+        "The features provider {provider} finds keypoints only in the upper left "
+        "{width_ratio:.0%} x {height_ratio:.0%} of all {num_images} photos: keypoints may be in "
+        "pixels of a reduced photo.",
+        "Test the provider with mpsfm plugins check {provider}.",
+    ),
+    DoubtReason.MEANINGLESS_SCORES: (
+        "meaningless match scores",
+        "The scores of the matcher {provider} are not higher for inliers than for outliers in "
+        "{num_pairs} pairs of photos: scores may be inverted or random.",
+        "Test the matcher with mpsfm plugins check {provider}.",
+    ),
     CameraReason.KNOWN: ("known focal length", "The focal length is given.", _NO_REMEDY),
     CameraReason.NOT_ESTIMATED: (
         "focal length not estimated",
@@ -318,7 +331,7 @@ def explain(reason: Reason) -> Explanation:
     """Render a reason as title, text and remedy for users."""
     title, text, remedy = _TEMPLATES[reason.code]
     values = {name: _readable(value) for name, value in reason.values.items()}
-    return Explanation(title, text.format(**values), remedy)
+    return Explanation(title, text.format(**values), remedy.format(**values))
 
 
 def explain_image(stored: Mapping[str, Any]) -> Explanation:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from mpsfm_core.data.decisions import DoubtReason, GpsReason, Reason
+from mpsfm_core.data.decisions import DoubtReason, GpsReason, Reason, reason_from_json
 
 Level = Literal["good", "doubtful", "partial", "failed"]
 
@@ -81,7 +81,9 @@ def judge(summary: Mapping[str, Any]) -> Verdict:
 
 
 def find_doubts(summary: Mapping[str, Any]) -> Iterator[Doubt]:
-    """Yield the reasons to doubt the first model of a run."""
+    """Yield the reasons to doubt the providers and the first model of a run."""
+    for stored in summary.get("doubts", ()):
+        yield Doubt(reason_from_json(DoubtReason, stored))
     yield from _unexplained_pairs(summary["pairs"]["all"])
     for reconstruction in summary["reconstructions"][:1]:
         yield from _weak_evidence(reconstruction["evidence"])

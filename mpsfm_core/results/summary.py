@@ -119,6 +119,8 @@ class RunSummary(TypedDict):
     status: str
     """``success`` or ``failed``."""
     warnings: list[str]
+    doubts: list[dict[str, Value]]
+    """Reasons (``DoubtReason``) to doubt the output of a provider for all images or pairs."""
     stages: dict[str, StageSummary]
     providers: list[ProviderSummary]
     config: dict[str, Any]

@@ -1,4 +1,4 @@
-"""Tests of the warnings about providers that are wrong for every image of a run."""
+"""Tests of the doubts about providers that are wrong for every image of a run."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pytest
 from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera
 from mpsfm_core.data.mapping_problem import MappingImage
 from mpsfm_core.extraction.output_checks import find_meaningless_scores, find_partial_coverage
+from mpsfm_core.report.reasons import explain
 
 CAMERA = PinholeCamera(2000, 1500, 1600.0, 1600.0, 1000.0, 750.0)
 
@@ -29,9 +30,11 @@ def images_with_keypoints(
 
 
 def test_find_partial_coverage_of_reduced_image_names_provider() -> None:
-    warning = find_partial_coverage(images_with_keypoints((0, 0), (0.32, 0.32)), "my-features")
-    assert "'my-features' finds keypoints only in the upper left 32% x 32% of all 4" in warning
-    assert "mpsfm plugins check my-features" in warning
+    doubt = find_partial_coverage(images_with_keypoints((0, 0), (0.32, 0.32)), "my-features")
+    assert doubt is not None
+    explained = explain(doubt)
+    assert "my-features finds keypoints only in the upper left 32% x 32% of all 4" in explained.text
+    assert "mpsfm plugins check my-features" in explained.remedy
 
 
 @pytest.mark.parametrize(
@@ -46,7 +49,7 @@ def test_find_partial_coverage_of_reduced_image_names_provider() -> None:
 def test_find_partial_coverage_of_usual_images_is_silent(
     low: tuple[float, float], high: tuple[float, float], count: int
 ) -> None:
-    assert find_partial_coverage(images_with_keypoints(low, high, count), "sift") == ""
+    assert find_partial_coverage(images_with_keypoints(low, high, count), "sift") is None
 
 
 def scored_pairs(shift: float, count: int = 4) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -60,9 +63,12 @@ def scored_pairs(shift: float, count: int = 4) -> list[tuple[np.ndarray, np.ndar
 
 
 def test_find_meaningless_scores_of_inverted_scores_names_matcher() -> None:
-    warning = find_meaningless_scores(scored_pairs(-0.2), "my-matcher")
-    assert "the scores of the matcher 'my-matcher' are not higher for inliers" in warning
-    assert "in 4 image pairs" in warning and "mpsfm plugins check my-matcher" in warning
+    doubt = find_meaningless_scores(scored_pairs(-0.2), "my-matcher")
+    assert doubt is not None
+    explained = explain(doubt)
+    assert "scores of the matcher my-matcher are not higher for inliers" in explained.text
+    assert "in 4 pairs" in explained.text
+    assert "mpsfm plugins check my-matcher" in explained.remedy
 
 
 @pytest.mark.parametrize(
@@ -76,4 +82,4 @@ def test_find_meaningless_scores_of_inverted_scores_names_matcher() -> None:
     ids=["good", "two pairs", "constant", "few outliers"],
 )
 def test_find_meaningless_scores_of_usual_scores_is_silent(pairs: list) -> None:
-    assert find_meaningless_scores(pairs, "nearest") == ""
+    assert find_meaningless_scores(pairs, "nearest") is None

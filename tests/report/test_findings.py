@@ -240,6 +240,14 @@ def test_verdict_without_doubt_is_good_or_partial() -> None:
     assert judge(report).level == "partial"
 
 
+def test_verdict_doubts_wrong_providers() -> None:
+    doubt = DoubtReason.MEANINGLESS_SCORES.because(provider="mine", num_pairs=7)
+    report = summary(doubts=[doubt.to_json()])
+    assert judge(report).level == "doubtful" and doubts(report) == [doubt.code]
+    (finding,) = findings(report)
+    assert "matcher mine" in finding.text and "plugins check mine" in finding.remedy
+
+
 def test_verdict_doubts_pairs_that_share_no_points() -> None:
     report = summary()
     for pair in report["pairs"]["all"][:2]:
