@@ -102,7 +102,11 @@ class SparseMatches:
             raise DataError("indices", "feature indices must not be negative")
         for column in self.indices.T:
             if len(np.unique(column)) != len(column):
-                raise DataError("indices", "matches must use each feature at most once")
+                raise DataError(
+                    "indices",
+                    "matches must use each feature at most once; SparseMatches.from_best_scores "
+                    "keeps the best match of each feature",
+                )
 
     @classmethod
     def from_arrays(cls, indices: NDArray[Any], scores: NDArray[Any]) -> SparseMatches:

@@ -18,7 +18,9 @@ class SiftOptions(Options):
     """
 
     max_keypoints: int = Field(8192, gt=0)
-    """Largest number of keypoints per image; keypoints with the largest scale remain [COLMAP]."""
+    """Approximate number of keypoints per image. COLMAP keeps whole levels of scale space, the
+    largest scales first, and one keypoint for each orientation, so that the number may be higher
+    [COLMAP]."""
     resize: int | None = Field(3200, ge=32)
     """Longer side in pixels to which a larger image is downsampled for keypoint detection; null
     keeps the image size."""

@@ -28,13 +28,13 @@ class DepthCalibration(Options):
     """Uncertainty model of depth priors, which calibrates their standard deviation.
 
     The calibrated depth std is ``max(std_scale * network_std, relative_std * depth, std_floor)``.
-    The default values are those of Metric3D v2 giant2 in the reference implementation. Plugins
-    declare the values of the uncertainty model for other networks. The calibrated variance
-    describes the depth errors that remain after the mapper has estimated a scale for the depth map
-    of each image.
+    By default the std of the network is not scaled, and the smallest relative std is that of
+    Metric3D v2 giant2. Plugins declare the values of the uncertainty model for their networks. The
+    calibrated variance describes the depth errors that remain after the mapper has estimated a
+    scale for the depth map of each image.
     """
 
-    std_scale: float = Field(3.33, gt=0)
+    std_scale: float = Field(1.0, gt=0)
     """Factor of the network's depth std [reference prior_std_multiplier]. Raising the factor lowers
     the weight of the depth prior."""
     relative_std: float = Field(0.0263, ge=0)

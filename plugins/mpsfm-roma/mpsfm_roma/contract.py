@@ -60,10 +60,7 @@ def sparse(folder: Path) -> ContractSetup:
     return ContractSetup(
         options={**_stand_in(folder), "snap_px": 3.0, "min_certainty": 0.5},
         truth_source="image",
-        expected_failures={
-            "matcher-sizes": "comparing patches is not invariant to scale",
-            "matcher-many-features": "patches of small images do not distinguish 4096 features",
-        },
+        expected_failures={"matcher-sizes": "comparing patches is not invariant to scale"},
     )
 
 

@@ -12,9 +12,6 @@ _STAND_IN = "mpsfm_vismatch.stand_in"
 _SMALL = {"network": f"{_STAND_IN}:Matching", "resize": 96}
 """Options of a matcher with small images, where comparing all pixels is fast."""
 _NOT_INVARIANT = {"matcher-sizes": "comparing patches is not invariant to scale"}
-_SMALL_IMAGES = {
-    "matcher-many-features": "patches of images with few pixels do not distinguish 4096 features"
-}
 
 
 def vismatch(folder: Path) -> ContractSetup:
@@ -30,7 +27,7 @@ def vismatch_sparse(folder: Path) -> ContractSetup:
     return ContractSetup(
         options={**options, "snap_px": 3.0},
         truth_source="image",
-        expected_failures={} if find_spec("vismatch") else {**_NOT_INVARIANT, **_SMALL_IMAGES},
+        expected_failures={} if find_spec("vismatch") else _NOT_INVARIANT,
     )
 
 
@@ -45,7 +42,7 @@ def vismatch_roma_sparse(folder: Path) -> ContractSetup:
     return ContractSetup(
         options={"network": f"{_STAND_IN}:Warping", "snap_px": 3.0, "min_certainty": 0.5},
         truth_source="image",
-        expected_failures={**_NOT_INVARIANT, **_SMALL_IMAGES},
+        expected_failures=_NOT_INVARIANT,
     )
 
 
