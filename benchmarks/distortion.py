@@ -85,7 +85,7 @@ def main() -> None:
 def list_photo_sets(
     source: Path, arguments: argparse.Namespace
 ) -> dict[str, list[tuple[str, ...]]]:
-    """Return the image names of the photo sets of a scene, by label of the table row.
+    """Select the photo sets of a scene; return the image names of each set by its row label.
 
     Args:
         source: Scene folder.

@@ -1,4 +1,4 @@
-"""Localization of left-out photos, compared with the recipe of hloc on the same matches.
+"""Localize photos in a model that does not contain them, and compare with hloc's pipeline.
 
     python -m benchmarks.localize [SCENE ...] [--draws 5] [--config sift] [--records DIR]
 
@@ -44,7 +44,7 @@ OTHER_PLACE = {
 NUM_QUERIES = 6
 NUM_NEGATIVES = 2
 THRESHOLDS = ((0.05, 1.0), (0.25, 2.0), (0.5, 5.0))
-"""Errors of position in meters and rotation in degrees up to which an image is localized."""
+"""Maximum position errors in meters and rotation errors in degrees of localized images."""
 Record = dict[str, Any]
 
 
@@ -67,7 +67,7 @@ def main() -> None:
 
 
 def load_or_run(scene: str, size: int, draw: int, config: str, folder: Path) -> list[Record]:
-    """Return the records of a draw, from a file if an earlier call computed them."""
+    """Localize the photos of one random draw, or read the errors that an earlier call stored."""
     path = folder / f"{scene}-{size}-{draw}-{config}.json"
     if not path.is_file():
         records = list(run_draw(scene, size, draw, config))
@@ -271,7 +271,7 @@ def _median(records: Sequence[Record]) -> str:
 
 
 def _count_false(records: Sequence[Record]) -> str:
-    """Return how many photos of another place have a pose."""
+    """Return how many of the photos of another scene were localized, which is wrong."""
     other = [record["found"] for record in records if record["is_other"]]
     return f"{sum(other)} of {len(other)}"
 

@@ -21,11 +21,12 @@ class CalibrationStd(NamedTuple):
     """Prior standard deviations of the intrinsics of a guessed camera."""
 
     log_focal: float
-    """Of the log focal length, which is estimated together with the pose."""
+    """Standard deviation of the log focal length, which is estimated together with the pose."""
     center_px: float
-    """Of both coordinates of the principal point in pixels, which is not estimated."""
+    """Standard deviation of each coordinate of the principal point, in pixels. The principal point
+    is not estimated."""
     radial: float
-    """Of the distortion coefficient of SIMPLE_RADIAL, which is not estimated."""
+    """Standard deviation of the coefficient k of SIMPLE_RADIAL, which is not estimated."""
 
 
 def compute_point_covariances(

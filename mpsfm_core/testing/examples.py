@@ -177,7 +177,7 @@ class Example:
 
     @property
     def _content(self) -> _Content:
-        """Hashable values that determine the image and the ground truth."""
+        """Fields that determine the rendered image and its ground truth, as keys of the caches."""
         parts = self.scene, self.camera, self.pose.tobytes(), self.look, self.mirrored, self.holes
         return _Content(*parts)
 
@@ -194,7 +194,7 @@ class _Content(NamedTuple):
 
     @property
     def pose(self) -> Float64:
-        """Pose ``cam_from_world`` (3, 4)."""
+        """Pose ``cam_from_world`` of the rendered view, (3, 4) float64."""
         return np.frombuffer(self.pose_data).reshape(3, 4)
 
     @property
@@ -234,7 +234,7 @@ def _render(content: _Content) -> UInt8:
 def _compute_truth(
     content: _Content, rows: int, columns: int, offset_px: tuple[float, float], step: int
 ) -> TrueMaps:
-    """Compute the ground truth of a synthetic view on a grid, see :meth:`Example.truth`."""
+    """Compute the true depth, normals and mask of a synthetic view at the pixels of a grid."""
     camera = content.camera
     offset = (-offset_px[0] if content.mirrored else offset_px[0], offset_px[1])
     xy = pixel_centers(columns, rows) * (camera.width / columns, camera.height / rows) + offset

@@ -195,7 +195,7 @@ class FocalRatio(PaintedDepth):
 
 
 class FocalOfCamera(PaintedDepth):
-    """Fault: the estimate repeats the focal length of the camera, which is a guess."""
+    """Fault: ``estimate_focal`` returns the guessed focal length of the given camera."""
 
     def estimate_focal(self, view: View) -> float:
         return view.camera.fx

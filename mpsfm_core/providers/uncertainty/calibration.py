@@ -35,8 +35,8 @@ class DepthCalibration(Options):
     """
 
     std_scale: float = Field(1.0, gt=0)
-    """Factor of the network's depth std [reference prior_std_multiplier]. Raising the factor lowers
-    the weight of the depth prior."""
+    """Factor of the network's depth std (``prior_std_multiplier`` of the reference implementation).
+    A larger factor lowers the weight of the depth prior."""
     relative_std: float = Field(0.0263, ge=0)
     """Smallest depth std divided by depth [reference depth_uncertainty]."""
     std_floor: float = Field(0.02, ge=0)
