@@ -47,7 +47,7 @@ from mpsfm_core.extraction.features import FeatureSet, FeatureSource, FeatureTab
 from mpsfm_core.extraction.match_graph import MatchGraph, NamePair, Priors
 from mpsfm_core.inputs import images as image_inputs
 from mpsfm_core.inputs.images import ImageSet
-from mpsfm_core.inputs.intrinsics import Cameras
+from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.models import read_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
 from mpsfm_core.mapping import mapper
@@ -110,8 +110,7 @@ def load_images(
         >>> images = mpsfm.load_images({"a": rgb_a, "b": rgb_b}, cameras=camera)
     """
     config, registry = configure(config, registry, overrides)
-    if cameras is not None and intrinsics is not None:
-        raise TypeError("give cameras or the file intrinsics, not both")
+    given = choose_cameras(cameras, intrinsics)
     if isinstance(images, Mapping):
         if intrinsics is not None or image_list is not None:
             raise TypeError("arrays have cameras, not intrinsics or image_list")
@@ -123,7 +122,6 @@ def load_images(
         with stages.stage("video"):
             progress = partial(stages.stage_progress, "video")
             folder = extract_frames(folder, Path(output), config.inputs.video, progress)
-    given = cameras if intrinsics is None else Path(intrinsics)
     names_file = None if image_list is None else Path(image_list)
     with stages.stage("inputs"):
         return image_inputs.load_images(folder, given, names_file, config.inputs)

@@ -150,7 +150,6 @@ def densify(
         pixels.
     """
     images = reconstruction.dense_images
-    image_rows = [reconstruction.images.index(image) for image in images]
     steps = _DensifySteps(images, view_of, options, checkpoints, store_array, poses_use_depth)
     rows = [row for row, views in enumerate(steps.sources) if views]
     with ThreadPoolExecutor(workers or thread_limit()) as pool:
@@ -161,16 +160,17 @@ def densify(
         steps.consistency.update({row: result for row, (result, _) in checks.items()})
         constraints = {row: known for row, (_, known) in checks.items() if known}
         steps.scale_stds.update(estimate_scale_stds(constraints))
-        dense_images, measured_masks = list(reconstruction.images), {}
-        for row, (dense_image, mask) in zip(rows, pool.map(steps.fuse_image, rows), strict=True):
-            dense_images[image_rows[row]], measured_masks[dense_image.name] = dense_image, mask
+        dense_images, measured_masks = {}, {}
+        for dense_image, mask in pool.map(steps.fuse_image, rows):
+            dense_images[dense_image.name], measured_masks[dense_image.name] = dense_image, mask
     names = [image.name for image in images]
     report = DenseReport(
         {names[row]: [names[view] for view in views] for row, views in enumerate(steps.sources)},
         {name: _confirmed_ratio(steps.consistency.get(row)) for row, name in enumerate(names)},
         measured_masks,
     )
-    return replace(reconstruction, images=tuple(dense_images)), report
+    all_images = (dense_images.get(image.name, image) for image in reconstruction.images)
+    return replace(reconstruction, images=tuple(all_images)), report
 
 
 class _DensifySteps:

@@ -20,7 +20,7 @@ from mpsfm_core.geometry import resize_map
 from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.exports.source import ExportSource
-from mpsfm_core.results.ply import read_ply, read_triangles
+from mpsfm_core.results.ply import read_mesh
 
 _MAX_SIZE = 640
 """Maximum length of the longer side of rendered images in pixels, as of depth maps."""
@@ -59,7 +59,7 @@ def evaluate_held_out(
             or scikit-image is not installed.
     """
     source = ExportSource.read(model, photos)
-    recorded = list(source.summary.get("images", {}).get("held_out", ()))
+    recorded = source.held_out
     names = _select_names(source, recorded, names)
     files = [geometry] if geometry else [model / DENSE, model / MESH[0]]
     files = [path for path in files if path == geometry or path.is_file()]
@@ -85,10 +85,10 @@ def read_geometry(path: Path) -> Geometry:
     Raises:
         InputError: The file is not a PLY file, is damaged or has no points.
     """
-    points, colors = read_ply(path)
-    if not len(points):
+    geometry = Geometry(*read_mesh(path))
+    if not len(geometry.points):
         raise InputError(f"{path}: the file has no points to render")
-    return Geometry(points, colors, read_triangles(path))
+    return geometry
 
 
 def compare_rendering(

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, Pose, UInt8
 from mpsfm_core.geometry import transform
-from mpsfm_core.support.jit import kernel
+from mpsfm_core.support.jit import helper, kernel
 
 _NUM_NEIGHBORS = 4
 """Number of nearest neighbors of a point whose distance gives the radius of its splat."""
@@ -88,6 +88,14 @@ def render(
     return Rendering(colors, depth)
 
 
+@helper()
+def _covered_range(low: float, high: float, size: int) -> tuple[int, int]:
+    """Return the first and the end of the pixels whose centers are in an interval."""
+    first = math.ceil(min(max(low - 0.5, 0.0), float(size)))
+    end = math.floor(max(min(high - 0.5, size - 1.0), -1.0)) + 1
+    return first, end
+
+
 @kernel()
 def _fill_triangles(
     points: Float64,
@@ -120,14 +128,11 @@ def _fill_triangles(
         area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
         if area == 0:
             continue
-        # A pixel is inside if its center (column + 0.5, row + 0.5) is inside.
-        left = max(0, math.ceil(min(xa, xb, xc) - 0.5))
-        right = min(width - 1, math.floor(max(xa, xb, xc) - 0.5))
-        top = max(0, math.ceil(min(ya, yb, yc) - 0.5))
-        bottom = min(height - 1, math.floor(max(ya, yb, yc) - 0.5))
-        for i in range(top, bottom + 1):
+        left, right = _covered_range(min(xa, xb, xc), max(xa, xb, xc), width)
+        top, bottom = _covered_range(min(ya, yb, yc), max(ya, yb, yc), height)
+        for i in range(top, bottom):
             y = i + 0.5
-            for j in range(left, right + 1):
+            for j in range(left, right):
                 x = j + 0.5
                 wa = ((xb - x) * (yc - y) - (xc - x) * (yb - y)) / area
                 wb = ((xc - x) * (ya - y) - (xa - x) * (yc - y)) / area
@@ -177,12 +182,10 @@ def _splat_points(
             x, y = fx * points[n, 0] / z + cx, fy * points[n, 1] / z + cy
             # A square covers at least the pixel that contains the point.
             rx, ry = max(0.5, fx * radii[n] / z), max(0.5, fy * radii[n] / z)
-            if x + rx < 0 or y + ry < 0 or x - rx > width or y - ry > height:
-                continue
-            top, bottom = math.ceil(y - ry - 0.5), math.floor(y + ry - 0.5)
-            left, right = math.ceil(x - rx - 0.5), math.floor(x + rx - 0.5)
-            for i in range(max(0, top), min(height - 1, bottom) + 1):
-                for j in range(max(0, left), min(width - 1, right) + 1):
+            left, right = _covered_range(x - rx, x + rx, width)
+            top, bottom = _covered_range(y - ry, y + ry, height)
+            for i in range(top, bottom):
+                for j in range(left, right):
                     if not blends:
                         depth[i, j] = min(depth[i, j], np.float32(z))
                     elif z - radii[n] <= depth[i, j]:

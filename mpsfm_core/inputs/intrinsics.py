@@ -45,6 +45,17 @@ _SAME_SCALE = 0.1
 camera is for an image of another size."""
 
 
+def choose_cameras(cameras: Cameras | None, intrinsics: str | Path | None) -> Path | Cameras | None:
+    """Return the cameras or the file with the cameras, of which the caller gives at most one.
+
+    Raises:
+        TypeError: both are given.
+    """
+    if cameras is not None and intrinsics is not None:
+        raise TypeError("give cameras or the file intrinsics, not both")
+    return cameras if intrinsics is None else Path(intrinsics)
+
+
 @dataclass(frozen=True)
 class CameraEntry:
     """One camera of an intrinsics file."""

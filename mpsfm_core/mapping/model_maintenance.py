@@ -10,11 +10,7 @@ import numpy as np
 from mpsfm_core.data import Bool, Int64, MappingProblem
 from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.geometry import rotation_angle_deg
-from mpsfm_core.mapping.consistency.depth_consistency import (
-    DepthConsistencyCheck,
-    DepthViolation,
-    find_overlapping_images,
-)
+from mpsfm_core.mapping.consistency.depth_consistency import DepthConsistencyCheck
 from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.depth_noise import DepthNoise
@@ -189,27 +185,15 @@ class ModelMaintenance:
             return None
         limit = self.thresholds.tighten_violations(max_violations)
         with self.event_log.timed("depth check"):
-            violation = self._find_violation(image, limit)
+            violation = self._depth_check.check_image(
+                image, self.refiner.std_factor, limit, self._wrong_depth
+            )
         if violation.ratio <= limit:
             return None
         self.history.record_contradiction(violation.other_image, image)
         other = self.problem.images[violation.other_image].name
         ratio = round(float(violation.ratio), 4)
         return ImageReason.CONTRADICTS_IMAGE.because(violation_ratio=ratio, other_image=other)
-
-    def _find_violation(self, image: int, limit: float) -> DepthViolation:
-        """Return the largest violation ratio of an image and overlapping images of right depth."""
-        std_factor = self.refiner.std_factor
-        if not self._wrong_depth:
-            return self._depth_check.check_image(image, std_factor, limit)
-        others = find_overlapping_images(self.scene, image, self.options.consistency.num_views)
-        measure = self._depth_check.measure_violation_ratio
-        violations = [
-            DepthViolation(measure(image, other, std_factor, limit), other)
-            for other in others
-            if other not in self._wrong_depth
-        ]
-        return max(violations, default=DepthViolation(0.0, -1))
 
     def find_wrong_depth(self) -> list[int]:
         """Find registered images with exact poses whose depth contradicts other such images."""

@@ -138,14 +138,14 @@ def predict_calibration_errors(
         _prior_stds(problem, columns, known, longer_sides, deviation_stds)
         for deviation_stds in (LENS_DEVIATIONS, EDIT_DEVIATIONS)
     )
-    mixed_stds = lens_stds
+    if not extended:  # The solution is the minimum for known intrinsics.
+        equations = equations._replace(gradient=np.zeros(columns.point))
+    step, covariance = pose_step, pose_covariance = _compute_posterior(
+        equations, lens_stds, offsets
+    )
     if extended:
         mixed_stds = _mix_prior_stds(equations, offsets, lens_stds, edit_stds, columns)
-    else:
-        # The solution is the minimum for known intrinsics.
-        equations = equations._replace(gradient=np.zeros(columns.point))
-    pose_step, pose_covariance = _compute_posterior(equations, mixed_stds, offsets)
-    step, covariance = _compute_posterior(equations, lens_stds, offsets)
+        pose_step, pose_covariance = _compute_posterior(equations, mixed_stds, offsets)
     focal = columns.focal + np.asarray(problem.camera_of_image)
     deviation = columns.focal_deviation + np.arange(num_images)
     log_focal = step[focal] ** 2 + covariance[focal, focal]

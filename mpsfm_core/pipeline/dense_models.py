@@ -163,11 +163,9 @@ def mesh_model(
         source = ExportSource.read(Path(folder), None if photos is None else Path(photos))
         poses = reconstruction_poses(source.model)
         files = [source.folder / DEPTH / f"{name}.npz" for name in source.names]
-        depths = [read_depth_map(file)[1] if file.is_file() else None for file in files]
-        held_out = source.summary.get("images", {}).get("held_out", ())
         depths = [
-            None if name in held_out else depth
-            for name, depth in zip(source.names, depths, strict=True)
+            read_depth_map(file)[1] if file.is_file() and name not in source.held_out else None
+            for name, file in zip(source.names, files, strict=True)
         ]
         posed = _reconstruction_of_maps(
             source.images, [poses[name] for name in source.names], depths

@@ -31,8 +31,8 @@ from mpsfm_core.extraction.runner import (
 )
 from mpsfm_core.inputs.image_search import check_output_folder, find_images
 from mpsfm_core.inputs.images import ImageSet, SourceImage, load_images
-from mpsfm_core.inputs.intrinsics import Cameras
-from mpsfm_core.inputs.models import find_model_folder, match_names, reconstruction_poses
+from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
+from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.mapping.localization import (
     FixedModel,
     LocalizedImage,
@@ -168,8 +168,7 @@ def localize(
         depth=depth,
         normals=normals,
     )
-    if cameras is not None and intrinsics is not None:
-        raise TypeError("give cameras or the file intrinsics, not both")
+    given_cameras = choose_cameras(cameras, intrinsics)
     stages = Stages(registry, on_event)
     folder = None if output is None else Path(output)
     with ExitStack() as stack:
@@ -183,7 +182,7 @@ def localize(
             config = config.model_copy(update={"fast_pass": None})
             config = resolve_providers(config, registry, stages).config
         run = _Localization(source, config, registry, stages)
-        queries = run.load_queries(Path(photos), cameras if intrinsics is None else intrinsics)
+        queries = run.load_queries(Path(photos), given_cameras)
         if extend:
             _require_new_names(source, queries)
         fixed = run.load_model(Path(database) if database else source.folder / DATABASE)
@@ -220,33 +219,18 @@ class _Localization:
     def _load_references(self) -> ImageSet:
         """Load the images of the model, with the cameras of the model."""
         source = self._source
-        if source.photos is None:
-            raise InputError(
-                f"{source.folder}: the folder of the model's images is unknown; give it with "
-                f"--images"
-            )
-        files = match_names(source.names, find_images(source.photos))
-        missing = [name for name in source.names if name not in files]
-        if missing:
-            raise InputError(
-                f"{source.photos}: {len(missing)} images of the model {source.folder} are not in "
-                f"this folder, such as {missing[0]!r}; give their folder with --images"
-            )
-        names = [files[name] for name in source.names]
-        if len(names) < 2:
+        if len(source.names) < 2:
             raise InputError(f"{source.folder}: localization needs a model of two or more images")
-        folder = find_model_folder(source.folder)
-        return load_images(source.photos, folder, options=self._config.inputs, names=names)
+        return source.load_images(self._config.inputs)
 
-    def load_queries(self, photos: Path, cameras: PathLike | Cameras | None) -> ImageSet:
+    def load_queries(self, photos: Path, cameras: Path | Cameras | None) -> ImageSet:
         """Load the photos to localize, with known or estimated focal lengths."""
         folder, names = (photos.parent, [photos.name]) if photos.is_file() else (photos, [])
         names = names or find_images(photos)
         if not names:
             raise InputError(f"{photos}: the folder has no photos to localize")
-        given = Path(cameras) if isinstance(cameras, (str, Path)) else cameras
         with self._stages.stage("inputs"):
-            queries = load_images(folder, given, options=self._config.inputs, names=names)
+            queries = load_images(folder, cameras, options=self._config.inputs, names=names)
         return estimate_focal_lengths(queries, self._config, self._registry, self._stages)
 
     def split(self, queries: ImageSet, *, sequence: bool) -> Iterator[ImageSet]:

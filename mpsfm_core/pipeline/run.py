@@ -27,7 +27,7 @@ from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
 from mpsfm_core.extraction.runner import Extraction, extend_matches, extract
 from mpsfm_core.inputs.image_search import check_output_folder, find_images
 from mpsfm_core.inputs.images import ImageSet, load_images
-from mpsfm_core.inputs.intrinsics import Cameras
+from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.matches import (
     ImportedMatches,
     matches_from_database,
@@ -200,9 +200,7 @@ def reconstruct(
     matches = (database,) if database is not None else hloc or ()
     if matches:
         config = _without_matching(config)
-    if cameras is not None and intrinsics is not None:
-        raise TypeError("give cameras or the file intrinsics, not both")
-    given_cameras = cameras if intrinsics is None else Path(intrinsics)
+    given_cameras = choose_cameras(cameras, intrinsics)
     if isinstance(images, ImageSet) and (given_cameras is not None or image_list is not None):
         raise TypeError("cameras and image_list belong to load_images, which made the images")
     source = _Source(

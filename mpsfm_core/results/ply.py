@@ -96,7 +96,26 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
     Raises:
         InputError: the file is not a PLY file, is cut off, or has points that are not finite.
     """
-    encoding, _, vertex, count, body = _parse_ply(path)
+    return _read_vertices(path, _parse_ply(path))
+
+
+def read_mesh(path: Path) -> tuple[Float64, UInt8, Int64]:
+    """Read the vertices and triangles of a text or binary PLY file.
+
+    Returns:
+        Points (n, 3) float64 and RGB colors (n, 3) uint8 as of :func:`read_ply`, and vertex indices
+        (m, 3) int64 of the triangles, (0, 3) for a point cloud.
+
+    Raises:
+        InputError: as :func:`read_ply`; or the file has faces that are not triangles, or the index
+            of a missing vertex.
+    """
+    file = _parse_ply(path)
+    return *_read_vertices(path, file), _read_triangles(path, file)
+
+
+def _read_vertices(path: Path, file: _PlyFile) -> tuple[Float64, UInt8]:
+    encoding, _, vertex, count, body = file
     if encoding == "ascii":
         vertices = _read_text(path, body, vertex, count)
     elif len(body) < count * vertex.itemsize:
@@ -112,17 +131,8 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
     return points, np.stack([vertices[color] for color in rgb], axis=1).astype(np.uint8)
 
 
-def read_triangles(path: Path) -> Int64:
-    """Read the triangles of a text or binary PLY file.
-
-    Returns:
-        Vertex indices (m, 3) int64 of the triangles, (0, 3) for a point cloud.
-
-    Raises:
-        InputError: the file is not a PLY file, is cut off, has faces that are not triangles, or the
-            index of a missing vertex.
-    """
-    encoding, header, vertex, count, body = _parse_ply(path)
+def _read_triangles(path: Path, file: _PlyFile) -> Int64:
+    encoding, header, vertex, count, body = file
     match [line.split() for line in header if line.startswith(("element", "property list"))]:
         case [["element", "vertex", _]]:
             return np.zeros((0, 3), np.int64)

@@ -13,7 +13,7 @@ from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.geometry import pixel_centers, rays
 from mpsfm_core.results.depth_maps import write_depth_maps
-from mpsfm_core.results.ply import read_triangles, write_ply
+from mpsfm_core.results.ply import read_mesh, write_ply
 
 
 def test_written_ply_is_read_by_pycolmap(tmp_path: Path) -> None:
@@ -32,25 +32,25 @@ def test_triangles_of_other_libraries_are_read(tmp_path: Path, encoding: str) ->
     mesh = trimesh.creation.box()
     mesh.export(tmp_path / "a.ply", encoding=encoding.removesuffix("_little_endian"))
     assert f"format {encoding} 1.0" in (tmp_path / "a.ply").read_bytes().decode("latin-1")
-    np.testing.assert_array_equal(read_triangles(tmp_path / "a.ply"), mesh.faces)
+    np.testing.assert_array_equal(read_mesh(tmp_path / "a.ply")[2], mesh.faces)
 
 
 def test_written_triangles_are_read_and_clouds_have_none(tmp_path: Path) -> None:
     points, colors = np.eye(3), np.zeros((3, 3), np.uint8)
     write_ply(tmp_path / "a.ply", points, colors, triangles=np.array([(0, 1, 2), (2, 1, 0)]))
-    assert read_triangles(tmp_path / "a.ply").tolist() == [[0, 1, 2], [2, 1, 0]]
+    assert read_mesh(tmp_path / "a.ply")[2].tolist() == [[0, 1, 2], [2, 1, 0]]
     write_ply(tmp_path / "b.ply", points, colors)
-    assert read_triangles(tmp_path / "b.ply").shape == (0, 3)
+    assert read_mesh(tmp_path / "b.ply")[2].shape == (0, 3)
 
 
 def test_damaged_triangles_raise(tmp_path: Path) -> None:
     points, colors = np.eye(3), np.zeros((3, 3), np.uint8)
     write_ply(tmp_path / "a.ply", points, colors, triangles=np.array([(0, 1, 3)]))
     with pytest.raises(InputError, match="index of a missing vertex"):
-        read_triangles(tmp_path / "a.ply")
+        read_mesh(tmp_path / "a.ply")
     (tmp_path / "b.ply").write_bytes((tmp_path / "a.ply").read_bytes()[:-2])
     with pytest.raises(InputError, match="is cut off: the header has 1 faces"):
-        read_triangles(tmp_path / "b.ply")
+        read_mesh(tmp_path / "b.ply")
 
 
 def test_empty_ply_has_a_header(tmp_path: Path) -> None:

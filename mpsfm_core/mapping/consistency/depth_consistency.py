@@ -38,7 +38,7 @@ with the wrong pose.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -100,7 +100,11 @@ class DepthConsistencyCheck:
         self._grids: dict[int, tuple[_DepthMapState, _DepthGrid]] = {}
 
     def check_image(
-        self, image: int, std_factor: float = 1.0, limit: float = math.nan
+        self,
+        image: int,
+        std_factor: float = 1.0,
+        limit: float = math.nan,
+        excluded: Collection[int] = (),
     ) -> DepthViolation:
         """Return the largest violation ratio of an image and its most overlapping images.
 
@@ -108,10 +112,12 @@ class DepthConsistencyCheck:
             image: A registered image.
             std_factor: Ratio of the measured and the declared standard deviation of depth.
             limit: See :meth:`measure_violation_ratio`.
+            excluded: Images with wrong depth, which are not compared with the image.
         """
         violations = [
             DepthViolation(self.measure_violation_ratio(image, other, std_factor, limit), other)
             for other in find_overlapping_images(self._scene, image, self._options.num_views)
+            if other not in excluded
         ]
         return max(violations, default=DepthViolation(0.0, -1))
 

@@ -125,6 +125,22 @@ class ExportSource:
         Raises:
             InputError: the original image files are missing.
         """
+        settings = self.summary.get("config", {}).get("inputs", {})
+        return self.load_images(
+            InputOptions(max_image_size=settings.get("max_image_size"), strict=True)
+        )
+
+    @property
+    def held_out(self) -> tuple[str, ...]:
+        """Names of the images that the dense stage ignored, as recorded by the run."""
+        return tuple(self.summary.get("images", {}).get("held_out", ()))
+
+    def load_images(self, options: InputOptions) -> ImageSet:
+        """Load the original images of the registered images, with the cameras of the model.
+
+        Raises:
+            InputError: the original image files are missing.
+        """
         if self.photos is None:
             recorded = self.summary.get("photos", "")
             where = f" (the run read them from {recorded})" if recorded else ""
@@ -138,11 +154,6 @@ class ExportSource:
                 f"{self.photos}: has no photo {missing[0]!r}"
                 + (f" and {len(missing) - 1} more of the model" if len(missing) > 1 else "")
             )
-        settings = self.summary.get("config", {}).get("inputs", {})
-        options = InputOptions(
-            max_image_size=settings.get("max_image_size"),
-            strict=True,
-        )
         names = [files[name] for name in self.names]
         return load_images(
             self.photos, find_model_folder(self.folder), options=options, names=names
