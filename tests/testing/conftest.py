@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -32,11 +33,13 @@ def named() -> Callable[..., set[str]]:
 
 
 @pytest.fixture
-def caught() -> Caught:
+def caught(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Caught:
     """Assert that a check fails for a provider, with a message that matches.
 
-    ``caught("depth", RayLength, "depth-is-z", "length of the ray", setup, "metric")``
+    ``caught("depth", RayLength, "depth-is-z", "length of the ray", setup, "metric")``; files that
+    the provider leaves behind are written to a temporary directory.
     """
+    monkeypatch.chdir(tmp_path)
 
     def catch(
         kind: Kind,
