@@ -281,8 +281,9 @@ class _Run:
 
     @contextmanager
     def environment(self) -> Iterator[None]:
-        """Limit threads, lock the output folder and measure the memory of child processes."""
+        """Limit threads, lock the output folder, record warnings and memory of child processes."""
         with ExitStack() as stack:
+            stack.enter_context(self._stages.recording_logged_warnings())
             stack.enter_context(limit_threads(self._config.runtime.workers))
             if self._output is not None:
                 if isinstance(self._source.images, Path):

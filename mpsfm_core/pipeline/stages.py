@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -44,6 +45,17 @@ class StageRecord:
         return StageRecord(earlier.seconds + self.seconds, max(peaks, default=None))
 
 
+class _WarningRecorder(logging.Handler):
+    """Handler that appends the text of logged warnings to a list."""
+
+    def __init__(self, warnings: list[str]) -> None:
+        super().__init__(logging.WARNING)
+        self._warnings = warnings
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._warnings.append(record.getMessage())
+
+
 class Stages:
     """Receiver of progress events of a run, which forwards events to callback and plugins."""
 
@@ -54,6 +66,16 @@ class Stages:
         self._running: dict[str, float] = {}
         self.warnings: list[str] = []
         """Warnings to the user so far, for ``summary.json``."""
+
+    @contextmanager
+    def recording_logged_warnings(self) -> Iterator[None]:
+        """Append warnings that the package logs in the ``with`` block to :attr:`warnings`."""
+        logger, recorder = logging.getLogger("mpsfm_core"), _WarningRecorder(self.warnings)
+        logger.addHandler(recorder)
+        try:
+            yield
+        finally:
+            logger.removeHandler(recorder)
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:

@@ -302,6 +302,7 @@ def test_poses_without_photo_are_reported(
     )
     assert result.model.num_images() == 3
     assert "2 of its 5 images are not among the photos: 3.png, 4.png" in caplog.text
+    assert any("are not among the photos" in text for text in result.summary["warnings"])
 
 
 @pytest.mark.parametrize(("poses", "found"), [("fixed", False), ("start", True)])
