@@ -21,7 +21,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +44,9 @@ KNOWN_CAMERAS = ", known cameras"
 CONVENTION = CONVENTIONS["paper"]
 MAX_ROTATION_DEG = 2.0
 """Maximum rotation error in degrees of an image whose pose counts as correct. [ours]"""
+MAX_FOCAL_ERROR = 0.15
+"""Relative error above which the table counts a focal length as wrong, and as silent if no doubt of
+the verdict names the image. [ours]"""
 MIN_GPS_POSITIONS = 4
 """Minimum number of GPS positions for an evaluation, because a similarity transform fits any three
 positions well. [ours]"""
@@ -141,18 +144,19 @@ def reconstruct_and_measure(
         overrides: Settings ``KEY=VALUE`` that override our configuration.
         camera_model: Camera model that both programs estimate.
     """
-    start, verdict = time.perf_counter(), ""
+    start, verdict, doubted = time.perf_counter(), "", frozenset[str]()
     if method.startswith("COLMAP"):
         is_shared = method.endswith("one camera")
         models = reconstruct_with_colmap(folder / "images", camera_model, is_shared=is_shared)
     else:
         seed, _, known = method.removeprefix("seed ").partition(",")
         settings = [f"runtime.seed={seed}", f"inputs.camera_model={camera_model.value}"]
-        models, verdict = reconstruct_with_mpsfm(
+        models, verdict, doubted = reconstruct_with_mpsfm(
             folder / "images", config, [*settings, *overrides], folder / "gt" if known else None
         )
         method = f"`{config}` {method}"
-    row = {"set": folder.name, "method": method, **measure(models, folder), "verdict": verdict}
+    measured = measure(models, folder, doubted)
+    row = {"set": folder.name, "method": method, **measured, "verdict": verdict}
     row["seconds"] = time.perf_counter() - start
     print(json.dumps(row), file=sys.stderr, flush=True)
     return row
@@ -160,12 +164,18 @@ def reconstruct_and_measure(
 
 def reconstruct_with_mpsfm(
     images: Path, config: str, overrides: Sequence[str], cameras: Path | None = None
-) -> tuple[list[pycolmap.Reconstruction], str]:
-    """Return the models of ``mpsfm reconstruct IMAGES``, largest first, and the verdict.
+) -> tuple[list[pycolmap.Reconstruction], str, frozenset[str]]:
+    """Return the models of ``mpsfm reconstruct IMAGES``, largest first, with the verdict.
 
-    The returned verdict string includes the names of the reasons for doubt. The list of models is
-    empty if the reconstruction fails. ``cameras`` is the folder of a COLMAP model with the known
-    cameras.
+    Args:
+        images: Folder of the photos.
+        config: Our configuration.
+        overrides: Settings ``KEY=VALUE`` that override our configuration.
+        cameras: Folder of a COLMAP model with the known cameras, or None.
+
+    Returns:
+        The models, none if the reconstruction fails; the verdict with the names of the reasons for
+        doubt; and the names of the images that the doubts concern.
     """
     offline = ["runtime.offline=true", "dense.enabled=false"]
     try:
@@ -174,11 +184,12 @@ def reconstruct_with_mpsfm(
         )
     except MpsfmError as error:
         print(f"{images}: {error}", file=sys.stderr)
-        return [], "failed"
+        return [], "failed", frozenset()
     verdict = judge(result.summary)
     doubts = ", ".join(doubt.reason.code.value for doubt in verdict.doubts)
     text = f"{verdict.level}: {doubts}" if doubts else verdict.level
-    return [result.model, *result.further_models], text
+    doubted = frozenset(name for doubt in verdict.doubts for name in doubt.images)
+    return [result.model, *result.further_models], text, doubted
 
 
 def reconstruct_with_colmap(
@@ -211,12 +222,15 @@ def reconstruct_with_colmap(
         return sorted(models.values(), key=lambda model: -model.num_reg_images())
 
 
-def measure(models: Sequence[pycolmap.Reconstruction], folder: Path) -> dict[str, Any]:
+def measure(
+    models: Sequence[pycolmap.Reconstruction], folder: Path, doubted: Set[str]
+) -> dict[str, Any]:
     """Measure registered images, pose AUC, rotation, focal and distortion errors, GPS residual.
 
     Args:
         models: Models of one photo set, largest first; only the largest model is evaluated.
         folder: Folder of the photo set.
+        doubted: Names of the images that the doubts of the verdict concern.
     """
     names = sorted(path.name for path in (folder / "images").iterdir())
     row: dict[str, Any] = {
@@ -236,20 +250,22 @@ def measure(models: Sequence[pycolmap.Reconstruction], folder: Path) -> dict[str
     true_cameras = {image.name: image.camera for image in reference.images.values()}
     area = pose_auc(pose_errors_deg(poses, true_poses, CONVENTION), CONVENTION)
     rotation_errors = measure_rotation_errors_deg(poses, true_poses)
-    focal_errors = np.array(
-        [
-            cameras[name].mean_focal_length() / true_cameras[name].mean_focal_length() - 1
-            for name in cameras
-            if name in true_cameras
-        ]
-    )
+    errors_by_name = {
+        name: abs(cameras[name].mean_focal_length() / true.mean_focal_length() - 1)
+        for name, true in true_cameras.items()
+        if name in cameras
+    }
+    wrong = {name for name, error in errors_by_name.items() if error > MAX_FOCAL_ERROR}
+    focal_errors = list(errors_by_name.values())
     true_distortion = np.median([get_distortion(camera) for camera in true_cameras.values()])
     return row | {
         "auc_percent": [100 * value for value in area.values()],
         "num_correct": int((rotation_errors < MAX_ROTATION_DEG).sum()),
         "max_rotation_deg": float(rotation_errors.max(initial=0.0)),
-        "focal_median_error": float(np.median(np.abs(focal_errors))),
-        "focal_max_error": float(np.abs(focal_errors).max()),
+        "focal_median_error": float(np.median(focal_errors)),
+        "focal_max_error": max(focal_errors),
+        "num_wrong_focals": len(wrong),
+        "num_silent_focals": len(wrong - doubted),
         "true_distortion": float(true_distortion),
     }
 
@@ -339,7 +355,10 @@ def format_table(rows: Sequence[Mapping[str, Any]]) -> str:
         if "auc_percent" in row:
             cells += [" / ".join(f"{value:.1f}" for value in row["auc_percent"])]
             cells += [row["num_correct"], f"{row['max_rotation_deg']:.2f}"]
-            cells += [f"{row['focal_median_error']:.1%} / {row['focal_max_error']:.1%}"]
+            focal = f"{row['focal_median_error']:.1%} / {row['focal_max_error']:.1%}"
+            if row.get("num_wrong_focals"):
+                focal += f" ({row['num_wrong_focals']} wrong, {row['num_silent_focals']} silent)"
+            cells += [focal]
         else:
             cells += ["-"] * 4
         k1 = f"{row['distortion']:.3f}" if "distortion" in row else "-"

@@ -125,8 +125,7 @@ class CameraReason(ReasonCode):
     """The refined focal length is implausible for any lens; its 35 mm equivalent is
     ``equivalent_mm``."""
     DISTORTION_NOT_ESTIMATED = ("distortion-not-estimated",)
-    """Distortion is not refined because its refinement is disabled, the focal length is fixed, or
-    fewer than three images share the camera."""
+    """Distortion is not refined because its refinement is disabled or the focal length is fixed."""
     DISTORTION_NOT_OBSERVABLE = ("distortion-not-observable", "radial_std")
     """The images do not constrain the radial distortion, whose std is ``radial_std``."""
     DISTORTION_OUT_OF_RANGE = ("distortion-out-of-range", "radial")

@@ -13,6 +13,7 @@ from mpsfm_core.mapping.consistency.misregistration import Misregistration, dete
 from mpsfm_core.mapping.consistency.pair_consistency import PairConsistencyCheck
 from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.incremental_registration import IncrementalRegistration
+from mpsfm_core.mapping.initialization.camera_splitting import find_deviating_focals
 from mpsfm_core.mapping.initialization.global_initialization import (
     GlobalPoses,
     estimate_global_poses,
@@ -26,6 +27,7 @@ from mpsfm_core.mapping.model_maintenance import ModelMaintenance, ModelState
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.filtering import filter_points, find_lost_images
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
+from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, triangulate_image
 
 _log = logging.getLogger(__name__)
@@ -306,13 +308,28 @@ class Component:
         maintenance.history.excluded_references[image, reference] = True
 
     def _detect_misregistrations(self) -> list[Misregistration]:
-        """Detect misregistered images, except those whose known pose must not change."""
+        """Detect misregistered images, except those whose known pose must not change.
+
+        Only if no poses are contradicted, images with a wrong focal length are detected.
+        """
         is_guess = self._options.known_poses == "guess"
         has_pose = np.array(
             [image.known_pose is not None for image in self.maintenance.problem.images]
         )
         detections = detect_misregistrations(self.scene, self._options.registration.min_inliers)
+        detections = detections or self._detect_wrong_focals()
         return [d for d in detections if is_guess or not has_pose[list(d.images)].any()]
+
+    def _detect_wrong_focals(self) -> list[Misregistration]:
+        """Detect images with their own camera whose points support another focal length."""
+        if not self._options.refinement.refine_focal or not self.size:
+            return []
+        problem, options = self.maintenance.problem, self._options
+        focals = find_deviating_focals(
+            problem, convert_scene(self.scene), options.registration, options.seed, is_shared=False
+        )
+        no_pairs = np.zeros((0, 2), dtype=np.int64)
+        return [Misregistration((image,), no_pairs, 0) for image in focals]
 
     def _count_explained_matches(self) -> int:
         """Count the matches whose keypoints observe the same 3D point."""

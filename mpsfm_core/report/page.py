@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Float64
+from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel, IntrinsicParameter
 from mpsfm_core.data.errors import InputError, MpsfmError
 from mpsfm_core.data.result_layout import REPORT
 from mpsfm_core.report import pictures
@@ -43,6 +44,7 @@ _NUM_MAPS = 4
 """Number of embedded depth, std and normal maps per image."""
 _MAX_COORDINATE = 0xFFFF
 """Maximum value of a 16-bit coordinate."""
+CENTER = [IntrinsicParameter.PRINCIPAL_POINT_X, IntrinsicParameter.PRINCIPAL_POINT_Y]
 _DEFAULT_MAX_STD = 0.2
 """Relative depth std that the brightest color of a std map encodes if no image is registered."""
 
@@ -178,8 +180,7 @@ class _ImageEntries:
             "focal": details["focal_length_px"],
             "focal_from": details["focal_length_from"],
             "refined_focal": details.get("refined_focal_length_px"),
-            "radial": details.get("radial_distortion"),
-            "radial_std": details.get("radial_distortion_std"),
+            "lens": _list_lens_parameters(details),
             **self._in_model(name),
             **self._camera(name, prior),
             "pictures": self._pictures(name, prior, refined),
@@ -279,6 +280,28 @@ class _PictureSizes:
             int(np.clip(share * _PHOTO_SIDE[1], *_PHOTO_SIDE)),
             int(np.clip(share * _MAP_SIDE[1], *_MAP_SIDE)),
         )
+
+
+def _list_lens_parameters(details: Mapping[str, Any]) -> list[tuple[str, float, float, int]]:
+    """List the estimated distortion coefficients and principal point of an image.
+
+    Args:
+        details: Entry of the image in ``images.details`` of ``summary.json``.
+
+    Returns:
+        Name, value, standard deviation and number of shown decimals of each parameter.
+    """
+    is_fisheye = details.get("camera_model") == CameraModel.OPENCV_FISHEYE.value
+    coefficients = ("k1", "k2", "k3", "k4") if is_fisheye else ("k1", "k2", "p1", "p2")
+    names = dict(zip(list(IntrinsicParameter)[-NUM_DISTORTION:], coefficients, strict=True))
+    decimals = {**dict.fromkeys(names, 3), **dict.fromkeys(CENTER, 1)}
+    names |= {parameter: f"c{axis}, px" for parameter, axis in zip(CENTER, "xy", strict=True)}
+    keys = {parameter: parameter.name.lower() for parameter in names}
+    return [
+        (names[parameter], details[key], details[f"{key}_std"], decimals[parameter])
+        for parameter, key in keys.items()
+        if key in details and f"{key}_reason" not in details
+    ]
 
 
 def _scale_between(prior: PriorMaps, refined: RefinedMap | None) -> float:

@@ -298,13 +298,13 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
     ),
     CameraReason.DISTORTION_NOT_ESTIMATED: (
         "distortion not estimated",
-        "Bundle adjustment estimates the radial distortion only if the focal length is refined and "
-        "at least three photos share the camera.",
+        "Bundle adjustment estimates the radial distortion only if the focal length is refined.",
         "Give the camera with --intrinsics if its lens distorts.",
     ),
     CameraReason.DISTORTION_NOT_OBSERVABLE: (
         "distortion not observable",
-        "The photos leave a standard deviation of {radial_std:.2f} of the radial distortion.",
+        "The photos do not separate radial distortion from other errors; the standard deviation "
+        "of the radial distortion is {radial_std:.2f}.",
         "Give the camera with --intrinsics if its lens distorts.",
     ),
     CameraReason.DISTORTION_OUT_OF_RANGE: (

@@ -65,6 +65,20 @@ def test_report_lists_unregistered_photos_and_remedies(finished: Path) -> None:
     assert any("noise.png" in finding["images"] for finding in data["findings"])
 
 
+def test_report_lists_refined_lens_parameters_of_a_photo(finished: Path, tmp_path: Path) -> None:
+    shutil.copytree(finished, tmp_path / "out")
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text(encoding="utf-8"))
+    details = next(iter(summary["images"]["details"].values()))
+    details |= {"camera_model": "OPENCV_FISHEYE", "principal_point_x": 331.5}
+    details |= {"principal_point_x_std": 0.5, "principal_point_x_reason": {}}
+    details |= {"distortion_3": 0.02, "distortion_3_std": 0.001}
+    (tmp_path / "out" / "summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    data = data_of(write_report(tmp_path / "out").read_text(encoding="utf-8"))
+    first, *others = data["photos"]
+    assert first["lens"] == [["k3", 0.02, 0.001, 3]]
+    assert all(photo["lens"] == [] for photo in others)
+
+
 def test_report_without_views_is_written(finished: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "out")
     shutil.rmtree(tmp_path / "out" / "views")

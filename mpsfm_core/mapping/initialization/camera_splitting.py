@@ -1,10 +1,11 @@
-"""Detection of images whose focal length differs from that of their shared camera.
+"""Detection of images whose points support another focal length than that of their camera.
 
 Photos without EXIF may differ in zoom or crop although their sizes are equal. The pose of a zoomed
 or cropped image is estimated with the shared focal length and with a focal length of its own. The
 image gets its own camera if clearly more keypoints support the pose with an own focal length. Where
 focal length and distance are ambiguous, for example for a frontal plane, the poses with own and
-shared focal length have equal support.
+shared focal length have equal support. An image with a camera of its own may be misregistered with
+a wrong focal length, and is then registered again.
 """
 
 from __future__ import annotations
@@ -43,15 +44,21 @@ the position of the point. [ours]"""
 
 
 def find_deviating_focals(
-    problem: MappingProblem, model: Reconstruction, options: RegistrationOptions, seed: int
+    problem: MappingProblem,
+    model: Reconstruction,
+    options: RegistrationOptions,
+    seed: int,
+    *,
+    is_shared: bool = True,
 ) -> dict[int, float]:
-    """Find images whose focal length differs from that of their shared camera.
+    """Find images whose points support another focal length than that of their camera.
 
     Args:
         problem: Mapping problem that was reconstructed.
         model: Largest component of the reconstruction.
         options: Options of absolute pose estimation.
         seed: Seed of RANSAC.
+        is_shared: Examine the images that share a camera, else the images with their own cameras.
 
     Returns:
         Focal lengths ``fx`` in pixels of the images with a deviating focal length, by image index.
@@ -70,7 +77,7 @@ def find_deviating_focals(
         if (
             image.focal_known
             or image.camera_model.is_fisheye
-            or num_images[image.shared_camera] < 2
+            or (num_images[image.shared_camera] > 1) != is_shared
         ):
             continue
         if len(keypoints) < options.min_inliers:

@@ -36,6 +36,11 @@ from mpsfm_core.optimize.options import BundleOptions
 MAX_STD_RATIO = 0.5
 """Ratio of posterior and prior standard deviation above which an intrinsic parameter keeps its
 guess. At a ratio of 0.5, the observations add three times the information of the prior. [ours]"""
+MIN_DEVIATION_OF_FEW = 15.0
+"""Smallest deviation of the other intrinsic parameters from the mean of their prior, in posterior
+standard deviations, that a camera of fewer than ``MIN_FOCAL_IMAGES`` images takes. Systematic
+errors of few images resemble distortion of many standard deviations. [tuned:
+benchmarks.mixed_cameras]"""
 DISTORTION_PRIOR_STD = 0.1
 """Standard deviation of the zero-mean prior on radial distortion coefficients. The coefficient k1
 of phones and zoom lenses stays below 0.05 in magnitude, that of action cameras below 0.3. [ours]"""
@@ -71,11 +76,9 @@ def calibrate_cameras(
     """Run bundle adjustment with guessed intrinsics, and apply well-determined estimates.
 
     The other intrinsic parameters of a camera become variable after its focal length is refined,
-    because they would otherwise compensate a wrong focal length. A camera of fewer than
-    ``MIN_FOCAL_IMAGES`` images only estimates its focal length, because systematic errors of few
-    images resemble distortion. An intrinsic parameter whose estimate is implausible or undetermined
-    keeps the guess, and bundle adjustment is repeated with this parameter fixed. The outcome of
-    each camera is recorded in the scene.
+    because they would otherwise compensate a wrong focal length. An intrinsic parameter whose
+    estimate is implausible or undetermined keeps the guess, and bundle adjustment is repeated with
+    this parameter fixed. The outcome of each camera is recorded in the scene.
 
     Args:
         scene: The scene, which receives the refined intrinsics.
@@ -91,8 +94,6 @@ def calibrate_cameras(
     )
     free[:, IntrinsicParameter.RADIAL_DISTORTION :] &= refine_distortion
     free &= has_guessed_camera(scene, representatives)[:, None]
-    num_images = np.bincount(problem.camera_of_image, minlength=len(images))
-    free[:, 1:] &= (num_images >= MIN_FOCAL_IMAGES)[:, None]
     estimated = free.copy()
     active = free.copy()
     active[:, 1:] &= scene.estimated_intrinsics.is_refined(FOCAL)[representatives][:, None]
@@ -177,21 +178,23 @@ def _decide(
     assert variable is not None and means is not None
     values = intrinsic_parameters(result.intrinsics, result.distortion)
     stds = np.asarray(problem.prior_std_intrinsics)
+    num_images = np.bincount(problem.camera_of_image, minlength=len(images))
     refused = np.zeros_like(variable)
     for row in map(int, np.flatnonzero(variable[:, FOCAL])):
         sharing = scene.shares_camera(int(representatives[row]))
         for column in map(int, np.flatnonzero(variable[row])):
             parameter, value = IntrinsicParameter(column), float(values[row, column])
+            std, deviation = float(result.std_intrinsics[row, column]), value - means[row, column]
+            has_few_images = parameter != FOCAL and num_images[row] < MIN_FOCAL_IMAGES
+            is_small = has_few_images and abs(deviation) < MIN_DEVIATION_OF_FEW * std
             if parameter == FOCAL:
                 value = float(result.intrinsics[row, 0])
                 size = images[row].camera.size
                 is_plausible = is_plausible_equivalent(compute_equivalent_mm(value, *size))
             else:
-                deviation = abs(value - means[row, column])
-                is_plausible = bool(deviation <= MAX_PRIOR_DEVIATION * stds[row, column])
-            std = float(result.std_intrinsics[row, column])
+                is_plausible = bool(abs(deviation) <= MAX_PRIOR_DEVIATION * stds[row, column])
             estimate = judge_estimate(value, std, float(stds[row, column]), is_plausible)
-            if parameter != FOCAL and refused[row, FOCAL]:
+            if is_small or (parameter != FOCAL and refused[row, FOCAL]):
                 estimate = estimate._replace(outcome=CalibrationOutcome.NOT_OBSERVABLE)
             scene.estimated_intrinsics.set(sharing, parameter, estimate)
             refused[row, column] = estimate.outcome != CalibrationOutcome.REFINED

@@ -123,7 +123,7 @@
       ["Error", photo.error === null ? "–" : `${number(photo.error, 2)} px`], ["Prior depth std", percent(photo.depth_std, 1)],
       ["Focal length", `${number(photo.refined_focal ?? photo.focal)} px`], ["from", photo.refined_focal ? `${photo.focal_from}, refined` : photo.focal_from],
     ];
-    if (photo.radial !== null) facts.push(["Radial distortion", `${number(photo.radial, 3)} ± ${number(photo.radial_std, 3)}`]);
+    for (const [name, value, std, digits] of photo.lens) facts.push([name, `${number(value, digits)} ± ${number(std, digits)}`]);
     know.append(el("dl", { class: "small" }, ...facts.map(([k, v]) => el("div", {}, el("dt", {}, k), el("dd", {}, v)))));
     know.append(el("h4", {}, partners[row].length ? `Matches with ${plural(partners[row].length, "photo")}` : "Matches no other photo"));
     const chips = el("div", { class: "names" });

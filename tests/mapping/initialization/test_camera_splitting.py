@@ -17,7 +17,8 @@ from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
-from tests.mapping.focal_scenes import CAMERA, make_room, register_true_poses
+from mpsfm_core.mapping.triangulation import complete_and_merge_tracks
+from tests.mapping.focal_scenes import CAMERA, POSES, make_room, register_true_poses
 
 OPTIONS = MapperOptions()
 
@@ -61,13 +62,33 @@ def test_find_deviating_focals_without_zoom_finds_none(
     assert apply_refined_focal_lengths(room, model, OPTIONS) is None
 
 
-def test_find_deviating_focals_keeps_known_and_single_cameras(
+def test_find_deviating_focals_examines_either_shared_or_own_cameras(
     room: MappingProblem, model: Reconstruction
 ) -> None:
     zoomed = zoom(room.images[1], 1.6)
-    for own in (replace(zoomed, focal_known=True), replace(zoomed, camera_id=7)):
-        problem = replace(room, images=(room.images[0], own, *room.images[2:]))
-        assert find_deviating_focals(problem, model, OPTIONS.registration, seed=0) == {}
+    expected = pytest.approx(1.6 * CAMERA.fx, rel=0.01)
+    for own, focals in ((replace(zoomed, focal_known=True), {}), (zoomed, {1: expected})):
+        problem = replace(
+            room, images=(room.images[0], replace(own, camera_id=7), *room.images[2:])
+        )
+        arguments = problem, model, OPTIONS.registration, 0
+        assert find_deviating_focals(*arguments) == {}
+        assert find_deviating_focals(*arguments, is_shared=False) == focals
+
+
+@pytest.mark.slow
+def test_reregister_images_replaces_a_focal_length_that_the_pose_compensates(
+    room: MappingProblem,
+) -> None:
+    zoomed = replace(zoom(room.images[1], 1.08), camera_id=7)
+    known = [replace(image, focal_known=True) for image in room.images]
+    problem = replace(room, images=(known[0], zoomed, *known[2:]))
+    component = register_true_poses(problem, (0, 2, 3, 4))
+    approach = np.array([0.0, 0.0, 4.0 * (1 - 1 / 1.08)])  # compensates at a distance of 4
+    component.scene.register(1, POSES[1][:, :3], POSES[1][:, 3] - approach)
+    complete_and_merge_tracks(component.scene, OPTIONS.triangulation, create=True)
+    component.reregister_images(np.arange(5) == 1)
+    assert component.scene.camera(1).fx == pytest.approx(1.08 * CAMERA.fx, rel=0.01)
 
 
 def test_apply_seed_poses_keeps_own_cameras(room: MappingProblem, model: Reconstruction) -> None:

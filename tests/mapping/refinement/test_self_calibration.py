@@ -136,11 +136,21 @@ def test_reconstruct_with_principal_point_refines_it() -> None:
         assert image.changes_view
 
 
-def test_reconstruct_with_one_image_per_camera_keeps_pinhole_cameras(room: MappingProblem) -> None:
-    problem = guess_focals(distort(room, -0.05), [0.9, 0.95, 1.0, 1.05, 1.1])
-    for image in reconstruct(problem).reconstructions[0].images:
-        assert image.distortion[0] == 0 and image.calibration[FOCAL].reason is None
-        assert image.calibration[RADIAL].reason == CameraReason.DISTORTION_NOT_ESTIMATED.because()
+def test_reconstruct_with_one_image_per_camera_refines_only_clear_distortion(
+    room: MappingProblem,
+) -> None:
+    clear, none = distort(room, -0.25), room
+    images = [(none if i == 2 else clear).images[i] for i in range(5)]
+    problem = guess_focals(replace(room, images=tuple(images)), [0.9, 0.95, 1.0, 1.05, 1.1])
+    options = MapperOptions.model_validate({"max_runs": 1})
+    for image in reconstruct(problem, options).reconstructions[0].images:
+        assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
+        reason = image.calibration[RADIAL].reason
+        if image.index == 2:
+            assert image.distortion[0] == 0 and reason is not None
+            assert reason.code == CameraReason.DISTORTION_NOT_OBSERVABLE
+        else:
+            assert image.distortion[0] == pytest.approx(-0.25, abs=0.02) and reason is None
 
 
 def test_reconstruct_of_partly_undistorted_views_refines_the_original_distortion(
