@@ -12,7 +12,12 @@ A pair is true if its two-view overlap (mpsfm_core/evaluation/overlap.py) is abo
 column *matched* counts true pairs that can contribute to a reconstruction. A real pair counts as
 matched if its overlap is at least 0.15 and its verified LighterGlue matches give a rotation error
 below 10 degrees. A pair of the hall counts as matched if it has 30 common points with similar
-descriptors. Writes benchmarks/results/pairs.md.
+descriptors.
+
+A second table has the share of true pairs among the candidate pairs, whose match scores are
+computed. The images of the table are synthetic: each image along a street shares 224 of its 256
+repeatable descriptors with the next image, 192 with the image after it, and so on. Writes
+benchmarks/results/pairs.md.
 """
 
 from __future__ import annotations
@@ -40,6 +45,7 @@ from mpsfm_core.extraction.matching.pair_matching import PairMatcher, PairVerifi
 from mpsfm_core.extraction.options import PairOptions
 from mpsfm_core.extraction.pairs import similarity as pair_similarity
 from mpsfm_core.extraction.pairs.pairing import Pair, most_similar_pairs, numbered_neighbor_pairs
+from mpsfm_core.extraction.pairs.similarity import PairSimilarity
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.synthetic.halls import make_hall_problem
@@ -49,6 +55,7 @@ OVERLAPS = (0.1, 0.25, 0.4)
 MATCHED_OVERLAP = 0.15
 RIGHT_DEG = 10.0
 VIEWS = 200
+STREETS = (1000, 4000, 10000)
 
 
 class Case(NamedTuple):
@@ -75,6 +82,12 @@ def main() -> None:
         case = _hall() if name == "hall" else _real(name, arguments.output / "pairs")
         lines.append(_row(name, case))
         print(lines[-1], flush=True)
+    lines += [
+        "",
+        "| images of a street | candidate pairs per image | shared > 190 | > 30 | CPU s |",
+    ]
+    lines.append("|---" * 5 + "|")
+    lines += [_candidate_row(count) for count in STREETS]
     text = "# Recall of `pairs.mode: auto`\n\n" + "\n".join(lines) + "\n"
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "pairs.md").write_text(text, encoding="utf-8")
@@ -84,12 +97,10 @@ def main() -> None:
 def _row(name: str, case: Case) -> str:
     started = time.process_time()
     count, options = len(case.names), PairOptions()
-    scores = np.zeros((count, count))
-    for a, b in combinations(range(count), 2):
-        scores[a, b] = scores[b, a] = pair_similarity.match_score(
-            case.descriptors[a], case.descriptors[b]
-        )
-    alike = most_similar_pairs(pair_similarity.diffuse_similarity(scores), options.partners)
+    pairs = pair_similarity.candidate_pairs(case.descriptors)
+    scores = [pair_similarity.match_score(*(case.descriptors[i] for i in pair)) for pair in pairs]
+    similarity = pair_similarity.diffuse_similarity(PairSimilarity(pairs, np.array(scores)), count)
+    alike = most_similar_pairs(similarity, options.partners)
     chosen = {*alike, *numbered_neighbor_pairs(case.names, options)}
     seconds = time.process_time() - started
     recalls = []
@@ -106,6 +117,28 @@ def _row(name: str, case: Case) -> str:
         f"{seconds:.1f}",
     ]
     return f"| {' | '.join(cells)} |"
+
+
+def _candidate_row(count: int) -> str:
+    """Measure recall and time of the candidate pairs of images along a street."""
+    rng = np.random.default_rng(0)
+    points = _unit(rng.normal(size=(32 * (count + 7), 64)))
+    positions = rng.permutation(count)
+    descriptors = []
+    for position in positions:
+        seen = points[32 * position : 32 * position + 256]
+        noise = 0.5 * _unit(rng.normal(size=seen.shape))
+        outliers = _unit(rng.normal(size=seen.shape))
+        descriptors.append(np.concatenate([_unit(seen + noise), outliers]).astype(np.float32))
+    started = time.process_time()
+    pairs = pair_similarity.candidate_pairs(descriptors)
+    seconds = time.process_time() - started
+    distances = np.abs(np.diff(positions[pairs], axis=1))
+    cells = [str(count), f"{len(pairs) / count:.0f}"]
+    for steps in (2, 7):
+        true = sum(count - step for step in range(1, steps + 1))
+        cells.append(f"{100 * (distances <= steps).sum() / true:.1f} % of {true}")
+    return f"| {' | '.join([*cells, f'{seconds:.1f}'])} |"
 
 
 def _recall(chosen: set[Pair], true: Sequence[Pair]) -> str:

@@ -59,11 +59,6 @@ class Life:
         finished = [line.partition(":")[0] for line in self.said if line.endswith(" s")]
         return f"after {finished[-1]}" if finished else "at the start"
 
-    @property
-    def resumed(self) -> str:
-        """Return the message in which the process states from where mapping resumes."""
-        return next((line for line in self.said if "continues from a checkpoint" in line), "")
-
 
 def main() -> None:
     """Run the interrupted and the undisturbed reconstruction, and write the table."""
@@ -165,6 +160,9 @@ def report(folder: Path, alone: Life, lives: list[Life], arguments: argparse.Nam
     leftovers += [p.name for p in (folder / "disturbed" / "out").glob(".mpsfm-*")]
     total = sum(life.seconds for life in lives)
     verdict = "all identical" if not different else f"different: {', '.join(different[:10])}"
+    processes = ", ".join(
+        f"{life.seconds:.0f} ({life.doing if life.code else 'finished'})" for life in lives
+    )
     lines = [
         "# Killed and resumed",
         "",
@@ -177,14 +175,8 @@ def report(folder: Path, alone: Life, lives: list[Life], arguments: argparse.Nam
         f"one {total:.0f} s, **{total / alone.seconds:.2f} times** as much.",
         f"* The result has {len(expected)} files, {verdict}. Leftover files: "
         f"{', '.join(leftovers) or 'none'}.",
-        "",
-        "| process | CPU s | killed | mapping resumed from |",
-        "| --- | --- | --- | --- |",
+        f"* CPU seconds of the processes, with what each did when it was killed: {processes}.",
     ]
-    for number, life in enumerate(lives, start=1):
-        end = life.doing if life.code else "finished"
-        place = life.resumed.partition(": ")[2].partition(" (")[0]
-        lines.append(f"| {number} | {life.seconds:.1f} | {end} | {place} |")
     return "\n".join(lines) + "\n"
 
 

@@ -14,6 +14,7 @@ from mpsfm_core.extraction.pairs.pairing import (
     retrieval_pairs,
     sequential_pairs,
 )
+from mpsfm_core.extraction.pairs.similarity import PairSimilarity
 
 
 def test_exhaustive_pairs_are_all_pairs() -> None:
@@ -67,15 +68,19 @@ def test_filter_pairs_intersects_and_ignores_order() -> None:
     assert filter_pairs(pairs, names, [[]]) == []
 
 
+def similarity(values: dict[tuple[int, int], float]) -> PairSimilarity:
+    return PairSimilarity(np.array(list(values)), np.array(list(values.values())))
+
+
 def test_most_similar_pairs_exclude_zero_similarity() -> None:
-    likeness = np.array([[9, 3, 0, 0], [3, 9, 1, 0], [0, 1, 9, 0], [0, 0, 0, 9]], dtype=np.float64)
+    likeness = similarity({(0, 1): 3.0, (0, 2): 0.0, (1, 2): 1.0, (2, 3): 0.0})
     assert most_similar_pairs(likeness, 1) == [(0, 1), (1, 2)]
     assert most_similar_pairs(likeness, 3) == [(0, 1), (1, 2)]
 
 
 def test_most_similar_pairs_of_selected_images() -> None:
     """Only the selected images get partners."""
-    likeness = np.array([[0, 3, 1, 0], [3, 0, 2, 0], [1, 2, 0, 5], [0, 0, 5, 0]], dtype=np.float64)
+    likeness = similarity({(0, 1): 3.0, (0, 2): 1.0, (1, 2): 2.0, (2, 3): 5.0})
     assert most_similar_pairs(likeness, 1, images=[0]) == [(0, 1)]
     assert most_similar_pairs(likeness, 2, images=[3, 0]) == [(0, 1), (0, 2), (2, 3)]
 

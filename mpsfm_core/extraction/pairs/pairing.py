@@ -7,14 +7,14 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from mpsfm_core.data import Float32, Float64
+from mpsfm_core.data import Float32
 from mpsfm_core.extraction.options import PairOptions
+from mpsfm_core.extraction.pairs.similarity import PairSimilarity, rank_images
 
 Pair = tuple[int, int]
 """Indices of the two images of a pair, the smaller index first."""
 
 _NUMBERED = re.compile(r"(.*?)(\d+)(\D*)")
-_SMALLEST_POSITIVE = float(np.finfo(np.float64).tiny)
 
 
 def exhaustive_pairs(count: int) -> list[Pair]:
@@ -31,32 +31,33 @@ def sequential_pairs(count: int, options: PairOptions) -> list[Pair]:
 
 def retrieval_pairs(descriptors: Sequence[Float32], options: PairOptions) -> list[Pair]:
     """Pair each image with the images of largest dot product of global descriptors (d,)."""
-    matrix = np.stack(descriptors).astype(np.float64)
-    min_similarity = max(options.min_similarity, -np.finfo(np.float64).max)
-    return most_similar_pairs(matrix @ matrix.T, options.top_k, min_similarity)
+    ranked = rank_images(np.stack(descriptors).astype(np.float64), options.top_k)
+    return [
+        (a, b)
+        for (a, b), value in zip(ranked.pairs.tolist(), ranked.values.tolist(), strict=True)
+        if value >= options.min_similarity
+    ]
 
 
 def most_similar_pairs(
-    similarity: Float64,
-    count: int,
-    min_similarity: float = _SMALLEST_POSITIVE,
-    images: Iterable[int] | None = None,
+    similarity: PairSimilarity, count: int, images: Iterable[int] | None = None
 ) -> list[Pair]:
-    """Pair images with the images of largest similarity.
+    """Pair images with the images of largest similarity, if the similarity is above 0.
 
     Args:
-        similarity: (n, n) similarity of all images.
+        similarity: Similarity of the candidate pairs.
         count: Number of most similar images that each image is paired with.
-        min_similarity: Minimum similarity of a paired image.
         images: Indices of the images that are paired with similar images; default: all images.
     """
-    ranked = similarity.copy()
-    np.fill_diagonal(ranked, -np.inf)
-    best = np.argsort(-ranked, axis=1, kind="stable")[:, :count]
-    chosen = range(len(ranked)) if images is None else images
-    return _sort_pairs(
-        (a, int(b)) for a in chosen for b in best[a] if ranked[a, b] >= min_similarity
-    )
+    both = np.concatenate([similarity.pairs, similarity.pairs[:, ::-1]])
+    values = np.tile(similarity.values, 2)
+    kept = values > 0
+    if images is not None:
+        kept &= np.isin(both[:, 0], list(images))
+    both, values = both[kept], values[kept]
+    both = both[np.lexsort((both[:, 1], -values, both[:, 0]))]
+    rank = np.arange(len(both)) - np.searchsorted(both[:, 0], both[:, 0])
+    return _sort_pairs((a, b) for a, b in both[rank < count].tolist())
 
 
 def numbered_neighbor_pairs(names: Sequence[str], options: PairOptions) -> list[Pair]:

@@ -19,6 +19,7 @@ from mpsfm_core.extraction.features import FeatureSource
 from mpsfm_core.extraction.pairs import pairing as pairs
 from mpsfm_core.extraction.pairs import similarity as pair_similarity
 from mpsfm_core.extraction.pairs.pairing import Pair
+from mpsfm_core.extraction.pairs.similarity import PairSimilarity
 from mpsfm_core.providers.kinds.retrieval import run_retrieval
 from mpsfm_core.providers.source_hash import hash_module
 
@@ -48,7 +49,7 @@ class PairSelection:
         self._duplicates = duplicates or {}
         self._context = context
         self._table = table
-        self._similarity: Float64 | None = None
+        self._similarity: PairSimilarity | None = None
         self._selected: set[Pair] = set()
 
     def choose(self) -> list[Pair]:
@@ -124,21 +125,18 @@ class PairSelection:
         """
         if self._similarity is None:
             return []
-        count = len(self._similarity)
+        count = len(self._context.images)
         rows, columns = np.array(verified, dtype=np.int64).reshape(-1, 2).T
         graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
         num_components, component_of = connected_components(graph, directed=False)
         sizes = np.bincount(component_of, minlength=num_components)
+        candidates, values = self._similarity
+        ranked = candidates[np.lexsort((candidates[:, 1], candidates[:, 0], -values))]
         further: list[Pair] = []
         for component in np.flatnonzero(np.arange(num_components) != sizes.argmax()):
-            inside = component_of == component
-            across = [
-                (min(a, b), max(a, b))
-                for a in np.flatnonzero(inside).tolist()
-                for b in np.flatnonzero(~inside).tolist()
-            ]
-            untried = [pair for pair in across if pair not in self._selected]
-            untried.sort(key=lambda pair: (-self._pair_similarity(pair), pair))
+            inside = component_of[ranked] == component
+            across = ranked[inside[:, 0] != inside[:, 1]].tolist()
+            untried = [(a, b) for a, b in across if (a, b) not in self._selected]
             further += untried[: self._context.config.pairs.partners]
         return self._select(further)
 
@@ -149,9 +147,6 @@ class PairSelection:
         if self._unconstrained is None or config.fast_pass is None:
             return config.pairs.partners
         return config.fast_pass.partners
-
-    def _pair_similarity(self, pair: Pair) -> float:
-        return 0.0 if self._similarity is None else float(self._similarity[pair])
 
     def _select(self, chosen: Sequence[Pair]) -> list[Pair]:
         """Sort and record image pairs, and apply the pair filters of plugins."""
@@ -167,41 +162,39 @@ class PairSelection:
         answers = self._context.registry.call_hook("mpsfm_filter_pairs", pairs=named)
         return pairs.filter_pairs(unique, names, answers)
 
-    def _compute_similarity(self) -> Float64 | None:
-        """Compute the similarity (n, n) of all images by retrieval, or else by local features.
+    def _compute_similarity(self) -> PairSimilarity | None:
+        """Compute the similarity of candidate pairs by retrieval, or else by local features.
 
         The similarity is None if neither a retrieval provider nor a feature provider is configured.
         """
-        backend = self._context.config.retrieval
-        if backend is not None:
+        if self._context.config.retrieval is not None:
             descriptors = np.stack(self._descriptors()).astype(np.float64)
-            similarity: Float64 = np.maximum(descriptors @ descriptors.T, 0)
-            return similarity
+            return pair_similarity.rank_images(descriptors, pair_similarity.NUM_CANDIDATES)
         if self._table is None:
             return None
-        return pair_similarity.diffuse_similarity(self._match_scores(self._table))
+        scores = self._match_scores(self._table)
+        return pair_similarity.diffuse_similarity(scores, len(self._context.images))
 
-    def _match_scores(self, table: FeatureSource) -> Float64:
+    def _match_scores(self, table: FeatureSource) -> PairSimilarity:
         context, count = self._context, len(self._context.images)
         key = content_key(
             hash_module(pair_similarity.__name__), [table.key(index) for index in range(count)]
         )
         cached: Float64 | None = context.cache.load("pair-similarity", key, np.ndarray)
         if cached is not None:
-            return cached
+            return PairSimilarity(cached[:, :2].astype(np.int64), cached[:, 2])
         strongest = [pair_similarity.strongest_descriptors(table[index]) for index in range(count)]
-        scores = np.zeros((count, count))
+        pairs = pair_similarity.candidate_pairs(strongest)
+        ends = np.searchsorted(pairs[:, 0], np.arange(count), side="right").tolist()
 
-        def compare(first: int) -> None:
-            for other in range(first + 1, count):
-                scores[first, other] = pair_similarity.match_score(
-                    strongest[first], strongest[other]
-                )
+        def compare(first: int) -> list[float]:
+            others = pairs[ends[first - 1] if first else 0 : ends[first], 1].tolist()
+            return [pair_similarity.match_score(strongest[first], strongest[b]) for b in others]
 
-        context.each("similarity", range(count), compare)
-        scores += scores.T
-        context.cache.store("pair-similarity", key, scores)
-        return scores
+        rows = context.each("similarity", range(count), compare)
+        scores = np.array([score for row in rows for score in row], dtype=np.float64)
+        context.cache.store("pair-similarity", key, np.column_stack([pairs, scores]))
+        return PairSimilarity(pairs, scores)
 
     def describe(self, index: int) -> Any:
         """Return the cached or computed global descriptor (d,) of an image.

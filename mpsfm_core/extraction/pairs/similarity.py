@@ -6,20 +6,49 @@ the score that both images reach by chance, because images with repetitive textu
 images. Diffusion of the similarities raises the similarity of two images that are both similar to a
 third image. Diffusion finds pairs of small overlap (Zhou et al., Ranking on Data Manifolds, NIPS
 2003).
+
+Match scores are computed for candidate pairs only, so that memory and time per image do not grow
+with the number of images. The candidates of an image are the images with the most similar global
+descriptors (VLAD of the strongest descriptors: Jegou et al., CVPR 2010; Arandjelovic and Zisserman,
+CVPR 2013).
 """
 
 from __future__ import annotations
 
-import numpy as np
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
-from mpsfm_core.data import Features, Float32, Float64
+import numpy as np
+from scipy.cluster.vq import kmeans2, vq
+from scipy.sparse import csr_array
+
+from mpsfm_core.data import Features, Float32, Float64, Int64
 
 NUM_DESCRIPTORS = 512
 """Number of descriptors per image that are compared. The cost of comparison grows with the square
 of the number of descriptors. [tuned: benchmarks.pairs]"""
 DIFFUSION_RATIO = 0.8
 """Diffusion weight ``alpha`` of manifold ranking. [tuned: benchmarks.pairs]"""
+NUM_CANDIDATES = 256
+"""Number of images that each image is compared with. Sets of up to 257 images are compared
+exhaustively. [tuned: benchmarks.pairs]"""
+_NUM_CLUSTERS = 64
+"""Number of clusters of a VLAD descriptor."""
+_TRAINING_DESCRIPTORS = 256 * _NUM_CLUSTERS
+"""Number of descriptors of all images that the clusters are computed from."""
+_BLOCK = 256
+"""Number of images whose similarity to all images is in memory at once."""
 _TINY = np.float32(1e-12)
+
+
+class PairSimilarity(NamedTuple):
+    """Similarity of the candidate pairs of an image set."""
+
+    pairs: Int64
+    """Image indices (n, 2) of the candidate pairs, the smaller index first, in ascending order."""
+    values: Float64
+    """Similarities (n,), 0 or larger for similarities of local features."""
 
 
 def strongest_descriptors(features: Features) -> Float32:
@@ -49,22 +78,111 @@ def match_score(a: Float32, b: Float32) -> float:
     return float((1 - np.sqrt(np.minimum(first / np.maximum(second, _TINY), 1))).sum())
 
 
-def diffuse_similarity(scores: Float64) -> Float64:
-    """Convert match scores to similarities by subtracting chance scores and by diffusion.
+def candidate_pairs(descriptors: Sequence[Float32]) -> Int64:
+    """Pair each image with the `NUM_CANDIDATES` images of most similar global descriptors.
 
     Args:
-        scores: (n, n) match scores of all pairs, symmetric with zero diagonal.
+        descriptors: Strongest descriptors (k, d) of each image; k may differ and may be 0.
 
     Returns:
-        (n, n) nonnegative similarities of all images.
+        Image indices (n, 2), the smaller index first, in ascending order.
     """
-    image_scores = scores.sum(axis=1)
-    by_chance = np.outer(image_scores, image_scores) / max(image_scores.sum(), float(_TINY))
-    excess = np.maximum(scores - by_chance, 0) / np.sqrt(by_chance + 1)
-    np.fill_diagonal(excess, 0)
-    degree = np.sqrt(np.maximum(excess.sum(axis=1), float(_TINY)))
-    links = excess / np.outer(degree, degree)
-    diffused: Float64 = np.linalg.inv(np.eye(len(scores)) - DIFFUSION_RATIO * links)
-    np.fill_diagonal(diffused, 0)
-    similarity: Float64 = np.maximum((diffused + diffused.T) / 2, 0)
-    return similarity
+    count = len(descriptors)
+    if count <= NUM_CANDIDATES + 1:
+        return np.stack(np.triu_indices(count, 1), axis=1)
+    return rank_images(compute_vlad(descriptors), NUM_CANDIDATES).pairs
+
+
+def compute_vlad(descriptors: Sequence[Float32]) -> Float32:
+    """Aggregate the local descriptors of each image to a global descriptor of unit length.
+
+    Args:
+        descriptors: Descriptors (k, d) of each image; images without descriptors get zeros.
+
+    Returns:
+        Global descriptors (n, clusters * d).
+    """
+    rng = np.random.default_rng(0)
+    samples_per_image = -(-_TRAINING_DESCRIPTORS // len(descriptors))
+    sample = np.concatenate(
+        [rng.permutation(found)[:samples_per_image] for found in descriptors if len(found)]
+    )
+    num_clusters = min(_NUM_CLUSTERS, len(sample))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "One of the clusters is empty", UserWarning)
+        centers, _ = kmeans2(sample, num_clusters, minit="points", seed=rng)
+    vectors = np.zeros((len(descriptors), *centers.shape), dtype=np.float32)
+    for vector, found in zip(vectors, descriptors, strict=True):
+        if len(found):
+            members = np.eye(num_clusters, dtype=np.float32)[vq(found, centers)[0]].T
+            residuals = members @ found - members.sum(axis=1, keepdims=True) * centers
+            lengths = np.linalg.norm(residuals, axis=1, keepdims=True)
+            vector[:] = residuals / np.sqrt(np.maximum(lengths, _TINY))
+    flat = vectors.reshape(len(descriptors), -1)
+    flat = np.sign(flat) * np.sqrt(np.abs(flat))
+    unit: Float32 = flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), _TINY)
+    return unit
+
+
+def rank_images(vectors: Float32 | Float64, count: int) -> PairSimilarity:
+    """Pair each image with the ``count`` images of largest dot product of global descriptors.
+
+    Args:
+        vectors: Global descriptors (n, d).
+        count: Number of most similar images of each image.
+
+    Returns:
+        The union of the pairs of all images, with dot products as similarity.
+    """
+    pairs, values = [], []
+    for first in range(0, len(vectors), _BLOCK):
+        products = vectors[first : first + _BLOCK] @ vectors.T
+        rows = np.arange(len(products))[:, None]
+        products[rows, first + rows] = -np.inf
+        best = np.argsort(-products, axis=1, kind="stable")[:, : min(count, len(vectors) - 1)]
+        values.append(products[rows, best].ravel().astype(np.float64))
+        images = np.broadcast_to(first + rows, best.shape)
+        pairs.append(np.stack([np.minimum(images, best), np.maximum(images, best)], axis=-1))
+    found, index = np.unique(np.concatenate(pairs).reshape(-1, 2), axis=0, return_index=True)
+    return PairSimilarity(found, np.concatenate(values)[index])
+
+
+def diffuse_similarity(scores: PairSimilarity, count: int) -> PairSimilarity:
+    """Convert match scores to similarities by subtracting chance scores and by diffusion.
+
+    The similarity of an image diffuses over the image and its candidates.
+
+    Args:
+        scores: Match scores of the candidate pairs.
+        count: Number of images.
+
+    Returns:
+        Nonnegative similarities of the candidate pairs.
+    """
+    (first, second), values = scores.pairs.T, scores.values
+    image_scores = np.bincount(first, values, count) + np.bincount(second, values, count)
+    by_chance = image_scores[first] * image_scores[second] / max(image_scores.sum(), float(_TINY))
+    excess = np.maximum(values - by_chance, 0) / np.sqrt(by_chance + 1)
+    excess_sums = np.bincount(first, excess, count) + np.bincount(second, excess, count)
+    degree = np.sqrt(np.maximum(excess_sums, float(_TINY)))
+    links = _symmetric(scores.pairs, excess / (degree[first] * degree[second]), count)
+    candidates = _symmetric(scores.pairs, np.arange(1.0, 1 + len(values)), count)
+    diffused = np.zeros(len(values))
+    for image, (others, rows) in enumerate(_entries(candidates)):
+        members = np.append(others, image)
+        system = np.eye(len(members)) - DIFFUSION_RATIO * links[members][:, members].toarray()
+        unit = np.eye(len(members))[-1]
+        diffused[rows.astype(np.int64) - 1] += np.linalg.solve(system, unit)[:-1] / 2
+    return PairSimilarity(scores.pairs, np.maximum(diffused, 0))
+
+
+def _symmetric(pairs: Int64, values: Float64, count: int) -> csr_array:
+    """Return a symmetric sparse matrix (count, count) with the values of the pairs."""
+    rows, columns = np.concatenate([pairs, pairs[:, ::-1]]).T
+    return csr_array((np.tile(values, 2), (rows, columns)), shape=(count, count))
+
+
+def _entries(matrix: csr_array) -> Iterator[tuple[Int64, Float64]]:
+    """Yield the columns and values of the stored entries of each row."""
+    for start, end in zip(matrix.indptr[:-1], matrix.indptr[1:], strict=True):
+        yield matrix.indices[start:end], matrix.data[start:end]
