@@ -16,7 +16,11 @@ def evaluate(
     ],
     truth: Annotated[
         Path | None,
-        typer.Argument(metavar="GT", help="Model with true poses, in the same formats."),
+        typer.Argument(
+            metavar="GT",
+            help="Model with true poses, in the same formats, or the true trajectory of a video "
+            "(TUM .txt or EuRoC .csv), which is compared with MODEL/trajectory.txt.",
+        ),
     ] = None,
     images: Annotated[
         str | None,
@@ -80,6 +84,12 @@ def evaluate(
     from mpsfm_core.data.errors import InputError, did_you_mean
     from mpsfm_core.evaluation import CONVENTIONS, evaluate, read_poses
     from mpsfm_core.evaluation.result_folder import find_photos
+    from mpsfm_core.evaluation.trajectories import (
+        count_missing,
+        evaluate_trajectory,
+        find_trajectory,
+        read_trajectory,
+    )
 
     if convention not in CONVENTIONS:
         raise InputError(f"no convention {convention!r}{did_you_mean(convention, CONVENTIONS)}")
@@ -94,6 +104,14 @@ def evaluate(
     if truth is None:
         if not held_out or gt_depth is not None or scan is not None:
             raise InputError("GT is missing: the model with true poses, or --held-out")
+        typer.echo(json.dumps(report, indent=2))
+        return
+    if truth.is_file() and (trajectory := find_trajectory(truth)) is not None:
+        found = find_trajectory(model)
+        if found is None:
+            raise InputError(f"{model}: the folder has no trajectory.txt to compare with {truth}")
+        compared = read_trajectory(found), read_trajectory(trajectory)
+        report |= evaluate_trajectory(*compared, count_missing(model))
         typer.echo(json.dumps(report, indent=2))
         return
     photos = photos or find_photos(model)

@@ -177,6 +177,31 @@ class DoubtReason(ReasonCode):
     """The match scores of a matcher are not higher for inliers than for outliers."""
 
 
+class KeyframeReason(ReasonCode):
+    """Reasons why a frame of a video is a keyframe."""
+
+    FIRST = ("first",)
+    MOVED = ("moved", "motion_ratio")
+    """The tracked points moved by ``motion_ratio`` of the image diagonal in the median."""
+    LOST_OVERLAP = ("lost-overlap", "tracked_ratio")
+    """Only the share ``tracked_ratio`` of the points of the previous keyframe is still tracked."""
+    UNTRACKED = ("untracked", "num_tracks")
+    """Too few points are tracked to measure the motion of the camera."""
+    CUT = ("cut",)
+    """A cut separates the frame from the previous frame, so that a new shot starts."""
+
+
+class FrameReason(ReasonCode):
+    """Reasons why a frame of a video has no pose, or why its pose is interpolated."""
+
+    TOO_FEW_TRACKS = ("too-few-tracks", "num_tracks", "min_tracks")
+    """Too few points of the neighboring keyframes are tracked into the frame."""
+    TOO_FEW_INLIERS = ("too-few-inliers", "num_inliers", "min_inliers")
+    """Too few tracked points fit one pose."""
+    NO_KEYFRAME = ("no-keyframe",)
+    """No keyframe of the same shot is registered."""
+
+
 @dataclass(frozen=True)
 class Reason:
     """Reason for a decision, consisting of a code and the values of its fields."""

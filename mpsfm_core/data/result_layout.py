@@ -27,6 +27,10 @@ MESH = ("mesh.ply", "mesh.glb")
 """Surface mesh, which ``mpsfm mesh`` extracts from the depth maps."""
 TRANSFORMS = "transforms.json"
 """Cameras and poses in the format of nerfstudio."""
+TRAJECTORY = "trajectory.txt"
+"""Poses of the frames of a video in the format of TUM, ``timestamp tx ty tz qx qy qz qw``."""
+FRAME_TABLE = "trajectory.csv"
+"""Source, standard deviation and number of inliers of each frame of a video."""
 VIEWS = "views"
 """Thumbnails, priors and matches that the HTML report displays."""
 REPORT = "report.html"
@@ -41,6 +45,8 @@ ENTRIES = (
     *MESH,
     DEPTH,
     TRANSFORMS,
+    TRAJECTORY,
+    FRAME_TABLE,
     VIEWS,
     REPORT,
     SUMMARY,

@@ -118,11 +118,11 @@ def trajectory_errors(
 
 
 def _steps(poses: Sequence[Pose], scale: float) -> Pose:
-    """Compute rotations (n - 1, 3, 3) and translations ``b_from_a`` of successive images."""
+    """Compute rotations (n - 1, 3, 3) and translations ``a_from_b`` of successive images a, b."""
     rotations = np.stack([rotation for rotation, _ in poses])
     translations = scale * np.stack([translation for _, translation in poses])
-    relative = rotations[1:] @ rotations[:-1].transpose(0, 2, 1)
-    return relative, translations[1:] - np.einsum("nij,nj->ni", relative, translations[:-1])
+    relative = rotations[:-1] @ rotations[1:].transpose(0, 2, 1)
+    return relative, translations[:-1] - np.einsum("nij,nj->ni", relative, translations[1:])
 
 
 def _rms(values: Float64) -> float:

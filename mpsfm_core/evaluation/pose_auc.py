@@ -45,7 +45,7 @@ def exact_area(errors: Float64, threshold: int) -> float:
     return float(np.maximum(0.0, 1.0 - errors / threshold).mean())
 
 
-def interpolated_area(errors: Float64, threshold: int) -> float:
+def interpolated_area(errors: Float64, threshold: float) -> float:
     """Integrate the linearly interpolated recall curve, as SuperGlue and COLMAP's benchmark do.
 
     The interpolated area is never below :func:`exact_area`.

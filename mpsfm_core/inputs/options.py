@@ -21,9 +21,12 @@ class VideoOptions(Options):
     overlap: float = expert(0.7, gt=0, lt=1)
     """Share of still tracked points below which the next frame is selected. A larger share of
     tracked points selects more frames."""
-    max_frames: int = Field(300, ge=2)
-    """Maximum number of frames of a video. If more frames are selected, an evenly spaced subset is
-    used."""
+    max_frames: int = Field(600, ge=2)
+    """Maximum number of keyframes of a video. If more keyframes are selected, those with the least
+    motion are dropped. More keyframes take proportionally more time [tuned: benchmarks.walks]."""
+    trajectory_every: int = Field(1, ge=0)
+    """Interval of the video frames whose poses are written to ``trajectory.txt``; 1 localizes all
+    frames, and 0 writes no trajectory."""
 
 
 class InputOptions(Options):

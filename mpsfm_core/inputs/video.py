@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import heapq
 import json
 import logging
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
 from mpsfm_core.data import Float32, UInt8
+from mpsfm_core.data.decisions import KeyframeReason, Reason, reason_from_json
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.options import VideoOptions
 from mpsfm_core.inputs.telemetry import read_telemetry
@@ -34,7 +36,9 @@ _log = logging.getLogger(__name__)
 
 _LIST = "frames.json"
 FORMAT = 1
-"""Format version of ``frames.json``, the origin of the selected frames."""
+"""Format version of ``frames.json``, the origin and the reasons of the selected frames."""
+_ORIGIN = "sha256", "options", "telemetry"
+"""Fields of ``frames.json`` that identify the video, the options and the GPS positions."""
 _TRACKED_SIDE = 480
 """Longer side in pixels of the downscaled frames in which points are tracked."""
 _MAX_POINTS = 300
@@ -49,6 +53,17 @@ _MIN_POINTS = 20
 """Minimum number of tracked points to measure the motion of a frame."""
 _MAX_CANDIDATES = 300
 """Maximum number of candidate frames in memory, ten seconds of most videos."""
+_MAX_CUT_RATIO = 0.2
+"""Share of the points that are tracked from one frame to the next below which there may be a cut.
+[ours]"""
+_MAX_CUT_CORRELATION = 0.5
+"""Correlation of two successive frames below which there is a cut, if tracking fails too. [ours]"""
+_MIN_CONTRAST = 4.0
+"""Minimum std of the gray levels of a frame before or after a cut, so that black is no cut."""
+_THUMBNAIL = 16, 12
+"""Size of the small pictures that are correlated to detect cuts."""
+_DEFAULT_FPS = 30.0
+"""Frame rate of a video whose container has neither time stamps nor a frame rate."""
 _MIN_FRAME_RATIO = 0.9
 """Minimum ratio of decoded frames to the frame count in the header of an undamaged video."""
 _JPEG_QUALITY = 95
@@ -58,6 +73,70 @@ _JPEG_QUALITY = 95
 def is_video(path: Path) -> bool:
     """Return whether a path has a video extension and is not a folder."""
     return path.suffix.lower() in EXTENSIONS and not path.is_dir()
+
+
+@dataclass(frozen=True)
+class SelectedFrame:
+    """Keyframe of a video."""
+
+    number: int
+    """Number of the frame in the video, from 0."""
+    time_s: float
+    """Time stamp of the frame in the container, in seconds."""
+    shot: int
+    """Number of the shot, from 0, which a cut separates from the next shot."""
+    reason: Reason
+    """Reason (``KeyframeReason``) why the frame is a keyframe."""
+    sharpness: float
+    """Variance of the Laplacian."""
+    motion: float
+    """Motion since the previous keyframe, relative to the motion that makes a keyframe."""
+
+    @property
+    def name(self) -> str:
+        """File name, numbered within the shot, so that no neighbors are matched across a cut."""
+        shot = f"shot{self.shot + 1}_" if self.shot else ""
+        return f"{shot}frame_{self.number:06d}.jpg"
+
+    def to_json(self) -> dict[str, Any]:
+        """Convert the keyframe to an entry of ``frames.json``."""
+        return {**vars(self), "reason": self.reason.to_json()}
+
+    @classmethod
+    def from_json(cls, entry: Mapping[str, Any]) -> SelectedFrame:
+        """Read an entry of ``frames.json``."""
+        return cls(**{**entry, "reason": reason_from_json(KeyframeReason, entry["reason"])})
+
+
+@dataclass(frozen=True)
+class VideoSelection:
+    """Keyframes of a video, and what was found while reading the video."""
+
+    keyframes: tuple[SelectedFrame, ...]
+    num_frames: int
+    """Number of decoded frames."""
+    duration_s: float
+    """Time stamp of the last frame in seconds."""
+    num_over_budget: int = 0
+    """Number of keyframes that were dropped because of ``max_frames``."""
+
+    @property
+    def numbers(self) -> list[int]:
+        """Frame numbers of the keyframes, ascending."""
+        return [frame.number for frame in self.keyframes]
+
+    def describe(self) -> dict[str, Any]:
+        """Describe the selection for ``summary.json``."""
+        reasons = [frame.reason.code.value for frame in self.keyframes]
+        shots = {frame.shot: frame for frame in reversed(self.keyframes)}
+        return {
+            "frames": self.num_frames,
+            "duration_s": self.duration_s,
+            "keyframes": len(self.keyframes),
+            "keyframe_reasons": {code: reasons.count(code) for code in dict.fromkeys(reasons)},
+            "keyframes_over_budget": self.num_over_budget,
+            "cuts_s": [shots[shot].time_s for shot in sorted(shots) if shot],
+        }
 
 
 def extract_frames(
@@ -82,21 +161,48 @@ def extract_frames(
         InputError: the file is not a video or is damaged, or the camera does not move.
     """
     folder = output / FRAMES
-    origin: dict[str, Any] = {"sha256": _digest(video), "options": options.model_dump(mode="json")}
+    selected = options.model_dump(mode="json", exclude={"trajectory_every"})
     telemetry = read_telemetry(video)
-    if telemetry.points:
-        origin["telemetry"] = telemetry.digest
-    if _read_list(folder / _LIST) == origin:
+    digest = telemetry.digest if telemetry.points else None
+    origin = dict(zip(_ORIGIN, (_digest(video), selected, digest), strict=True))
+    content = _read_list(folder / _LIST)
+    if content is not None and {key: content.get(key) for key in _ORIGIN} == origin:
         return folder
-    origin[VERSION] = FORMAT
-    chosen = choose_frames(video, options, progress)
+    selection = choose_frames(video, options, progress)
+    names = {frame.number: frame.name for frame in selection.keyframes}
     with replace_entries(output, (FRAMES,)) as fresh:
         (fresh / FRAMES).mkdir()
-        for number, frame in read_frames(video, frozenset(chosen)):
-            path = fresh / FRAMES / f"frame_{number:06d}.jpg"
-            path.write_bytes(telemetry.add_exif(encode_frame(frame), number))
-        (fresh / FRAMES / _LIST).write_text(json.dumps(origin), encoding="utf-8")
+        for frame in read_frames(video, frozenset(names)):
+            path = fresh / FRAMES / names[frame.number]
+            path.write_bytes(telemetry.add_exif(encode_frame(frame.image), frame.number))
+        content = {
+            VERSION: FORMAT,
+            **origin,
+            **vars(selection),
+            "keyframes": [frame.to_json() for frame in selection.keyframes],
+        }
+        (fresh / FRAMES / _LIST).write_text(json.dumps(content, indent=1), encoding="utf-8")
     return folder
+
+
+def read_selection(folder: Path) -> VideoSelection:
+    """Read the keyframes from ``frames.json`` in the folder that :func:`extract_frames` wrote.
+
+    Raises:
+        InputError: the file is missing or damaged.
+    """
+    content = _read_list(folder / _LIST)
+    try:
+        if content is None:
+            raise ValueError("the file is missing or has another format")
+        keyframes = tuple(map(SelectedFrame.from_json, content["keyframes"]))
+        names = ("num_frames", "duration_s", "num_over_budget")
+        return VideoSelection(keyframes, *(content[name] for name in names))
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{folder / _LIST}: the list of keyframes cannot be read ({error}); delete the folder "
+            f"to extract the keyframes again"
+        ) from error
 
 
 def encode_frame(frame: UInt8) -> bytes:
@@ -106,23 +212,24 @@ def encode_frame(frame: UInt8) -> bytes:
 
 def choose_frames(
     video: Path, options: VideoOptions, progress: Progress | None = None
-) -> list[int]:
-    """Select frames of a video; return their frame numbers in order.
+) -> VideoSelection:
+    """Select keyframes of a video, which is read frame by frame.
 
     Points are tracked from each selected frame with Lucas-Kanade optical flow. The next frame is
     selected when the tracked points have moved by ``options.motion`` or only the share
     ``options.overlap`` of the points is still tracked. If an earlier frame nearby is sharper, the
-    earlier frame is selected instead.
+    earlier frame is selected instead. A cut starts a new shot.
 
     Raises:
         InputError: as :func:`extract_frames`.
     """
     announced = _read_frame_count(video)
     chooser = _Chooser(options)
-    decoded = 0
-    for number, frame in read_frames(video):
-        decoded = number + 1
-        chooser.process(_Frame(number, _gray(frame, _TRACKED_SIDE), _sharpness(frame)))
+    decoded, duration_s = 0, 0.0
+    for frame in read_frames(video):
+        decoded, duration_s = frame.number + 1, frame.time_s
+        gray, sharpness = gray_image(frame.image, _TRACKED_SIDE), _sharpness(frame.image)
+        chooser.process(_Frame(frame.number, frame.time_s, gray, sharpness))
         if progress is not None:
             progress(decoded, max(announced, decoded))
     if decoded < _MIN_FRAME_RATIO * announced:
@@ -133,17 +240,54 @@ def choose_frames(
             f"{video}: the camera hardly moves in its {decoded} frames. A reconstruction needs "
             f"images from several places; move the camera while filming"
         )
-    if len(chosen) > options.max_frames:
-        text = "%s: %d frames were chosen, %d evenly spaced ones are used (inputs.video.max_frames)"
-        _log.warning(text, video, len(chosen), options.max_frames)
-        rows = np.linspace(0, len(chosen) - 1, options.max_frames).round().astype(int)
-        chosen = [chosen[row] for row in rows]
-    return chosen
+    num_over_budget = max(0, len(chosen) - options.max_frames)
+    if num_over_budget:
+        text = (
+            "%s: %d keyframes were selected, and the %d with the least motion are dropped; raise "
+            "inputs.video.max_frames to use all keyframes"
+        )
+        _log.warning(text, video, len(chosen), num_over_budget)
+        chosen = thin_keyframes(chosen, options.max_frames)
+    return VideoSelection(tuple(chosen), decoded, duration_s, num_over_budget)
+
+
+def thin_keyframes(frames: Sequence[SelectedFrame], count: int) -> list[SelectedFrame]:
+    """Drop keyframes until ``count`` remain, those with the least motion to both neighbors first.
+
+    The first and the last keyframe of a shot remain as long as other keyframes can be dropped.
+    """
+    motion = [frame.motion for frame in frames]
+    before, after = list(range(-1, len(frames) - 1)), list(range(1, len(frames) + 1))
+
+    def cost(row: int) -> float:
+        inner = before[row] >= 0 and after[row] < len(frames)
+        inner = inner and frames[before[row]].shot == frames[after[row]].shot
+        return motion[row] + motion[after[row]] if inner else np.inf
+
+    heap = [(cost(row), row) for row in range(len(frames))]
+    heapq.heapify(heap)
+    dropped: set[int] = set()
+    while len(frames) - len(dropped) > count:
+        value, row = heapq.heappop(heap)
+        if row in dropped or value != cost(row):
+            continue  # the cost has changed since the entry was pushed
+        dropped.add(row)
+        previous, following = before[row], after[row]
+        if following < len(frames):
+            motion[following] += motion[row]
+            before[following] = previous
+        if previous >= 0:
+            after[previous] = following
+        for neighbor in (previous, following):
+            if 0 <= neighbor < len(frames):
+                heapq.heappush(heap, (cost(neighbor), neighbor))
+    return [frame for row, frame in enumerate(frames) if row not in dropped]
 
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
     number: int
+    time_s: float
     gray: UInt8
     sharpness: float
 
@@ -153,48 +297,74 @@ class _Chooser:
     """Selector of frames by the motion of points tracked from the last selected frame."""
 
     options: VideoOptions
-    chosen: list[int] = field(default_factory=list)
+    chosen: list[SelectedFrame] = field(default_factory=list)
     _track: _Track | None = None
-    _candidates: list[tuple[float, _Frame]] = field(default_factory=list)
+    _candidates: list[tuple[_Motion, _Frame]] = field(default_factory=list)
+    _shot: int = 0
 
     def process(self, frame: _Frame) -> None:
         """Track points into the next frame of the video and select frames."""
         if self._track is None:
-            self._take(frame)
+            self._take(frame, _Motion(0.0, KeyframeReason.FIRST.because()))
             return
-        way = self._track.follow(frame.gray, self.options)
-        if way < _EARLY_RATIO:
+        motion = self._track.follow(frame.gray, self.options)
+        if motion.reason.code is KeyframeReason.CUT:
+            self._start_shot(frame, motion)
+            return
+        if motion.ratio < _EARLY_RATIO:
             self._candidates.clear()  # the camera is back at the last selected frame
+            first = self.chosen[-1]
             if (
-                len(self.chosen) == 1
+                (len(self.chosen) == 1 or self.chosen[-2].shot != first.shot)
                 and frame.sharpness > self._track.sharpness
-                and way < _EARLY_RATIO / 2
+                and motion.ratio < _EARLY_RATIO / 2
             ):
-                self.chosen.clear()  # replace the first frame by a sharper frame
-                self._take(frame)
+                self.chosen.pop()  # replace the first frame of the shot by a sharper frame
+                self._take(frame, _Motion(0.0, first.reason))
             return
-        self._candidates.append((way, frame))
-        if way >= 1 or len(self._candidates) >= _MAX_CANDIDATES:
+        self._candidates.append((motion, frame))
+        if motion.ratio >= 1 or len(self._candidates) >= _MAX_CANDIDATES:
             self._take_sharpest()
 
-    def finish(self) -> list[int]:
-        """Select from the remaining candidate frames; return the numbers of all selected frames."""
+    def finish(self) -> list[SelectedFrame]:
+        """Select from the remaining candidate frames; return all selected frames."""
         while self._candidates:
             self._take_sharpest()
         return self.chosen
 
+    def _start_shot(self, frame: _Frame, motion: _Motion) -> None:
+        """Finish the shot before a cut, and select the first frame of the next shot."""
+        while self._candidates:
+            self._take_sharpest()
+        self._shot += 1
+        self._take(frame, motion)
+
     def _take_sharpest(self) -> None:
         best = max(range(len(self._candidates)), key=lambda i: self._candidates[i][1].sharpness)
         later = [frame for _, frame in self._candidates[best + 1 :]]
-        frame = self._candidates[best][1]
+        motion, frame = self._candidates[best]
+        trigger = self._candidates[-1][0].reason
         self._candidates = []
-        self._take(frame)
+        self._take(frame, _Motion(motion.ratio, trigger))
         for following in later:
             self.process(following)
 
-    def _take(self, frame: _Frame) -> None:
-        self.chosen.append(frame.number)
+    def _take(self, frame: _Frame, motion: _Motion) -> None:
+        self.chosen.append(
+            SelectedFrame(
+                frame.number, frame.time_s, self._shot, motion.reason, frame.sharpness, motion.ratio
+            )
+        )
         self._track = _Track(frame)
+
+
+class _Motion(NamedTuple):
+    """Motion since the last keyframe."""
+
+    ratio: float
+    """Motion relative to the motion that makes a keyframe."""
+    reason: Reason
+    """Reason (``KeyframeReason``) of a keyframe with this motion."""
 
 
 class _Track:
@@ -209,10 +379,11 @@ class _Track:
         self._count = len(self._start)
         self._last = frame.gray
 
-    def follow(self, gray: UInt8, options: VideoOptions) -> float:
-        """Track points into a frame; return the ratio of their motion to the required motion."""
+    def follow(self, gray: UInt8, options: VideoOptions) -> _Motion:
+        """Track points into a frame, and measure their motion since the keyframe."""
         height, width = gray.shape
-        if len(self._now) >= _MIN_POINTS:
+        count = len(self._now)
+        if count >= _MIN_POINTS:
             there, ok, _ = cv2.calcOpticalFlowPyrLK(self._last, gray, self._now, None)
             back, ok_back, _ = cv2.calcOpticalFlowPyrLK(gray, self._last, there, None)
             tracked = (ok.ravel() > 0) & (ok_back.ravel() > 0)
@@ -220,18 +391,40 @@ class _Track:
             x, y = there[:, 0, 0], there[:, 0, 1]
             tracked &= (x >= 0) & (y >= 0) & (x < width) & (y < height)
             self._start, self._now = self._start[tracked], there[tracked]
-        self._last = gray
+        last, self._last = self._last, gray
+        if len(self._now) < _MAX_CUT_RATIO * count and _is_cut(last, gray):
+            return _Motion(1.0, KeyframeReason.CUT.because())
         if len(self._now) < _MIN_POINTS:
-            # If a blank wall or a cut hides the motion, the frame is selected.
-            return 1.0
-        moved = np.median(np.linalg.norm(self._now - self._start, axis=2))
-        lost = 1 - len(self._now) / self._count
-        return float(
-            max(moved / (options.motion * np.hypot(width, height)), lost / (1 - options.overlap))
-        )
+            # If a blank wall hides the motion, the frame is selected.
+            reason = KeyframeReason.UNTRACKED.because(num_tracks=len(self._now))
+            return _Motion(1.0, reason)
+        moved = float(np.median(np.linalg.norm(self._now - self._start, axis=2)))
+        moved_ratio = moved / float(np.hypot(width, height))
+        tracked_ratio = len(self._now) / self._count
+        by_motion = moved_ratio / options.motion
+        by_overlap = (1 - tracked_ratio) / (1 - options.overlap)
+        if by_motion >= by_overlap:
+            return _Motion(by_motion, KeyframeReason.MOVED.because(motion_ratio=moved_ratio))
+        reason = KeyframeReason.LOST_OVERLAP.because(tracked_ratio=tracked_ratio)
+        return _Motion(by_overlap, reason)
 
 
-def _gray(frame: UInt8, side: int) -> UInt8:
+def _is_cut(last: UInt8, gray: UInt8) -> bool:
+    """Return whether two successive frames look different as small pictures without contrast."""
+    small = [
+        cv2.resize(frame, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64).ravel()
+        for frame in (last, gray)
+    ]
+    spread = [picture.std() for picture in small]
+    if min(spread) < _MIN_CONTRAST:
+        return False
+    first, second = ((picture - picture.mean()) for picture in small)
+    correlation = float((first * second).mean() / (spread[0] * spread[1]))
+    return correlation < _MAX_CUT_CORRELATION
+
+
+def gray_image(frame: UInt8, side: int) -> UInt8:
+    """Convert a BGR image to gray, downscaled to at most ``side`` pixels on its longer side."""
     factor = min(1.0, side / max(frame.shape[:2]))
     size = round(frame.shape[1] * factor), round(frame.shape[0] * factor)
     small = frame if factor == 1 else cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
@@ -240,18 +433,36 @@ def _gray(frame: UInt8, side: int) -> UInt8:
 
 def _sharpness(frame: UInt8) -> float:
     """Measure sharpness by the variance of the Laplacian (Pech-Pacheco et al. 2000)."""
-    return float(cv2.Laplacian(_gray(frame, _SHARPNESS_SIDE), cv2.CV_32F).var())
+    return float(cv2.Laplacian(gray_image(frame, _SHARPNESS_SIDE), cv2.CV_32F).var())
 
 
-def read_frames(video: Path, wanted: frozenset[int] | None = None) -> Iterator[tuple[int, UInt8]]:
-    """Yield number and upright BGR image of all frames, or of the frames ``wanted``."""
+class VideoFrame(NamedTuple):
+    """Decoded frame of a video."""
+
+    number: int
+    """Number of the frame in the video, from 0."""
+    time_s: float
+    """Time stamp of the frame in seconds, larger than the time stamp of the previous frame."""
+    image: UInt8
+    """Upright BGR image (h, w, 3)."""
+
+
+def read_frames(video: Path, wanted: frozenset[int] | None = None) -> Iterator[VideoFrame]:
+    """Yield all frames of a video, or the frames with a number in ``wanted``.
+
+    Time stamps are those of the container, so the frame rate may vary. A container without
+    ascending time stamps has the time stamps of a constant frame rate.
+    """
     with _opened(video) as capture:
-        number = 0
+        step_s = 1 / (capture.get(cv2.CAP_PROP_FPS) or _DEFAULT_FPS)
+        number, time_s = 0, -np.inf
         while capture.grab() and (wanted is None or number <= max(wanted)):
+            stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
+            time_s = stamp_s if stamp_s > time_s else max(time_s, -step_s) + step_s
             if wanted is None or number in wanted:
                 ok, frame = capture.retrieve()
                 if ok and frame is not None and frame.size:
-                    yield number, frame
+                    yield VideoFrame(number, time_s, np.asarray(frame))
             number += 1
 
 
@@ -282,12 +493,12 @@ def _digest(video: Path) -> str:
         raise InputError(f"video {video} cannot be read: {error.strerror or error}") from error
 
 
-def _read_list(path: Path) -> object:
-    """Read the source video and options of the frames in ``frames.json``, None if unreadable."""
+def _read_list(path: Path) -> dict[str, Any] | None:
+    """Read the origin and the keyframes in ``frames.json``, None if unreadable or incomplete."""
     try:
-        origin = json.loads(path.read_text(encoding="utf-8"))
-        check_version(origin, FORMAT, path)
-        origin.pop(VERSION, None)
-    except (OSError, ValueError, AttributeError, RecursionError, InputError):
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        check_version(content, FORMAT, path)
+        content["keyframes"]
+    except (OSError, ValueError, KeyError, AttributeError, TypeError, RecursionError, InputError):
         return None
-    return origin
+    return content

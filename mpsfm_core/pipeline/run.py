@@ -34,7 +34,7 @@ from mpsfm_core.inputs.matches import (
     matches_from_hloc,
 )
 from mpsfm_core.inputs.models import Poses, describe_name_difference, match_names, read_poses
-from mpsfm_core.inputs.video import extract_frames, is_video
+from mpsfm_core.inputs.video import VideoSelection, extract_frames, is_video, read_selection
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
@@ -49,6 +49,7 @@ from mpsfm_core.pipeline import precompile, resources
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, MappingCheckpoints
 from mpsfm_core.pipeline.provider_resolution import ProviderResolution, resolve_providers
 from mpsfm_core.pipeline.stages import Stages
+from mpsfm_core.pipeline.trajectory import localize_frames
 from mpsfm_core.providers.provider_config import FROM_MATCHER
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
@@ -71,6 +72,7 @@ from mpsfm_core.results.summary import (
     describe_reconstructions,
     describe_versions,
 )
+from mpsfm_core.results.trajectory import TrajectoryFrame, describe_trajectory
 from mpsfm_core.results.writer import ComponentResult, update_summary, write_failure, write_results
 from mpsfm_core.support.disk_arrays import DiskArrays
 from mpsfm_core.support.files import lock_output_folder
@@ -270,6 +272,8 @@ class _Run:
         self._georeference_report: dict[str, object] | None = None
         self._dense_reports: list[dict[str, Any]] | None = None
         self._doubts: tuple[Reason, ...] = ()
+        self._selection: VideoSelection | None = None
+        self._trajectory: list[TrajectoryFrame] = []
         self._estimate = resources.ResourceEstimate(0, 0, 0)
         self._children = ChildMemoryMonitor()
         self._checkpoints: list[MappingCheckpoints | DenseCheckpoints] = []
@@ -318,6 +322,7 @@ class _Run:
             self._fail(images, extraction, mapping, originals)
         mapping = self._georeference(images, mapping)
         mapping = self._densify(hold_out(mapping, self._config.dense.hold_out_every), originals)
+        self._localize_frames(mapping, originals)
         result = self._write_results(images, extraction, mapping, originals)
         self._delete_checkpoints()
         self._write_report()
@@ -358,6 +363,7 @@ class _Run:
             self._image_folder = extract_frames(
                 video, self._output, self._config.inputs.video, progress
             )
+            self._selection = read_selection(self._image_folder)
 
     def _load_inputs(self) -> ImageSet:
         """Read image headers, intrinsics, poses and imported matches; check memory and disk."""
@@ -516,6 +522,24 @@ class _Run:
                 self._dense_reports.append(report.describe())
         return replace(mapping, reconstructions=tuple(dense_parts))
 
+    def _localize_frames(self, mapping: MappingResult, originals: OriginalImages) -> None:
+        """Estimate the poses of the frames of a video between its keyframes."""
+        every, video = self._config.inputs.video.trajectory_every, self._source.video
+        if video is None or self._selection is None or not every:
+            return
+        with self._stages.stage("trajectory"):
+            progress = partial(self._stages.stage_progress, "trajectory")
+            self._trajectory = localize_frames(
+                video, self._selection, mapping.reconstructions, originals, every, progress
+            )
+
+    def _describe_video(self) -> dict[str, Any] | None:
+        """Describe the keyframes and the trajectory of a video, None for photos."""
+        if self._selection is None:
+            return None
+        trajectory = describe_trajectory(self._trajectory) if self._trajectory else None
+        return {**self._selection.describe(), "trajectory": trajectory}
+
     def _write_results(
         self,
         images: ImageSet,
@@ -537,7 +561,13 @@ class _Run:
             else:
                 seed, options = config.runtime.seed, config.results
                 summary = write_results(
-                    self._output, components, originals, options, summarize, seed
+                    self._output,
+                    components,
+                    originals,
+                    options,
+                    summarize,
+                    seed,
+                    self._trajectory,
                 )
         return ReconstructionResult(models[0], models[1:], mapping, summary, self._output)
 
@@ -607,6 +637,7 @@ class _Run:
             "config": config.model_dump(mode="json"),
             "versions": describe_versions(),
             "photos": None if self._image_folder is None else str(self._image_folder.resolve()),
+            "video": self._describe_video(),
             "matches_from": None if self._imported is None else self._imported.source,
             "images": describe_images(images, extraction.report, mapping, originals),
             "pairs": describe_pairs(extraction.report, mapping, extraction.problem),

@@ -14,8 +14,10 @@ from mpsfm_core.data.decisions import (
     CameraReason,
     ChoiceReason,
     DoubtReason,
+    FrameReason,
     GpsReason,
     ImageReason,
+    KeyframeReason,
     PairReason,
     ProviderReason,
     Reason,
@@ -210,6 +212,44 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "GPS positions contradict the model",
         "Only {num_inliers} of {num_positions} GPS positions fit the model.",
         _NO_REMEDY,
+    ),
+    KeyframeReason.FIRST: ("first frame", "The frame is the first of the video.", _NO_REMEDY),
+    KeyframeReason.MOVED: (
+        "the camera moved",
+        "The tracked points moved by {motion_ratio:.0%} of the image diagonal since the previous "
+        "keyframe.",
+        _NO_REMEDY,
+    ),
+    KeyframeReason.LOST_OVERLAP: (
+        "the view changed",
+        "Only {tracked_ratio:.0%} of the points of the previous keyframe are still tracked.",
+        _NO_REMEDY,
+    ),
+    KeyframeReason.UNTRACKED: (
+        "no motion can be measured",
+        "Only {num_tracks} points can be tracked, for example in front of a blank wall.",
+        "Film surfaces with texture, and turn the camera slowly.",
+    ),
+    KeyframeReason.CUT: (
+        "cut",
+        "A cut separates the frame from the previous frame of the video.",
+        _NO_REMEDY,
+    ),
+    FrameReason.TOO_FEW_TRACKS: (
+        "too few tracked points",
+        "{num_tracks} points can be tracked from the neighboring keyframes into the frame; "
+        "{min_tracks} are needed.",
+        "Film with less motion blur, and film surfaces with texture.",
+    ),
+    FrameReason.TOO_FEW_INLIERS: (
+        "tracked points contradict each other",
+        "{num_inliers} tracked points fit one pose of the frame; {min_inliers} are needed.",
+        "Film with less motion blur, and avoid views that show mostly moving objects.",
+    ),
+    FrameReason.NO_KEYFRAME: (
+        "no registered keyframe",
+        "No keyframe of the same shot of the video is registered.",
+        _ADD_OVERLAP,
     ),
     DoubtReason.UNEXPLAINED_PAIRS: (
         "matching photos that the model keeps apart",

@@ -52,6 +52,7 @@ from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.options import ResultOptions
 from mpsfm_core.results.original_images import OriginalImages, exported_image_name
 from mpsfm_core.results.ply import write_cloud, write_ply
+from mpsfm_core.results.trajectory import TrajectoryFrame, write_trajectory
 from mpsfm_core.results.transforms_json import supports_camera, write_transforms
 from mpsfm_core.results.views import write_views
 from mpsfm_core.support.files import replace_entries, write_file
@@ -97,6 +98,7 @@ def write_results(
     options: ResultOptions,
     summarize: Callable[[], Summary],
     seed: int = 0,
+    trajectory: Sequence[TrajectoryFrame] = (),
 ) -> Summary:
     """Write the results of a successful run.
 
@@ -108,6 +110,7 @@ def write_results(
         summarize: function that returns the content of ``summary.json``, called after all other
             files are written.
         seed: random seed of the selection of pixels for ``dense.ply``.
+        trajectory: localized frames of a video.
 
     Returns:
         Content of the written file ``summary.json``.
@@ -134,6 +137,8 @@ def write_results(
             _write_nerfstudio(folder / TRANSFORMS, output, largest, photos)
         if options.report:
             write_views(folder / VIEWS, photos.problem, photos.view)
+        if trajectory:
+            write_trajectory(folder, trajectory)
         summary = summarize()
         _write_json(folder / SUMMARY, summary)
     return summary

@@ -90,14 +90,14 @@ def test_rpe_measures_steps() -> None:
     assert exact is not None
     assert exact.rpe_rmse == pytest.approx(0, abs=1e-9)
     assert exact.rpe_rmse_deg == pytest.approx(0, abs=1e-6)
-    # The last image is rotated by 4 degrees about its center, so the last relative pose has errors
-    # of rotation and translation.
+    # The first image is rotated by 4 degrees about its center, so the first relative pose has
+    # errors of rotation and translation.
     turn = Rotation.from_euler("y", 4, degrees=True).as_matrix()
     turned = dict(truth)
-    turned["5"] = (turn @ truth["5"][0], turn @ truth["5"][1])
+    turned["0"] = (turn @ truth["0"][0], turn @ truth["0"][1])
     errors = trajectory_errors(turned, truth)
     assert errors is not None
-    assert errors.step_turns_deg == pytest.approx([0, 0, 0, 0, 4], abs=1e-6)
-    step = truth["5"][1] - truth["5"][0] @ truth["4"][0].T @ truth["4"][1]
-    assert errors.steps[-1] == pytest.approx(np.linalg.norm(turn @ step - step), rel=1e-6)
-    assert errors.steps[:-1] == pytest.approx([0] * 4, abs=1e-9)
+    assert errors.step_turns_deg == pytest.approx([4, 0, 0, 0, 0], abs=1e-6)
+    step = truth["0"][1] - truth["0"][0] @ truth["1"][0].T @ truth["1"][1]
+    assert errors.steps[0] == pytest.approx(np.linalg.norm(turn @ step - step), rel=1e-6)
+    assert errors.steps[1:] == pytest.approx([0] * 4, abs=1e-9)

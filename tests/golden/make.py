@@ -175,9 +175,12 @@ def write_others(output: Path) -> None:
     options = VideoOptions()
     folder = output / video.FRAMES
     folder.mkdir()
-    origin = {"sha256": video._digest(clip), "options": options.model_dump(mode="json")}
-    origin = {video.VERSION: video.FORMAT, **origin}
-    (folder / video._LIST).write_text(json.dumps(origin))
+    selected = options.model_dump(mode="json", exclude={"trajectory_every"})
+    origin = dict(zip(video._ORIGIN, (video._digest(clip), selected, None), strict=True))
+    selection = {"num_frames": 9, "duration_s": 0.3, "num_over_budget": 0, "keyframes": []}
+    (folder / video._LIST).write_text(
+        json.dumps({video.VERSION: video.FORMAT, **origin, **selection})
+    )
     environment = Environment(output / "environment")
     environment.ask = lambda **_: _description(Registry.discover(environments=False))  # type: ignore[method-assign,assignment]
     environment.refresh()

@@ -10,10 +10,19 @@ import numpy as np
 import pytest
 
 from mpsfm_core.data import PinholeCamera
+from mpsfm_core.data.decisions import KeyframeReason
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.image_search import find_images
 from mpsfm_core.inputs.options import VideoOptions
-from mpsfm_core.inputs.video import choose_frames, extract_frames, is_video
+from mpsfm_core.inputs.video import (
+    SelectedFrame,
+    choose_frames,
+    extract_frames,
+    is_video,
+    read_frames,
+    read_selection,
+    thin_keyframes,
+)
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 SIZE = (160, 120)
@@ -40,8 +49,8 @@ def write(path: Path, frames: list[np.ndarray]) -> Path:
 
 def test_frames_are_chosen_by_motion_and_not_by_time(turn, tmp_path: Path) -> None:
     slow = [frame for frame in turn[:20] for _ in range(3)] + turn[20:]
-    steady = choose_frames(write(tmp_path / "a.avi", turn), VideoOptions())
-    waiting = choose_frames(write(tmp_path / "b.avi", slow), VideoOptions())
+    steady = choose_frames(write(tmp_path / "a.avi", turn), VideoOptions()).numbers
+    waiting = choose_frames(write(tmp_path / "b.avi", slow), VideoOptions()).numbers
     assert 5 <= len(steady) <= 15
     assert abs(len(waiting) - len(steady)) <= 1
     gaps = np.diff([number // 3 if number < 60 else number - 40 for number in waiting])
@@ -50,24 +59,74 @@ def test_frames_are_chosen_by_motion_and_not_by_time(turn, tmp_path: Path) -> No
 
 def test_waiting_camera_gives_no_frames(turn, tmp_path: Path) -> None:
     frames = [*turn[:20], *[turn[20]] * 40, *turn[20:]]
-    chosen = choose_frames(write(tmp_path / "v.avi", frames), VideoOptions())
+    chosen = choose_frames(write(tmp_path / "v.avi", frames), VideoOptions()).numbers
     assert sum(20 < number < 60 for number in chosen) <= 1
 
 
 def test_blurred_frames_are_not_selected(turn, tmp_path: Path) -> None:
     blurred = {n for n in range(len(turn)) if n % 3}
     frames = [cv2.blur(f, (13, 1)) if n in blurred else f for n, f in enumerate(turn)]
-    chosen = choose_frames(write(tmp_path / "v.avi", frames), VideoOptions())
+    chosen = choose_frames(write(tmp_path / "v.avi", frames), VideoOptions()).numbers
     assert len(chosen) >= 5
     assert len(blurred & set(chosen)) <= 1  # two thirds of all frames
 
 
-def test_frames_above_maximum_are_thinned_evenly(turn, tmp_path: Path, caplog) -> None:
+def test_keyframes_over_budget_with_least_motion_are_dropped(turn, tmp_path: Path, caplog) -> None:
     options = VideoOptions(motion=0.02, max_frames=6)
-    chosen = choose_frames(write(tmp_path / "v.avi", turn), options)
-    assert len(chosen) == 6
+    selection = choose_frames(write(tmp_path / "v.avi", turn), options)
+    chosen = selection.numbers
+    assert len(chosen) == 6 and selection.num_over_budget > 0
     assert max(np.diff(chosen)) <= 2.5 * min(np.diff(chosen))
     assert "max_frames" in caplog.text
+
+
+def test_thinning_keeps_quick_turns_and_ends_of_shots() -> None:
+    def frame(number: int, motion: float, shot: int = 0) -> SelectedFrame:
+        return SelectedFrame(number, number / 30, shot, KeyframeReason.FIRST.because(), 1.0, motion)
+
+    slow = [frame(number, 1.0) for number in range(10)]
+    quick = [frame(number, 3.0) for number in range(10, 14)]
+    second = [frame(number, 0.0, shot=1) for number in (14, 15)]
+    kept = [f.number for f in thin_keyframes([*slow, *quick, *second], 10)]
+    assert {0, 13, 14, 15} <= set(kept) and {10, 11, 12} <= set(kept)
+    assert len(kept) == 10
+
+
+def test_cut_starts_a_shot_whose_frames_are_numbered_apart(turn, tmp_path: Path) -> None:
+    scene = room_scene(seed=7)
+    other = [
+        cv2.cvtColor(scene.render(CAMERA, pose).rgb, cv2.COLOR_RGB2BGR)[::-1]
+        for pose in arc_poses(10, 2.0)
+    ]
+    video = write(tmp_path / "v.avi", [*turn[:20], *other])
+    selection = read_selection(extract_frames(video, tmp_path / "out", VideoOptions()))
+    shots = {frame.shot: frame for frame in reversed(selection.keyframes)}
+    assert sorted(shots) == [0, 1] and shots[1].number in range(20, 24)
+    assert shots[1].reason.code is KeyframeReason.CUT
+    assert selection.describe()["cuts_s"] == [pytest.approx(shots[1].number / 30)]
+    names = find_images(tmp_path / "out" / "frames")
+    assert {name.startswith("shot2_") for name in names} == {True, False}
+
+
+def test_time_stamps_of_variable_frame_rate_are_those_of_the_container(turn, tmp_path) -> None:
+    """The last 10 of 40 frames of the MP4 file have twice the duration of the others."""
+    video = tmp_path / "v.mp4"
+    writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 30, SIZE)
+    for frame in turn:
+        writer.write(frame)
+    writer.release()
+    data = bytearray(video.read_bytes())
+    for name in (b"moov", b"trak", b"mdia", b"minf", b"stbl", b"stts"):
+        start = data.index(name) - 4
+        data[start : start + 4] = struct.pack(">I", struct.unpack_from(">I", data, start)[0] + 8)
+    entry = data.index(b"stts") + 12  # ISO 14496-12: name, version and flags, number of entries
+    count, duration = struct.unpack_from(">II", data, entry)
+    assert count == 40
+    data[entry - 4 : entry + 8] = struct.pack(">IIIII", 2, 30, duration // 2, 10, duration)
+    video.write_bytes(data)
+    times = [frame.time_s for frame in read_frames(video)]
+    expected = np.concatenate([np.arange(31), 30 + 2 * np.arange(1, 10)]) / 60
+    assert times == pytest.approx(expected.tolist(), abs=2e-3)
 
 
 def test_extracted_frames_are_reused(turn, tmp_path: Path) -> None:
@@ -75,7 +134,7 @@ def test_extracted_frames_are_reused(turn, tmp_path: Path) -> None:
     assert is_video(video)
     folder = extract_frames(video, tmp_path / "out", VideoOptions())
     names = find_images(folder)
-    assert names == [f"frame_{n:06d}.jpg" for n in choose_frames(video, VideoOptions())]
+    assert names == [f"frame_{n:06d}.jpg" for n in choose_frames(video, VideoOptions()).numbers]
     picture = cv2.imread(str(folder / names[2])).astype(float)
     difference = [np.abs(picture - frame).mean() for frame in turn]
     assert np.argmin(difference) == int(names[2][6:12])
@@ -97,7 +156,7 @@ def test_truncated_video_is_used_until_its_end(turn, tmp_path: Path) -> None:
     video = write(tmp_path / "v.avi", turn)
     data = video.read_bytes()
     video.write_bytes(data[: len(data) // 2])
-    chosen = choose_frames(video, VideoOptions())
+    chosen = choose_frames(video, VideoOptions()).numbers
     assert 3 <= len(chosen) <= 8
 
 

@@ -40,8 +40,8 @@ def _read_frames(path: Path) -> Iterator[CapturedFrame]:
     rows = _read_rows(path / _ODOMETRY)
     shared = _read_matrix(path / _MATRIX)
     video = path / _VIDEO
-    chosen = frozenset(choose_frames(video, VideoOptions())) & rows.keys()
-    for number, pixels in read_frames(video, chosen):
+    chosen = frozenset(choose_frames(video, VideoOptions()).numbers) & rows.keys()
+    for number, _, pixels in read_frames(video, chosen):
         row, where = rows[number], f"{path / _ODOMETRY}, frame {number}"
         try:
             pose = np.array([float(row[key]) for key in _POSE])

@@ -1,0 +1,305 @@
+"""Reconstruct rendered walks through several rooms, and compare with COLMAP's mapper.
+
+    python -m benchmarks.walks [--walks 2] [--config sift] [--records DIR]
+
+A walk is a video of a loop through four furnished rooms with equal doors. The video has camera
+shake, noise, exposure changes and blurred frames, and its camera poses are known. Each video is
+reconstructed with an unknown focal length, and the poses of all frames are compared with the true
+poses. COLMAP extracts and matches SIFT features of the same keyframes (sequential matching without
+loop detection) and maps them. The frames of hololens_room are a video without its blurred frames.
+Results of earlier calls in DIR are not computed again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pycolmap
+
+from benchmarks._scenes import MPSFM, shared_folder
+from mpsfm_core.data import Pose, UInt8
+from mpsfm_core.evaluation.alignment import trajectory_errors
+from mpsfm_core.evaluation.trajectories import (
+    Trajectory,
+    count_missing,
+    evaluate_trajectory,
+    read_trajectory,
+)
+from mpsfm_core.inputs.models import reconstruction_poses
+from mpsfm_core.results.summary import read_summary
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "plugins" / "mpsfm-compact"))
+
+SIZE = 480, 360
+FOCAL_PX = 380.0
+FPS = 20.0
+SPEED = 0.8
+"""Walking speed in meters per second."""
+ROOM = np.array([4.4, 3.6])
+"""Length and width of each of the four rooms in meters."""
+HEIGHT = 2.6
+DOOR = 1.0
+"""Width of the door openings in meters."""
+_TEXTURES = 64
+Record = dict[str, Any]
+
+
+def build_rooms(rng: np.random.Generator) -> tuple[Any, Any, Any]:
+    """Build four rooms around the origin, each with doors to two neighbors."""
+    from training.synthetic.builder import Builder
+    from training.synthetic.furniture import FURNITURE, Frame
+    from training.synthetic.textures import make_textures
+    from training.synthetic.worlds import _wall
+
+    b = Builder(rng, _TEXTURES)
+    length, width = 2 * ROOM
+    b.box((0, 0, -0.1), (length + 1, width + 1, 0.1), b.look((0.8, 2)), shadow=False)
+    b.box((0, 0, HEIGHT), (length + 1, width + 1, 0.1), b.look((1, 3)), shadow=False)
+    door = b.look((1, 2))
+    for side in range(4):
+        along, away = (width, length) if side % 2 == 0 else (length, width)
+        yaw = np.pi + side * np.pi / 2
+        outward = np.array([np.cos(yaw), np.sin(yaw)]) * -away / 2
+        f = Frame(b, *outward, yaw)
+        b.box(f.at(0, -0.05, 0), (0.1, along + 0.2, HEIGHT), b.look((1, 3)), yaw, shadow=False)
+        for half in (-1, 1):
+            _wall(b, Frame(b, *f.at(half * along / 4, 0, 0)[:2], yaw), along / 2 - 0.4, HEIGHT)
+            for offset in (-1.1, 0.2, 1.3):
+                place = f.at(half * along / 4 + offset, 0.03, 0)
+                FURNITURE[rng.integers(len(FURNITURE))](b, place[0], place[1], yaw)
+        # An interior wall from the outer wall to the center, with a door opening in its middle.
+        inner = Frame(b, *(outward / 2), yaw + np.pi / 2)
+        half_length = away / 2
+        part = (half_length - DOOR) / 2
+        for end in (-1, 1):
+            u = end * (DOOR + part) / 2
+            look = b.look((0.6, 2))
+            b.box(inner.at(u, 0, 0), (0.12, part, HEIGHT), look, inner.yaw, shadow=False)
+            for face in (-1, 1):
+                picture = inner.at(u, 0.065 * face, rng.uniform(1.0, 1.4))
+                b.box(picture, (0.02, *rng.uniform(0.4, 0.9, 2)), b.look((0.4, 0.9)), inner.yaw)
+            b.box(inner.at(end * (DOOR / 2 - 0.03), 0, 0), (0.16, 0.06, 2.1), door, inner.yaw)
+        b.box(inner.at(0, 0, 2.1), (0.12, DOOR, HEIGHT - 2.1), b.look((0.6, 2)), inner.yaw)
+    # Without lamps there are no shadows to compute, which is several times faster.
+    b.lights.clear()
+    b.ambient = ((0.9,) * 3, (0.5,) * 3)
+    return b.arrays(make_textures(rng, _TEXTURES, ()))
+
+
+def make_path(rng: np.random.Generator, rounds: float = 1.15) -> list[Pose]:
+    """Return ``cam_from_world`` of each frame of a walk around the center through all rooms."""
+    a, c = ROOM / 2
+    perimeter = 4 * (a + c)
+    count = int(rounds * perimeter / SPEED * FPS)
+    turn = np.linspace(0, 2 * np.pi * rounds, count)
+    # A rounded rectangle through the middle of the door openings.
+    stretch = 1.0 / np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn))) ** 0.6
+    xy = np.column_stack([a * np.cos(turn) * stretch, c * np.sin(turn) * stretch])
+    xy = cv2.GaussianBlur(xy, (1, 0), sigmaX=1e-6, sigmaY=0.25 * FPS, borderType=cv2.BORDER_REFLECT)
+    heading = np.gradient(xy, axis=0)
+    yaw = np.unwrap(np.arctan2(heading[:, 1], heading[:, 0]))
+    yaw = yaw - 0.35 + 0.45 * np.sin(4 * turn + rng.uniform(0, 6))
+    shake = rng.normal(size=(count, 6))
+    shake = cv2.GaussianBlur(shake, (1, 0), sigmaX=1e-6, sigmaY=0.12 * FPS)
+    shake *= np.array([0.02, 0.02, 0.02, 0.012, 0.012, 0.012]) / shake.std(axis=0)
+    poses = []
+    for place, angle, (dx, dy, dz, pitch, roll, extra) in zip(xy, yaw, shake, strict=True):
+        angle += extra
+        tilt = -0.12 + pitch
+        forward = np.array(
+            [np.cos(angle) * np.cos(tilt), np.sin(angle) * np.cos(tilt), np.sin(tilt)]
+        )
+        right = np.cross(forward, [0, 0, 1.0])
+        right /= np.linalg.norm(right)
+        rotation = np.stack([right, np.cross(forward, right), forward])
+        cosine, sine = np.cos(roll), np.sin(roll)
+        rotation = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]]) @ rotation
+        center = np.array([place[0] + dx, place[1] + dy, 1.5 + dz])
+        poses.append((rotation, -rotation @ center))
+    return poses
+
+
+def render_frames(
+    world: tuple[Any, Any, Any], poses: Sequence[Pose], rng: np.random.Generator
+) -> Iterator[UInt8]:
+    """Yield the BGR frames of a walk with noise, exposure changes and some blurred frames."""
+    from training.synthetic.raycast import draw
+
+    width, height = SIZE
+    gain = 1.0
+    for number, (rotation, translation) in enumerate(poses):
+        light, depth = np.zeros((height, width, 3)), np.zeros((height, width))
+        normals, kind = np.zeros((height, width, 3)), np.zeros((height, width), np.uint8)
+        to_world = np.ascontiguousarray(rotation.T)
+        center = -to_world @ translation
+        draw(*world, center, to_world, FOCAL_PX, width, height, light, depth, normals, kind)
+        gain += 0.1 * (0.3 / (light.mean() + 0.02) - gain) if number else 0.3 / light.mean() - gain
+        frame = np.clip(light * gain, 0, 1) ** (1 / 2.2) * 255
+        if rng.random() < 0.1:
+            frame = cv2.blur(frame, (9, 1) if rng.random() < 0.7 else (1, 7))
+        frame += rng.normal(0, 2.0, frame.shape)
+        yield frame.clip(0, 255).astype(np.uint8)[:, :, ::-1]
+
+
+def write_walk(folder: Path, seed: int) -> tuple[Path, list[Pose]]:
+    """Write the video of a walk, unless the folder has the video; return video and true poses."""
+    rng = np.random.default_rng([seed, 51])
+    world = build_rooms(rng)
+    poses = make_path(rng)
+    video = folder / f"walk{seed}.mp4"
+    if not video.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        part = video.with_suffix(".part.mp4")
+        writer = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"mp4v"), FPS, SIZE)
+        for frame in render_frames(world, poses, rng):
+            writer.write(np.ascontiguousarray(frame))
+        writer.release()
+        part.rename(video)
+    return video, poses
+
+
+def write_room(folder: Path) -> tuple[Path, dict[int, Pose]]:
+    """Write the images of hololens_room as a video; return video and true poses by frame."""
+    scene = shared_folder() / "data" / "hololens_room"
+    names = sorted(path.name for path in (scene / "images").iterdir())
+    video, size = folder / "hololens_room.mp4", None
+    poses = reconstruction_poses(pycolmap.Reconstruction(str(scene / "gt")))
+    by_stem = {Path(name).stem: pose for name, pose in poses.items()}
+    if not video.is_file():
+        folder.mkdir(parents=True, exist_ok=True)
+        writer = None
+        for name in names:
+            image = cv2.imread(str(scene / "images" / name))
+            assert image is not None
+            if writer is None:
+                size = image.shape[1], image.shape[0]
+                writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 4.0, size)
+            writer.write(image)
+        assert writer is not None
+        writer.release()
+    rows = {
+        n: by_stem[Path(name).stem] for n, name in enumerate(names) if Path(name).stem in by_stem
+    }
+    return video, rows
+
+
+def run_walk(video: Path, poses: Mapping[int, Pose], fps: float, config: str) -> Record:
+    """Reconstruct a video with MP-SfM, and its keyframes with COLMAP; return the errors."""
+    truth = Trajectory(np.array(sorted(poses)) / fps, tuple(poses[n] for n in sorted(poses)))
+    output = video.with_suffix("")
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    start = time.monotonic()
+    arguments = ["reconstruct", str(video), "-o", str(output), "--config", config, "--quiet"]
+    subprocess.run([*MPSFM, *arguments], check=False)
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    summary = read_summary(output / "summary.json")
+    record: Record = {
+        "walk": video.stem,
+        "seconds": time.monotonic() - start,
+        "cpu_seconds": usage.ru_utime - before.ru_utime,
+        "memory_mb": usage.ru_maxrss / 1024,
+        "video": summary["video"],
+        "stages": {name: stage["seconds"] for name, stage in summary["stages"].items()},
+    }
+    if summary["status"] == "success":
+        found = read_trajectory(output / "trajectory.txt")
+        record["mpsfm"] = evaluate_trajectory(found, truth, count_missing(output))
+        record["keyframes"] = _evaluate_model(output / "sparse", poses)
+    start = time.process_time()
+    database, mapped = output / "colmap.db", output / "colmap"
+    database.unlink(missing_ok=True)
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL")
+    names = sorted(path.name for path in (output / "frames").glob("*.jpg"))
+    frames = str(output / "frames")
+    pycolmap.extract_features(
+        database, frames, names, pycolmap.CameraMode.SINGLE, reader, device=pycolmap.Device.cpu
+    )
+    pycolmap.match_sequential(database, device=pycolmap.Device.cpu)
+    mapped.mkdir(exist_ok=True)
+    models = pycolmap.incremental_mapping(database, frames, mapped)
+    record["colmap_cpu_seconds"] = time.process_time() - start
+    if models:
+        best = max(models, key=lambda number: models[number].num_reg_images())
+        record["colmap"] = _evaluate_model(mapped / str(best), poses)
+    return record
+
+
+def _evaluate_model(folder: Path, poses: Mapping[int, Pose]) -> Record:
+    """Return the number of registered keyframes and the ATE of a COLMAP model."""
+    found = reconstruction_poses(pycolmap.Reconstruction(str(folder)))
+    numbered = {str(int(Path(name).stem[-6:])): pose for name, pose in found.items()}
+    truth = {str(number): pose for number, pose in poses.items()}
+    errors = trajectory_errors(numbered, truth)
+    return {"registered": len(found), "ate": None if errors is None else errors.ate_rmse}
+
+
+def make_table(records: Sequence[Record]) -> str:
+    """Return a table in Markdown with one line a video."""
+    lines = [
+        "| video | frames | keyframes | placed | ATE all | ATE keyframes | WATE-AUC 10 m, full | "
+        "COLMAP keyframes | ATE | memory GB | CPU s, COLMAP | CPU min per min |",
+        "| --- |" + " ---: |" * 11,
+    ]
+    for record in records:
+        video, found = record["video"], record.get("mpsfm")
+        theirs = record.get("colmap", {"registered": 0, "ate": None})
+        keyframes, minutes = video["keyframes"], video["duration_s"] / 60
+        cells = [record["walk"], video["frames"], keyframes]
+        if found is None:
+            cells += ["0 %", *["none"] * 3]
+        else:
+            areas = found["wate_auc"]
+            cells += [
+                f"{100 * found['poses'] / video['frames']:.1f} %",
+                f"{100 * found['ate_rmse']:.1f} cm",
+                f"{_centimeters(record['keyframes']['ate'])}",
+                f"{areas.get('10', float('nan')):.1f}, {areas['full']:.1f}",
+            ]
+        cells += [f"{theirs['registered']} of {keyframes}", _centimeters(theirs["ate"])]
+        cells += [f"{record['memory_mb'] / 1024:.1f}"]
+        cells += [f"{record['cpu_seconds']:.0f}, {record['colmap_cpu_seconds']:.0f}"]
+        cells += [f"{record['cpu_seconds'] / 60 / minutes:.1f}"]
+        lines.append("| " + " | ".join(map(str, cells)) + " |")
+    return "\n".join(lines)
+
+
+def _centimeters(meters: float | None) -> str:
+    return "none" if meters is None else f"{100 * meters:.1f} cm"
+
+
+def main() -> None:
+    """Reconstruct all videos and print a table in Markdown."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--walks", type=int, default=2)
+    parser.add_argument("--config", default="sift")
+    parser.add_argument("--records", type=Path)
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory() as temporary:
+        folder, records = arguments.records or Path(temporary), []
+        for number in range(arguments.walks + 1):
+            name = f"walk{number}" if number < arguments.walks else "hololens_room"
+            path = folder / f"{name}-{arguments.config}.json"
+            if not path.is_file():
+                if number < arguments.walks:
+                    video, walk = write_walk(folder, number)
+                    record = run_walk(video, dict(enumerate(walk)), FPS, arguments.config)
+                else:
+                    record = run_walk(*write_room(folder), 4.0, arguments.config)
+                path.write_text(json.dumps(record))
+            records.append(json.loads(path.read_text()))
+    print(make_table(records))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,94 @@
+"""Write the camera poses of all frames of a video."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+
+from mpsfm_core.data import Float64, Pose
+from mpsfm_core.data.decisions import Reason
+from mpsfm_core.data.result_layout import FRAME_TABLE, TRAJECTORY
+from mpsfm_core.geometry import camera_center
+
+_COLUMNS = "frame,timestamp_s,source,component,num_inliers,position_std,rotation_std_deg,reason"
+
+
+@dataclass(frozen=True, eq=False)
+class TrajectoryFrame:
+    """Frame of a video with its pose, or with the reason why it has no pose."""
+
+    number: int
+    """Number of the frame in the video, from 0."""
+    time_s: float
+    """Time stamp in seconds."""
+    source: str
+    """``keyframe``, ``tracked``, ``interpolated``, or ``none`` without a pose."""
+    component: int = 0
+    """Component of the reconstruction with the pose, 0 for the largest."""
+    pose: Pose | None = None
+    """``cam_from_world``, or None."""
+    covariance: Float64 | None = None
+    """(6, 6) covariance of rotation vector and camera center in the world frame, in radians and
+    units of the model, relative to the keyframes."""
+    num_inliers: int = 0
+    """Number of tracked points that fit the pose."""
+    reason: Reason | None = None
+    """Reason (``FrameReason``) why the frame has no measured pose."""
+
+
+def write_trajectory(folder: Path, frames: Sequence[TrajectoryFrame]) -> None:
+    """Write the poses of the largest component, and a table of all frames.
+
+    Args:
+        folder: Result folder.
+        frames: All localized frames, and all frames without a pose, ascending by number.
+    """
+    lines = [
+        " ".join(f"{value:.9g}" for value in (*camera_center(*pose), *_quaternion(pose)))
+        for frame in frames
+        if frame.component == 0 and (pose := frame.pose) is not None
+    ]
+    times = [f.time_s for f in frames if f.component == 0 and f.pose is not None]
+    text = "".join(f"{time:.6f} {line}\n" for time, line in zip(times, lines, strict=True))
+    (folder / TRAJECTORY).write_text(
+        "# timestamp tx ty tz qx qy qz qw (camera to world)\n" + text, encoding="utf-8"
+    )
+    rows = [",".join(map(str, _row(frame))) for frame in frames]
+    table = "\n".join([_COLUMNS, *rows]) + "\n"
+    (folder / FRAME_TABLE).write_text(table, encoding="utf-8")
+
+
+def describe_trajectory(frames: Sequence[TrajectoryFrame]) -> dict[str, Any]:
+    """Describe the frames of a video for ``summary.json``."""
+    sources = [frame.source for frame in frames]
+    codes = [f.reason.code.value for f in frames if f.reason is not None and f.pose is None]
+    return {
+        "frames": len(frames),
+        "sources": {source: sources.count(source) for source in dict.fromkeys(sources)},
+        "reasons": {code: codes.count(code) for code in dict.fromkeys(codes)},
+    }
+
+
+def _row(frame: TrajectoryFrame) -> list[str | int]:
+    position, rotation = "", ""
+    if frame.covariance is not None:
+        variances = np.diag(frame.covariance)
+        position = f"{np.sqrt(variances[3:].sum()):.6g}"
+        rotation = f"{np.degrees(np.sqrt(variances[:3].sum())):.6g}"
+    reason = "" if frame.reason is None else str(frame.reason.code.value)
+    component = "" if frame.pose is None else frame.component
+    time = f"{frame.time_s:.6f}"
+    return [
+        *(frame.number, time, frame.source, component, frame.num_inliers),
+        *(position, rotation, reason),
+    ]
+
+
+def _quaternion(pose: Pose) -> Float64:
+    """Return the quaternion x, y, z, w of ``world_from_cam``."""
+    return np.asarray(pycolmap.Rotation3d(np.ascontiguousarray(pose[0].T)).quat)

@@ -1,0 +1,91 @@
+"""Tests of the localization of all frames of a rendered video between keyframes with true poses."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mpsfm_core.data import MappingProblem, PinholeCamera
+from mpsfm_core.data.decisions import FrameReason, KeyframeReason
+from mpsfm_core.geometry import camera_center, rotation_angle_deg
+from mpsfm_core.inputs.images import load_images
+from mpsfm_core.inputs.video import SelectedFrame, VideoSelection, encode_frame, read_frames
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.pipeline.trajectory import localize_frames
+from mpsfm_core.results.original_images import OriginalImages
+from mpsfm_core.results.trajectory import TrajectoryFrame
+from mpsfm_core.testing.synthetic.problems import SyntheticNoise, render_mapping_image
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+
+CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
+POSES = [np.asarray(pose) for pose in arc_poses(12, 1.5)]
+KEYFRAMES = (0, 4, 8, 10)
+BLANK = 6
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a video of a turning camera, whose frame 6 is black."""
+    path, scene = tmp_path_factory.mktemp("video") / "v.avi", room_scene()
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 15, CAMERA.size)
+    for number, pose in enumerate(POSES):
+        frame = cv2.cvtColor(scene.render(CAMERA, pose).rgb, cv2.COLOR_RGB2BGR)
+        writer.write(np.zeros_like(frame) if number == BLANK else frame)
+    writer.release()
+    return path
+
+
+def reconstruct(folder: Path, names: list[str]) -> tuple[Reconstruction, OriginalImages]:
+    """Return keyframes with true poses and depth, and their images."""
+    scene, rng = room_scene(), np.random.default_rng(0)
+    images, registered = [], []
+    for row, name in enumerate(names):
+        pose = POSES[int(name[-10:-4])]
+        image = render_mapping_image(
+            name, scene, CAMERA, pose, np.zeros((0, 2)), 80, 0.01, 5.0, SyntheticNoise(), rng
+        )
+        images.append(image)
+        points = np.zeros(0, np.int64)
+        registered.append(
+            RegisteredImage(row, name, CAMERA, pose[:, :3], pose[:, 3], points, image.depth, 1.0)
+        )
+    part = Reconstruction(tuple(registered), np.zeros((0, 3)), np.zeros(0))
+    loaded = load_images(folder, CAMERA, names=names)
+    return part, OriginalImages(loaded, MappingProblem(tuple(images), ()))
+
+
+def localize(video: Path, folder: Path, every: int = 1) -> list[TrajectoryFrame]:
+    reason = KeyframeReason.FIRST.because()
+    keyframes = tuple(SelectedFrame(n, n / 15, 0, reason, 1.0, 1.0) for n in KEYFRAMES)
+    names = {frame.number: frame.name for frame in keyframes}
+    for frame in read_frames(video, frozenset(names)):
+        (folder / names[frame.number]).write_bytes(encode_frame(frame.image))
+    part, originals = reconstruct(folder, list(names.values()))
+    selection = VideoSelection(keyframes, len(POSES), 1.0)
+    return localize_frames(video, selection, [part], originals, every)
+
+
+def test_all_frames_get_their_true_pose(video: Path, tmp_path: Path) -> None:
+    frames = localize(video, tmp_path)
+    assert [frame.number for frame in frames] == list(range(12))
+    assert {frame.source for frame in frames} == {"keyframe", "tracked", "interpolated"}
+    for frame, true in zip(frames, POSES, strict=True):
+        assert frame.pose is not None and frame.covariance is not None
+        error = np.linalg.norm(camera_center(*frame.pose) - camera_center(true[:, :3], true[:, 3]))
+        is_blank = frame.number == BLANK
+        assert error < (0.1 if is_blank else 0.03), frame.number
+        turn = rotation_angle_deg(frame.pose[0] @ true[:, :3].T)
+        assert turn < (1.0 if is_blank else 0.3), frame.number
+    blank, before = frames[BLANK], frames[BLANK - 1]
+    assert blank.source == "interpolated" and blank.reason is not None
+    assert blank.reason.code in (FrameReason.TOO_FEW_TRACKS, FrameReason.TOO_FEW_INLIERS)
+    assert np.trace(blank.covariance) > np.trace(before.covariance)
+
+
+def test_every_third_frame_and_keyframes_are_localized(video: Path, tmp_path: Path) -> None:
+    frames = localize(video, tmp_path, every=3)
+    tracked = {frame.number for frame in frames if frame.source == "tracked"}
+    assert tracked and all(number % 3 == 0 for number in tracked)
