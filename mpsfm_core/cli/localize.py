@@ -86,5 +86,8 @@ def localize(
         return
     for name, reason in result.reasons.items():
         typer.echo(f"not localized: {name}: {explain(reason).text}")
+    for name, photo in result.photos.items():
+        for doubt in photo.doubts:
+            typer.echo(f"doubtful: {name}: {explain(doubt).text} {explain(doubt).remedy}")
     total = len(result.photos) + len(result.reasons)
     typer.echo(f"{len(result.photos)} of {total} photos localized; written to {output}")

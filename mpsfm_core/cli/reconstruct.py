@@ -194,10 +194,26 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
         _row("missing", f"a provider failed: {name}: {fault}")
     for name, reason in images["unregistered"].items():
         _row("missing", f"not registered: {name}: {explain_image(reason).text}")
+    if video := result.summary["video"]:
+        _row("video", _describe_video(video))
     if (output / "report.html").is_file():
         _row("open", f"{output}/report.html")
     seconds = sum(stage["seconds"] for stage in result.summary["stages"].values())
     _row("time", f"written to {output} in {seconds:.0f} s")
+
+
+def _describe_video(video: Mapping[str, Any]) -> str:
+    """Describe keyframes, cuts and localized frames of a video."""
+    texts = [f"{video['keyframes']} keyframes of {video['frames']} frames"]
+    if video["cuts_s"]:
+        times = ", ".join(f"{time:.1f}" for time in video["cuts_s"])
+        texts.append(f"cuts at {times} s")
+    if trajectory := video["trajectory"]:
+        sources = trajectory["sources"]
+        names = {"none": "without pose"}
+        counts = ", ".join(f"{n} {names.get(source, source)}" for source, n in sources.items())
+        texts.append(f"poses in trajectory.txt: {counts}")
+    return "; ".join(texts)
 
 
 _YELLOW = ("partial", "doubtful", "warning", "missing")

@@ -173,6 +173,9 @@ class DoubtReason(ReasonCode):
     PARTIAL_COVERAGE = ("partial-coverage", "provider", "num_images", "width_ratio", "height_ratio")
     """The keypoints of a features provider cover only the upper left part of all images, up to the
     ratios ``width_ratio`` and ``height_ratio`` of the image size."""
+    FOCAL_LENGTH_FROM_ONE_IMAGE = ("focal-length-from-one-image", "image")
+    """The unknown focal length and the pose of a localized photo result from matches with a single
+    image of the model."""
     MEANINGLESS_SCORES = ("meaningless-scores", "provider", "num_pairs")
     """The match scores of a matcher are not higher for inliers than for outliers."""
 

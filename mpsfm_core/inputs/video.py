@@ -252,7 +252,7 @@ def choose_frames(
 
 
 def thin_keyframes(frames: Sequence[SelectedFrame], count: int) -> list[SelectedFrame]:
-    """Drop keyframes until ``count`` remain, those with the least motion to both neighbors first.
+    """Drop the keyframes with the least motion to both neighbors until ``count`` remain.
 
     The first and the last keyframe of a shot remain as long as other keyframes can be dropped.
     """

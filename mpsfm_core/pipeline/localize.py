@@ -50,6 +50,7 @@ from mpsfm_core.results.localization import (
     ENTRIES,
     LocalizedPhoto,
     extend_model,
+    find_pose_doubts,
     write_localization,
 )
 from mpsfm_core.support.files import lock_output_folder, replace_entries
@@ -343,6 +344,7 @@ class _Localization:
             image.num_inliers,
             image.num_matches,
             matches,
+            find_pose_doubts(matches, focal_known=source.focal_known),
         )
 
 

@@ -305,6 +305,13 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "pixels of a reduced photo.",
         "Test the provider with mpsfm plugins check {provider}.",
     ),
+    DoubtReason.FOCAL_LENGTH_FROM_ONE_IMAGE: (
+        "focal length from one image",
+        "The photo matches only {image} of the model, which hardly tells its unknown focal length "
+        "from its distance: the pose may be wrong by far more than its covariance.",
+        "Give the focal length of the photo with --intrinsics, or add photos of this place to the "
+        "model.",
+    ),
     DoubtReason.MEANINGLESS_SCORES: (
         "meaningless match scores",
         "The scores of the matcher {provider} are not higher for inliers than for outliers in "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ import pycolmap
 from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Float64, Pose
+from mpsfm_core.data.decisions import DoubtReason, Reason
 from mpsfm_core.results.colmap_model import write_model
 from mpsfm_core.support.format_versions import VERSION
 
@@ -56,6 +57,8 @@ class LocalizedPhoto:
     matches: Mapping[str, tuple[Float64, Float64]] = field(repr=False)
     """Keypoints of the photo and of an image of the model that observe the same point, each (m, 2)
     in pixels of the original images, by name of the image of the model."""
+    doubts: tuple[Reason, ...] = ()
+    """Reasons (``DoubtReason``) to doubt the pose."""
 
     @property
     def center(self) -> Float64:
@@ -95,7 +98,20 @@ class LocalizedPhoto:
                 "params": self.camera.params.tolist(),
             },
             "references": {name: len(rows[0]) for name, rows in self.matches.items()},
+            "doubts": [doubt.to_json() for doubt in self.doubts],
         }
+
+
+def find_pose_doubts(images: Collection[str], *, focal_known: bool) -> tuple[Reason, ...]:
+    """Return the reasons (``DoubtReason``) to doubt the pose of a localized photo.
+
+    Args:
+        images: Images of the model that observe the same points as the photo.
+        focal_known: True if the focal length of the photo was given.
+    """
+    if focal_known or len(images) != 1:
+        return ()
+    return (DoubtReason.FOCAL_LENGTH_FROM_ONE_IMAGE.because(image=next(iter(images))),)
 
 
 def write_localization(

@@ -16,11 +16,13 @@ from typer.testing import CliRunner
 import mpsfm_core
 from mpsfm_core import InputError
 from mpsfm_core.cli import build_app
-from mpsfm_core.data.decisions import ImageReason
+from mpsfm_core.data.decisions import DoubtReason, ImageReason
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
 from mpsfm_core.geometry.pycolmap_conversion import pose_from
 from mpsfm_core.inputs.models import reconstruction_poses
+from mpsfm_core.report.reasons import explain
 from mpsfm_core.results.exports.source import ExportSource
+from mpsfm_core.results.localization import find_pose_doubts
 
 SAMPLE = Path(__file__).parents[2] / "examples" / "sample_scene"
 MODEL_NAMES = ("view_0.jpg", "view_1.jpg", "view_3.jpg")
@@ -79,6 +81,17 @@ def test_localized_photo_has_the_true_pose(result: mpsfm_core.LocalizationResult
 def test_photo_of_another_place_gets_a_reason(result: mpsfm_core.LocalizationResult) -> None:
     assert list(result.reasons) == ["view_5.jpg"]
     assert result.reasons["view_5.jpg"].code in ImageReason
+
+
+def test_focal_length_from_one_image_makes_the_pose_doubtful(
+    result: mpsfm_core.LocalizationResult,
+) -> None:
+    (doubt,) = find_pose_doubts(["a.jpg"], focal_known=False)
+    assert doubt.code is DoubtReason.FOCAL_LENGTH_FROM_ONE_IMAGE
+    assert "a.jpg" in explain(doubt).text and "--intrinsics" in explain(doubt).remedy
+    assert not find_pose_doubts(["a.jpg"], focal_known=True)
+    assert not find_pose_doubts(["a.jpg", "b.jpg"], focal_known=False)
+    assert not result.photos[QUERY].doubts
 
 
 def test_written_files_have_the_poses(folder: Path, result: mpsfm_core.LocalizationResult) -> None:
