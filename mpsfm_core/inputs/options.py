@@ -23,7 +23,7 @@ class VideoOptions(Options):
     tracked points selects more frames."""
     max_frames: int = Field(600, ge=2)
     """Maximum number of keyframes of a video. If more keyframes are selected, those with the least
-    motion are dropped. More keyframes take proportionally more time [tuned: benchmarks.walks]."""
+    motion are dropped. More keyframes take proportionally more time. [ours]"""
     trajectory_every: int = Field(1, ge=0)
     """Interval of the video frames whose poses are written to ``trajectory.txt``; 1 localizes all
     frames, and 0 writes no trajectory."""
