@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mpsfm_core.data import Bool, Float64, MappingImage, MappingProblem, VerifiedPair
+from mpsfm_core.data import Bool, Float64, Int64, MappingImage, MappingProblem, VerifiedPair
 from mpsfm_core.mapping.initialization.refined_focal_lengths import (
     MIN_FOCAL_CHANGE,
     estimate_relative_poses,
@@ -35,6 +35,9 @@ estimate a focal length; the run time is proportional to both. [ours]"""
 MAX_EVIDENCE = 10.0
 """Largest difference of log-likelihoods of an image pair, because the matches of a pair with a
 wrong relative pose prefer a wrong focal length. [tuned: benchmarks.distortion --buckets]"""
+MAX_IMAGE_EVIDENCE = 7.0
+"""Largest difference of log-likelihoods of all pairs of an image together, because the image may be
+zoomed or cropped. [tuned: benchmarks.verdicts]"""
 MIN_EVIDENCE = 3.0
 """Smallest difference of the log-posteriors of the best and the guessed focal length that replaces
 the guess, strong evidence on the scale of Kass and Raftery ("Bayes Factors", 1995). The difference
@@ -133,6 +136,8 @@ def estimate_shared_focal(problem: MappingProblem, pairs: Sequence[VerifiedPair]
 class _Matches(NamedTuple):
     """Matches of p image pairs with up to m matches each."""
 
+    images: Int64
+    """(p, 2) indices of the images of each pair."""
     offsets_a: Float64
     """(p, m, 2) keypoints of the first images, relative to the principal point in pixels."""
     offsets_b: Float64
@@ -206,12 +211,13 @@ def _collect_matches(problem: MappingProblem, pairs: Sequence[VerifiedPair]) -> 
             fx, fy, cx, cy = image.camera.params
             xy = image.keypoints[matches[:, side]]
             offsets[side, row, : len(matches)] = (xy - (cx, cy)) * (1.0, fx / fy)
-        images = problem.images[pair.image_a], problem.images[pair.image_b]
-        std_px[row, : len(matches)] = max(image.keypoint_std_px for image in images)
+        both = problem.images[pair.image_a], problem.images[pair.image_b]
+        std_px[row, : len(matches)] = max(image.keypoint_std_px for image in both)
     center_std = PRINCIPAL_POINT_PRIOR_STD * max(image.camera.size)
     lens_stds = np.array([center_std, center_std, DIVISION_PRIOR_STD])
     radius = 0.5 * float(np.hypot(*image.camera.size))
-    return _Matches(offsets[0], offsets[1], std_px, radius, lens_stds)
+    images = np.array([(pair.image_a, pair.image_b) for pair in pairs])
+    return _Matches(images, offsets[0], offsets[1], std_px, radius, lens_stds)
 
 
 def _refine_poses(
@@ -296,6 +302,25 @@ def _undistort(
     return rays, np.concatenate([by_center, by_coefficient], axis=1)
 
 
+def _exclude_images(by_pair: Float64, images: Int64) -> float:
+    """Return the log-likelihood of all pairs, without the pairs of the most contradicted images.
+
+    Images are excluded greedily while an exclusion increases the log-likelihood.
+
+    Args:
+        by_pair: (p,) log-likelihood of each pair, at most about 0.
+        images: (p, 2) indices of the images of each pair.
+    """
+    remaining, penalty = by_pair.copy(), 0.0
+    while True:
+        by_image = np.bincount(images.ravel(), np.repeat(remaining, 2))
+        worst = int(np.argmin(by_image))
+        if by_image[worst] >= -MAX_IMAGE_EVIDENCE:
+            return float(remaining.sum()) - penalty
+        remaining[(images == worst).any(axis=1)] = 0.0
+        penalty += MAX_IMAGE_EVIDENCE
+
+
 def _cross_matrices(vectors: Float64) -> Float64:
     """Return the matrices (p, 3, 3) of the cross products with vectors (p, 3)."""
     matrices: Float64 = np.cross(vectors[:, None], np.eye(3)).transpose(0, 2, 1)
@@ -312,7 +337,8 @@ def _log_posterior(
     """Return the log-posterior (k,) of focal lengths.
 
     The noise variance of each pair is unknown, so that its profile likelihood is a power of its
-    cost. Each pair is an outlier with the log-odds ``-MAX_EVIDENCE``.
+    cost. Each pair is an outlier with the log-odds ``-MAX_EVIDENCE``, and all pairs of each image
+    are outliers with the log-odds ``-MAX_IMAGE_EVIDENCE``.
 
     Args:
         image: Image with the prior of the focal length.
@@ -326,7 +352,8 @@ def _log_posterior(
     smallest = np.minimum(all_costs.min(axis=0), costs.min(axis=0))
     freedom = np.maximum(counts - NUM_PARAMETERS, 0.0)
     evidence = 0.5 * freedom * np.log((costs + floor) / (smallest + floor))
-    log_likelihood = np.logaddexp(-evidence, -MAX_EVIDENCE).sum(axis=1)
+    by_pair = np.logaddexp(-evidence, -MAX_EVIDENCE)
+    log_likelihood = np.array([_exclude_images(row, matches.images) for row in by_pair])
     deviations = np.log(focals / image.focal_prior_px) / image.focal_log_std
     posterior: Float64 = log_likelihood - 0.5 * deviations**2
     return posterior

@@ -51,6 +51,16 @@ def test_estimate_shared_focal_finds_the_focal_length_of_distorted_images(
     assert focal_px == pytest.approx(CAMERA.fx, rel=0.04)
 
 
+def test_estimate_shared_focal_excludes_zoomed_images(room: MappingProblem) -> None:
+    center = np.array([CAMERA.cx, CAMERA.cy])
+    images = list(guess_focal(room, 1.6).images)
+    for row, zoom in ((1, 1.5), (3, 0.9)):
+        xy = zoom * (images[row].keypoints - center) + center
+        images[row] = replace(images[row], keypoints=xy)
+    problem = replace(room, images=tuple(images))
+    assert estimate_shared_focal(problem, problem.pairs) == pytest.approx(CAMERA.fx, rel=0.1)
+
+
 def test_calibrate_view_graph_keeps_the_prior_and_updates_relative_poses(
     room: MappingProblem,
 ) -> None:
