@@ -108,7 +108,7 @@ def independent_histogram(errors: list[float], threshold: int) -> float:
 )
 def test_pose_auc_matches_independent_implementation(convention, area) -> None:
     rng = np.random.default_rng(7)
-    for _ in range(1000):
+    for _ in range(200):
         truth = random_poses(rng, int(rng.integers(2, 6)))
         estimated = disturbed(rng, truth)
         errors = pose_errors_deg(estimated, truth, convention)

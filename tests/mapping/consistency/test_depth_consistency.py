@@ -190,7 +190,7 @@ def test_misplaced_image_with_own_tracks_is_violation() -> None:
         scene.maps[image].set_scale(1.0)
     room = np.array(case.room)
     wrong = []
-    for image in map(int, np.flatnonzero(room == 1)):
+    for image in map(int, np.flatnonzero(room == 1)[::2]):
         # the view before its twin's surroundings, with the tracks that it finds there
         truth = scene.translations[image].copy()
         scene.translations[image] = shift_pose(case.poses[image], 1)[:, 3]
@@ -203,7 +203,7 @@ def test_misplaced_image_with_own_tracks_is_violation() -> None:
                 > OPTIONS.max_violations
             )
         scene.translations[image] = truth
-    assert len(wrong) >= 4
+    assert len(wrong) >= 4, wrong
     assert np.mean(wrong) >= 0.75
 
 

@@ -40,8 +40,8 @@ def checker(problem: MappingProblem, kind: type[Check]) -> Check:
 def test_check_pair_accepts_correct_pairs_and_rejects_look_alikes() -> None:
     """Twin rooms look alike except for some objects."""
     case = make_twin_room_problem(0)
-    check, is_false = checker(case.problem, PairConsistencyCheck), np.array(case.false)
-    shares = np.array([check.check_pair(pair).support_ratio for pair in case.problem.pairs])
+    check, is_false = checker(case.problem, PairConsistencyCheck), np.array(case.false)[::3]
+    shares = np.array([check.check_pair(pair).support_ratio for pair in case.problem.pairs[::3]])
     assert (shares[~is_false] > 0).mean() > 0.97
     assert (shares[is_false] == 0).mean() > 0.5
 
