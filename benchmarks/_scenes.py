@@ -21,7 +21,8 @@ def shared_folder() -> Path:
     folder = Path(os.environ.get("MPSFM_SHARED", default))
     if not (folder / "data").is_dir():
         raise SystemExit(
-            f"no benchmark scenes in {folder}: set MPSFM_SHARED to the folder of data/ and models/"
+            f"no benchmark scenes in {folder}: set MPSFM_SHARED to the folder that contains data/ "
+            f"and models/"
         )
     return folder
 

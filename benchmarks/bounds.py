@@ -2,9 +2,9 @@
 
     python -m benchmarks.bounds [--buckets minimal leq30] [--output DIR]
 
-The scene is rendered_kitchen, with degraded depth of several seeds. A mapper that starts at the
-true poses only refines them, and drops images without points. The pose error that remains is due to
-matches, depth errors or the objective function. Writes
+The scene is rendered_kitchen; its true depth is degraded with several random seeds. A mapper that
+starts at the true poses only refines them, and drops images without points. The pose error that
+remains is due to matches, depth errors or the objective function. Writes
 benchmarks/results/bounds-rendered_kitchen.md.
 """
 

@@ -47,7 +47,7 @@ from mpsfm_core.results.colmap_model import build_model
 from mpsfm_core.results.ply import read_ply
 
 MODE = "moderate"
-"""Quality mode of pyarchinit-photogrammetry, the default for close range."""
+"""Quality mode of pyarchinit-photogrammetry, its own default for close-range photos."""
 _INSTALL = "pip install --no-deps pyarchinit-photogrammetry pyarchinit-photogrammetry-core"
 Maps = dict[str, DepthPrior]
 

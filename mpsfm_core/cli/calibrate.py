@@ -133,7 +133,7 @@ def calibrate(
 def _check_names(
     kind: str, alignments: list[str]
 ) -> tuple[CalibratedKind, tuple[Alignment, ...] | None]:
-    """Check the names of the provider kind and of the depth alignments.
+    """Check the values of ``--kind`` and ``--alignments``.
 
     Raises:
         InputError: The provider kind or a depth alignment is unknown.

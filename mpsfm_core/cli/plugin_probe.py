@@ -33,7 +33,7 @@ class PluginProbe(NamedTuple):
     status: list[dict[str, Any]]
     """Fields of the :class:`~mpsfm_core.providers.registry.ProviderStatus` of all providers."""
     messages: str
-    """Text that plugins printed and warnings of the registry."""
+    """Text that plugins printed, and warnings that the registry logged."""
 
 
 def probe_plugins() -> PluginProbe:

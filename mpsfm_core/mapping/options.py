@@ -111,7 +111,7 @@ class RefinementOptions(Options):
     """Options of bundle adjustment and depth integration (paper 3.3)."""
 
     integrate: bool = expert(True)
-    """Refine depth maps, whereas False keeps the scaled depth priors, which is faster."""
+    """True refines depth maps; False keeps the scaled depth priors, which is faster."""
     map_width: int = expert(200, ge=16)
     """Width in pixels to which depth maps are subsampled for refinement. Wider depth maps are
     slower to refine and show finer details. [tuned: benchmarks.ablation]"""

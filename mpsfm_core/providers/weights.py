@@ -577,7 +577,7 @@ class _RedirectPolicy(urllib.request.HTTPRedirectHandler):
 def is_local(netloc: str) -> bool:
     """Return whether a host name, with or without port, is in the local network.
 
-    This machine is in the local network, and a host whose name cannot be resolved is not.
+    ``localhost`` counts as local; a host name that cannot be resolved does not.
     """
     host = urllib.parse.urlsplit(f"//{netloc}").hostname or ""
     try:

@@ -67,7 +67,7 @@ def check_items(executor: Executor, folder: Path) -> None:
 
     Args:
         executor: Executor under test.
-        folder: Folder to create, which the workers can access.
+        folder: Folder that the check creates and that the workers can access.
     """
     folder.mkdir()
     assert sum(1 for _ in executor.run(_WriteMarker(folder), range(40))) == 40
@@ -82,7 +82,7 @@ def check_lost_worker(executor: Executor, folder: Path) -> None:
 
     Args:
         executor: Executor under test.
-        folder: Folder to create, which the workers can access.
+        folder: Folder that the check creates and that the workers can access.
     """
     folder.mkdir()
     assert sum(1 for _ in executor.run(_KillFirstWorker(folder), range(8))) == 8
@@ -109,7 +109,7 @@ def check_extraction(name: str, options: dict[str, Any], folder: Path) -> None:
     Args:
         name: Value of ``runtime.executor``.
         options: Value of ``runtime.executor_options``.
-        folder: Folder to create, which the workers can access.
+        folder: Folder that the check creates and that the workers can access.
     """
     _write_images(folder)
     local = _extract(folder, RuntimeOptions(cache_dir=folder / "local", workers=2))
@@ -142,7 +142,7 @@ def check_failing_provider(name: str, options: dict[str, Any], folder: Path) -> 
     Args:
         name: Value of ``runtime.executor``.
         options: Value of ``runtime.executor_options``.
-        folder: Folder to create, which the workers can access.
+        folder: Folder that the check creates and that the workers can access.
     """
     _write_images(folder)
     with _install_failing_plugin(folder):

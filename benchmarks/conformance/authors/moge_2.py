@@ -16,7 +16,7 @@ _SHIFT, _FOCAL = 0.7, 1.4
 
 
 class Seeing(MoGeModel):
-    """MoGe-2 network whose points are moved near the pixel rays, which defines the shift of z."""
+    """MoGe-2 network whose points are moved towards the pixel rays, to determine the shift of z."""
 
     def _remap_points(self, points):
         points = super()._remap_points(points)

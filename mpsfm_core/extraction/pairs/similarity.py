@@ -1,14 +1,14 @@
 """Image similarity from a few local features, to select image pairs without retrieval.
 
 The match score of two images counts mutual nearest neighbors among their strongest descriptors,
-weighted by the ratio of nearest to second nearest distance. The similarity is the match score minus
-the score that both images reach by chance, because images with repetitive texture match many
-images. Diffusion of the similarities raises the similarity of two images that are both similar to a
-third image. Diffusion finds pairs of small overlap (Zhou et al., Ranking on Data Manifolds, NIPS
-2003).
+each weighted by 1 minus the ratio of its nearest to its second nearest distance. The similarity is
+the match score minus the score that both images reach by chance, because images with repetitive
+texture match many images. Diffusion of the similarities raises the similarity of two images that
+are both similar to a third image. Diffusion finds pairs of small overlap (Zhou et al., Ranking on
+Data Manifolds, NIPS 2003).
 
-Match scores are computed for candidate pairs only, so that memory and time per image do not grow
-with the number of images. The candidates of an image are the images with the most similar global
+Match scores are computed for candidate pairs only, so that their time per image does not grow with
+the number of images. The candidates of an image are the images with the most similar global
 descriptors (VLAD of the strongest descriptors: Jegou et al., CVPR 2010; Arandjelovic and Zisserman,
 CVPR 2013).
 """
@@ -31,8 +31,8 @@ of the number of descriptors. [tuned: benchmarks.pairs]"""
 DIFFUSION_RATIO = 0.8
 """Diffusion weight ``alpha`` of manifold ranking. [tuned: benchmarks.pairs]"""
 NUM_CANDIDATES = 256
-"""Number of images that each image is compared with. Sets of up to 257 images are compared
-exhaustively. [tuned: benchmarks.pairs]"""
+"""Number of images of most similar global descriptor that become candidates of each image. In sets
+of up to 257 images, all pairs are candidates. [tuned: benchmarks.pairs]"""
 _NUM_CLUSTERS = 64
 """Number of clusters of a VLAD descriptor."""
 _TRAINING_DESCRIPTORS = 256 * _NUM_CLUSTERS
@@ -52,7 +52,7 @@ class PairSimilarity(NamedTuple):
 
 
 def strongest_descriptors(features: Features) -> Float32:
-    """Return the descriptors (k, d) with the largest scores, or the first k without scores."""
+    """Return the k descriptors (k, d) of largest score, or the first k if there are no scores."""
     if features.scores is None:
         return features.descriptors[:NUM_DESCRIPTORS]
     order = np.argsort(-features.scores, kind="stable")[:NUM_DESCRIPTORS]
@@ -79,7 +79,7 @@ def match_score(a: Float32, b: Float32) -> float:
 
 
 def candidate_pairs(descriptors: Sequence[Float32]) -> Int64:
-    """Pair each image with the `NUM_CANDIDATES` images of most similar global descriptors.
+    """Pair each image with the ``NUM_CANDIDATES`` images of most similar global descriptor.
 
     Args:
         descriptors: Strongest descriptors (k, d) of each image; k may differ and may be 0.
@@ -132,7 +132,7 @@ def rank_images(vectors: Float32 | Float64, count: int) -> PairSimilarity:
         count: Number of most similar images of each image.
 
     Returns:
-        The union of the pairs of all images, with dot products as similarity.
+        The pairs of all images, each pair once, with dot products as similarity.
     """
     pairs, values = [], []
     for first in range(0, len(vectors), _BLOCK):
@@ -150,7 +150,7 @@ def rank_images(vectors: Float32 | Float64, count: int) -> PairSimilarity:
 def diffuse_similarity(scores: PairSimilarity, count: int) -> PairSimilarity:
     """Convert match scores to similarities by subtracting chance scores and by diffusion.
 
-    The similarity of an image diffuses over the image and its candidates.
+    Diffusion for an image is limited to the image and its candidates.
 
     Args:
         scores: Match scores of the candidate pairs.

@@ -29,7 +29,7 @@ MIN_RESIDUALS = 25
 """Minimum number of depth residuals for a measurement of the noise. With fewer than
 ``MIN_RESIDUALS`` depth residuals, the declared variance of the depth prior applies. [ours]"""
 MIN_INDEPENDENT = 0.05
-"""Minimum share of the variance of depth that is independent between pixels. [ours]"""
+"""Minimum share of the depth variance that is noise independent between pixels. [ours]"""
 POSE_UNKNOWNS = 6
 """Degrees of freedom of the pose of an additional image."""
 MULTIPLIER_RANGE = (0.1, 10.0)

@@ -356,7 +356,7 @@ class PoseHypothesisGenerator:
     def _scale_relative_pose(
         self, depth_correspondences: PoseCorrespondences, reference: int, relative: Pose
     ) -> PoseHypothesis | None:
-        """Scale a pose relative to the reference image by depth, and convert it to the world."""
+        """Scale the baseline of a relative pose by depth, and return ``cam_from_world``."""
         length = _estimate_baseline(self.scene, depth_correspondences, reference, relative)
         if not length:
             return None

@@ -119,7 +119,7 @@ class RegisteredImage:
         return self.camera_model.is_fisheye or bool(self.distortion.any()) or refined
 
     def state_dict(self) -> StateDict:
-        """Return the state of the registered image for a checkpoint."""
+        """Return the fields of the image as nested dictionaries, for a checkpoint."""
         parts: StateDict = {"camera": {**vars(self.camera)}, "depth": {**vars(self.depth)}}
         parts["camera_model"] = self.camera_model.value
         calibration = {p.name: result.state_dict() for p, result in self.calibration.items()}

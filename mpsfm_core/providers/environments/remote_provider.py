@@ -219,7 +219,7 @@ def remote_providers(environment: Environment) -> list[RemoteSpec]:
 
 @dataclass(frozen=True)
 class _Contract:
-    """Function that gets the setup of a provider's contract tests from another environment."""
+    """Function that fetches the setup of a provider's contract tests from another environment."""
 
     location: ProviderLocation
 

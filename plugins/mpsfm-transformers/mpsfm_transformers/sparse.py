@@ -133,10 +133,10 @@ class SuperGlueMatcher(GivenKeypointsMatcher):
 
 
 def _to_first_view_pixels(xy: Float64, view: View, first: View) -> Float64:
-    """Transform keypoints so that normalization by the first view's size fits their own view.
+    """Transform keypoints of a view so that the network normalizes them by the view's own size.
 
-    The matching network normalizes the keypoints of both views by one image size, with half of the
-    longer side as unit and integer pixel centers.
+    The matching network normalizes the keypoints of both views by the size of the first view, with
+    half of the longer side as unit and integer pixel centers.
     """
     view_size, first_size = np.array(view.camera.size), np.array(first.camera.size)
     moved: Float64 = (xy - 0.5 - view_size / 2) * (
