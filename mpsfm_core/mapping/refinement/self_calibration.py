@@ -44,6 +44,10 @@ benchmarks.mixed_cameras]"""
 DISTORTION_PRIOR_STD = 0.1
 """Standard deviation of the zero-mean prior on radial distortion coefficients. The coefficient k1
 of phones and zoom lenses stays below 0.05 in magnitude, that of action cameras below 0.3. [ours]"""
+CORNER_SHIFT_PRIOR_STD = 0.025
+"""Standard deviation of the relative shift of the image corners by ``k1``, for long focal lengths.
+At a long focal length, a large ``k1`` shifts the image corners only a little. [tuned:
+benchmarks.mixed_cameras]"""
 TANGENTIAL_PRIOR_STD = 0.01
 """Standard deviation of the zero-mean prior on tangential distortion coefficients. [ours]"""
 ASPECT_PRIOR_STD = 0.01
@@ -129,6 +133,9 @@ def compute_intrinsic_priors(images: Sequence[MappingImage]) -> tuple[Float64, F
         stds[row, :4] = image.focal_log_std, ASPECT_PRIOR_STD, center_std, center_std
         if not image.camera_model.is_fisheye:
             stds[row, 6:] = TANGENTIAL_PRIOR_STD
+            radius = 0.5 * float(np.hypot(*image.camera.size)) / image.camera.fx
+            radial_std = max(DISTORTION_PRIOR_STD, CORNER_SHIFT_PRIOR_STD / radius**2)
+            stds[row, IntrinsicParameter.RADIAL_DISTORTION] = radial_std
     return means, stds
 
 

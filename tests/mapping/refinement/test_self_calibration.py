@@ -15,7 +15,10 @@ from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.geometry.distortion import distort_rays, undistort_rays
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement.self_calibration import judge_estimate
+from mpsfm_core.mapping.refinement.self_calibration import (
+    compute_intrinsic_priors,
+    judge_estimate,
+)
 from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.estimated_intrinsics import CalibrationOutcome
 from mpsfm_core.mapping.scene.reconstruction import VIEW_PARAMETERS
@@ -134,6 +137,15 @@ def test_reconstruct_with_principal_point_refines_it() -> None:
             assert std is not None and abs(error) < 3 * std
         assert np.abs(errors).max() < 2.0
         assert image.changes_view
+
+
+def test_compute_intrinsic_priors_allows_more_distortion_of_long_focal_lengths(
+    room: MappingProblem,
+) -> None:
+    images = [replace(room.images[0], camera=scale_focal(CAMERA, ratio)) for ratio in (1.0, 4.0)]
+    _, stds = compute_intrinsic_priors(images)
+    corner_radius = np.hypot(320, 240) / (4.0 * CAMERA.fx)
+    assert stds[:, RADIAL] == pytest.approx([0.1, 0.025 / corner_radius**2])
 
 
 def test_reconstruct_with_one_image_per_camera_refines_only_clear_distortion(
