@@ -50,6 +50,8 @@ class ExtractionContext:
         self.providers: list[ActiveProvider] = []
         self.failures: dict[int, str] = {}
         """Error message of each skipped image, by image index."""
+        self.pair_failures: dict[tuple[int, ...], str] = {}
+        """Error message of each skipped pair or group of images, by image indices."""
         self._events = events
         self.run_remotely: Callable[[str, Sequence[Any]], Generator[None, None, None]] | None = None
         """Function that runs an extraction stage on remote workers, or None without a remote
@@ -164,8 +166,10 @@ class ExtractionContext:
         """Record a provider failure; raise ProviderRunError if over half of the images failed."""
         names = " and ".join(self.images[index].name for index in images)
         _log.warning("a provider failed, so the result for %s is left out: %s", names, error)
-        if len(images) == 1:
-            self.failures[images[0]] = str(error)
+        if len(images) > 1:
+            self.pair_failures[tuple(images)] = str(error)
+            return
+        self.failures[images[0]] = str(error)
         if len(self.failures) > len(self.images) / 2:
             count = f"{len(self.failures)} of {len(self.images)} photos"
             raise ProviderRunError(

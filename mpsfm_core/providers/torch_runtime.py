@@ -7,8 +7,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import torch
+from torch.overrides import TorchFunctionMode
 
 from mpsfm_core.providers import ProviderContext
 
@@ -16,6 +18,21 @@ from mpsfm_core.providers import ProviderContext
 def use_threads(context: ProviderContext) -> None:
     """Set torch's number of CPU threads for the whole process."""
     torch.set_num_threads(context.threads)
+
+
+class SkipRandomWeights(TorchFunctionMode):
+    """Context manager that leaves the weights of new layers uninitialized.
+
+    Drawing random weights takes seconds for a large network, whose weights are then loaded from a
+    file. The caller has to load all weights of the network.
+    """
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Call a function of torch, unless the function fills a tensor with random numbers."""
+        named = kwargs or {}
+        if func.__name__.endswith(("uniform_", "normal_")):
+            return args[0] if args else named["tensor"]
+        return func(*args, **named)
 
 
 @contextmanager

@@ -5,9 +5,10 @@ from __future__ import annotations
 import hashlib
 import importlib
 import pickle
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Any, Literal
 from weakref import WeakSet
@@ -39,6 +40,7 @@ from mpsfm_core.testing.ground_truth_provider import (
     GroundTruth,
     GroundTruthOptions,
 )
+from mpsfm_core.testing.observed_instance import ObservedInstance, observe_instance
 from mpsfm_core.testing.outcome import CheckSkipped, CheckUnmeasured
 from mpsfm_core.testing.process_state import read_process_settings
 
@@ -47,8 +49,8 @@ TruthSource = Literal["painted", "prepared", "image", "none"]
 
 _NUM_DETECTIONS = 96
 """Number of views whose features a process stores for sparse matchers with the same detector."""
-_NUM_ANSWERS = 8
-"""Number of outputs of a provider that later checks reuse."""
+_MAX_ANSWER_BYTES = 100_000_000
+"""Total size in bytes of the outputs of a provider that later checks reuse."""
 AUXILIARY_RELATIVE_STD = 0.02
 """Relative std of the exact depth prior that a normals provider with ``needs-depth`` receives."""
 
@@ -132,11 +134,10 @@ class ContractCase:
         self._folder = folder
         self._device = device
         self._ground_truth = GroundTruth() if spec.kind == "wrapper" else None
-        self._provider: Any = None
         self._prepared: WeakSet[Example] = WeakSet()
         self._detector: Any = None
         self._example: Example | None = None
-        self._answers: LruCache[Hashable, Any] = LruCache(_NUM_ANSWERS, lambda _: 1)
+        self._answers: LruCache[bytes, Any] = LruCache(_MAX_ANSWER_BYTES, _count_bytes)
         self.process_before = read_process_settings()
         """Global settings of this process before the first instance of the provider was created."""
 
@@ -212,12 +213,22 @@ class ContractCase:
         wrapper = ProviderConfig(use=self.spec.name, options=dict(self.setup.options))
         return self._create(registry, self.kind, inner.name, inner_options, (wrapper,))
 
-    @property
+    @cached_property
     def provider(self) -> Any:
         """Instance of the provider under test that all checks share."""
-        if self._provider is None:
-            self._provider = self.create_provider()
-        return self._provider
+        return self.create_provider()
+
+    @cached_property
+    def observed(self) -> ObservedInstance:
+        """Second instance of the provider under test, with the recorded effects of two calls."""
+        example = self.example
+        self.run(example)  # imports the provider's libraries, which may change the process
+        auxiliary = self.make_auxiliary_input(example.view, example)
+        return observe_instance(
+            self.create_provider,
+            lambda provider: self.run_on_view(example.view, example, provider, auxiliary),
+            self.process_before,
+        )
 
     def run(self, example: Example, provider: Any = None) -> Any:
         """Run the provider on a synthetic view and validate the output.
@@ -225,13 +236,9 @@ class ContractCase:
         Args:
             example: The example. Matchers and multi-view providers also receive the view
                 ``example.partner``.
-            provider: Provider instance to call. By default, the instance that all checks share is
-                called once per synthetic view, and later checks get the same output.
+            provider: Provider instance, by default as in :meth:`run_on_views`.
         """
-        if provider is None:
-            return self._answers.get(example.key, lambda: self.run(example, self.provider))
-        uses_pair = self.kind in ("matcher", "multiview")
-        self.prepare(example, *([example.partner] if uses_pair else []))
+        self.prepare(example, *([example.partner] if self._uses_pair else []))
         return self.run_on_view(example.view, example, provider)
 
     def run_on_view(
@@ -242,23 +249,47 @@ class ContractCase:
         Args:
             view: Modified image that replaces the image ``example.view``.
             example: Synthetic view that supplies all inputs of the provider except the image.
-            provider: Provider instance to use instead of the one that all checks share.
+            provider: Provider instance, by default as in :meth:`run_on_views`.
             auxiliary: Depth or features for the provider, by default from
                 :meth:`make_auxiliary_input`.
         """
-        provider = self.provider if provider is None else provider
         auxiliary = self.make_auxiliary_input(view, example) if auxiliary is None else auxiliary
+        views = (view, example.partner.view) if self._uses_pair else (view,)
+        return self.run_on_views(views, auxiliary, provider)
+
+    def run_on_examples(self, *examples: Example) -> Any:
+        """Match a pair of synthetic views, or predict depth of a group, and validate the output."""
+        self.prepare(*examples)
+        return self.run_on_views([example.view for example in examples])
+
+    def run_on_views(
+        self, views: Sequence[View], auxiliary: Any = None, provider: Any = None
+    ) -> Any:
+        """Run the provider on an image, a pair or a group of images and validate the output.
+
+        Args:
+            views: Two images for a matcher, one or more for a multi-view provider, otherwise one.
+            auxiliary: Depth of a normals provider, or features of both images for a sparse matcher,
+                which are detected by default.
+            provider: Provider instance to call. By default, the instance that all checks share is
+                called once for equal inputs, and later checks get the same output.
+        """
+        if self.kind == "matcher" and auxiliary is None:
+            auxiliary = self.extract_features(*views)
+        if provider is None:
+            key = hashlib.blake2b(pickle.dumps((views, auxiliary))).digest()
+            return self._answers.get(
+                key, lambda: self.run_on_views(views, auxiliary, self.provider)
+            )
         if self.kind == "matcher":
-            views = (view, example.partner.view)
-            return run_matcher(self._validated_spec, provider, views, auxiliary)
+            return run_matcher(self._validated_spec, provider, (views[0], views[1]), auxiliary)
         if self.kind == "multiview":
-            views = (view, example.partner.view)
             return run_multiview(self._validated_spec, provider, views)
         if self.kind == "normals":
-            return run_normals(self._validated_spec, provider, view, auxiliary)
+            return run_normals(self._validated_spec, provider, views[0], auxiliary)
         run = self.description.run
         assert run is not None
-        return run(self._validated_spec, provider, view)
+        return run(self._validated_spec, provider, views[0])
 
     def make_auxiliary_input(self, view: View, example: Example) -> Any:
         """Return the input depth of a normals provider or features of a sparse matcher."""
@@ -269,19 +300,6 @@ class ContractCase:
         truth = example.truth()
         variance = (AUXILIARY_RELATIVE_STD * truth.depth) ** 2
         return DepthPrior.from_arrays(truth.depth, variance, truth.valid)
-
-    def run_on_pair(self, a: Example, b: Example) -> Any:
-        """Match two synthetic views and validate the matches."""
-        self.prepare(a, b)
-        views = (a.view, b.view)
-        features = self.extract_features(*views)
-        return run_matcher(self._validated_spec, self.provider, views, features)
-
-    def run_on_group(self, *examples: Example) -> MultiViewPrior:
-        """Run a multi-view provider on several synthetic views and validate the output."""
-        self.prepare(*examples)
-        views = [example.view for example in examples]
-        return run_multiview(self._validated_spec, self.provider, views)
 
     def prepare(self, *examples: Example) -> None:
         """Prepare the ground truth of each synthetic view once."""
@@ -339,6 +357,11 @@ class ContractCase:
         return registry.calibration(self.kind, inner)
 
     @property
+    def _uses_pair(self) -> bool:
+        """True if the provider receives an example together with its partner."""
+        return self.kind in ("matcher", "multiview")
+
+    @property
     def _validated_spec(self) -> ProviderSpec:
         """Specification of the provider, from which the validator reads the capabilities.
 
@@ -353,8 +376,7 @@ class ContractCase:
         spec = self._choose_detector()
         digest = hashlib.blake2b(view.image.tobytes()).digest()
         detection = _Detection(spec, digest, view.camera, self._device, view, self._create_detector)
-        features: Features = pickle.loads(_detect_once(detection))
-        return features
+        return deepcopy(_detect_once(detection))
 
     def _create_detector(self, spec: ProviderSpec) -> Any:
         """Return the detector of a sparse matcher, which all detections of the case share."""
@@ -404,10 +426,10 @@ class _Detection:
 
 
 @lru_cache(maxsize=_NUM_DETECTIONS)
-def _detect_once(detection: _Detection) -> bytes:
-    """Detect the features of a view, and return pickled features that no provider can modify."""
+def _detect_once(detection: _Detection) -> Features:
+    """Detect the features of a view, of which each call of a provider receives a copy."""
     detector = detection.create(detection.spec)
-    return pickle.dumps(run_features(detection.spec, detector, detection.view))
+    return run_features(detection.spec, detector, detection.view)
 
 
 def restore_case(
@@ -474,6 +496,11 @@ def collect_arrays(answer: object, name: str = "answer") -> dict[str, NDArray[An
         entries = enumerate(answer)
         return {k: v for i, a in entries for k, v in collect_arrays(a, f"{name}[{i}]").items()}
     return {} if answer is None else {name: np.asarray(answer)}
+
+
+def _count_bytes(answer: object) -> int:
+    """Return the size of the arrays in an output."""
+    return sum(value.nbytes for value in collect_arrays(answer).values())
 
 
 def describe_difference(first: object, second: object) -> str:

@@ -35,12 +35,17 @@ def measure_usage(run: Callable[[], object], count: int) -> Iterator[ProcessUsag
     Yields:
         Resources of this process after each call.
     """
-    process = psutil.Process()
     for _ in range(count):
         run()
-        gc.collect()
-        # The C library glibc retains freed memory, which would count as resident.
-        if sys.platform == "linux":
-            ctypes.CDLL(None).malloc_trim(0)
-        memory = process.memory_info().rss / 1e6
-        yield ProcessUsage(memory, len(gc.get_objects()), process.num_fds(), process.num_threads())
+        yield read_usage()
+
+
+def read_usage() -> ProcessUsage:
+    """Measure the resources of this process after a garbage collection (POSIX only)."""
+    gc.collect()
+    # The C library glibc retains freed memory, which would count as resident.
+    if sys.platform == "linux":
+        ctypes.CDLL(None).malloc_trim(0)
+    process = psutil.Process()
+    memory = process.memory_info().rss / 1e6
+    return ProcessUsage(memory, len(gc.get_objects()), process.num_fds(), process.num_threads())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from itertools import combinations
 
 import cv2
 import numpy as np
@@ -375,6 +376,25 @@ def test_on_error_skip_raises_if_most_images_fail(world) -> None:
         ProviderRunError, match=r"failed on 3 of 4 photos, most recently with: provider"
     ):
         world.extract(runtime=runtime)
+
+
+@pytest.mark.parametrize("num_failing", [1, 4])
+def test_on_error_skip_omits_failed_pairs_but_raises_if_most_pairs_fail(
+    world, num_failing: int
+) -> None:
+    def fail() -> None:
+        raise ZeroDivisionError("too many keypoints")
+
+    for pair in list(combinations(world.names, 2))[:num_failing]:
+        world.break_on["dense", " ".join(pair)] = fail
+    runtime = RuntimeOptions(cache_dir=world.cache, workers=1, on_error="skip")
+    settings = {"matcher": None, "dense_matcher": ProviderConfig(use="dense")}
+    if num_failing == 1:
+        found = world.extract(runtime=runtime, **settings)
+        assert found.report["pairs_verified"] == 5
+        return
+    with pytest.raises(ProviderRunError, match=r"matchers failed on 4 of 6 pairs, .*keypoints"):
+        world.extract(runtime=runtime, **settings)
 
 
 def test_hanging_provider_raises_after_timeout(world) -> None:

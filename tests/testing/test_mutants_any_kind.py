@@ -114,12 +114,6 @@ class LocalPrior(PaintedDepth):
         return Mine(prior.depth, prior.variance, prior.valid)
 
 
-class AsksTheNetwork(Changed):
-    def change(self, depth: np.ndarray, view: View) -> np.ndarray:
-        socket.getaddrinfo("localhost", 443)
-        return depth
-
-
 class TriesTheNetwork(Changed):
     """Fault: works offline, but reports every view to a server."""
 
@@ -200,7 +194,6 @@ class TripsOverMasks(Changed):
         (SecretlyCanonical, "intrinsics-declared", "depends on the focal length"),
         (SharedBuffer, "threads", "in two parallel threads"),
         (LocalPrior, "pickles", "the answer cannot be pickled"),
-        (AsksTheNetwork, "offline", "fails without network"),
         (TriesTheNetwork, "offline", "opens a network connection: localhost"),
         (KeepsViews, "memory-released", "retains 3.. kB per view"),
         (LandscapeOnly, "portrait", "mat1 and mat2"),

@@ -19,6 +19,7 @@ from mpsfm_core.data import (
     SparseMatches,
     VerifiedPair,
 )
+from mpsfm_core.data.errors import ProviderRunError
 from mpsfm_core.extraction.active_provider import ActiveProvider
 from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.context import ExtractionContext
@@ -71,12 +72,23 @@ class PairMatcher:
         self._snaps = config.matcher is None and table is not None
 
     def match(self, pairs: list[Pair], located: list[Features]) -> list[CandidateMatches]:
-        """Match image pairs with the features of all images, whose descriptors may be empty."""
+        """Match image pairs with the features of all images, whose descriptors may be empty.
+
+        Raises:
+            ProviderRunError: a matcher failed, or skipped failures exceed half of the pairs.
+        """
 
         def work(pair: Pair) -> CandidateMatches:
             return self._match_pair(pair, located[pair[0]], located[pair[1]])
 
-        return self._context.each("matching", pairs, work, *self._providers)
+        matches = self._context.each("matching", pairs, work, *self._providers)
+        failures = [text for p in pairs if (text := self._context.pair_failures.get(p))]
+        if len(failures) > len(pairs) / 2:
+            raise ProviderRunError(
+                f"matchers failed on {len(failures)} of {len(pairs)} pairs, most recently with: "
+                f"{failures[-1]}"
+            )
+        return matches
 
     def results(self, pair: Pair) -> list[PairMatches]:
         """Return the cached or computed results of all matchers for an image pair."""

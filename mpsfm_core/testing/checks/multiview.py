@@ -44,7 +44,7 @@ def check_multiview_order(case: ContractCase) -> None:
     """Require that the output depth maps have the order of the input views."""
     case.require_truth("painted", "prepared", "image")
     examples = _make_group(case)[::-1]
-    group = case.run_on_group(*examples)
+    group = case.run_on_examples(*examples)
     right = max(map(_scale_free_error, group.depth, examples))
     if max(map(_scale_free_error, group.depth[::-1], examples)) < 0.5 * right:
         raise CheckFailed("the order of the maps differs from the order of the views")
@@ -54,7 +54,7 @@ def check_multiview_own_axis(case: ContractCase) -> str:
     """Require depth along the optical axis of each view, not of the first view."""
     case.require_truth("painted", "prepared", "image")
     examples = _make_group(case)
-    group = case.run_on_group(*examples)
+    group = case.run_on_examples(*examples)
     errors = list(map(_scale_free_error, group.depth, examples))
     if max(errors) > DEPTH_TOLERANCE:
         first = [
@@ -76,7 +76,7 @@ def check_multiview_one_unit(case: ContractCase) -> str:
     """
     case.require_truth("painted", "prepared", "image")
     examples = _make_group(case)
-    factors = _log_factors(case.run_on_group(*examples), examples)
+    factors = _log_factors(case.run_on_examples(*examples), examples)
     spread = float(np.ptp(factors))
     if spread > DEPTH_TOLERANCE:
         raise CheckFailed(f"the units of the maps in one group differ by {np.expm1(spread):.0%}")
@@ -109,7 +109,7 @@ def check_multiview_poses(case: ContractCase) -> str:
 def check_multiview_pose_unit(case: ContractCase) -> str:
     """Require that predicted translations have the unit of the predicted depth."""
     poses, examples = _predict_poses(case)
-    unit = float(np.exp(np.median(_log_factors(case.run_on_group(*examples), examples))))
+    unit = float(np.exp(np.median(_log_factors(case.run_on_examples(*examples), examples))))
     factors = []
     for index in range(1, len(examples)):
         found, true = (_relative(p, index)[1] for p in (poses, _true_poses(examples)))
@@ -134,7 +134,7 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
     common = case.example.with_common_camera()
     sizes = ((2 * width, 2 * height), (height, width))
     examples = (common, *(case.example.sized(*size).with_common_camera() for size in sizes))
-    found = case.run_on_group(*examples).intrinsics
+    found = case.run_on_examples(*examples).intrinsics
     assert found is not None  # The validator requires the predicted intrinsics.
     if case.truth_source == "none":
         ratio = float(found[1, 0] / found[0, 0])
@@ -162,7 +162,7 @@ def check_multiview_group_sizes(case: ContractCase) -> str:
     worst = 0.0
     for size in _GROUP_SIZES:
         examples = tuple(views[:size])
-        group = case.run_on_group(*examples)
+        group = case.run_on_examples(*examples)
         if case.truth_source == "none":
             continue
         for index, (prior, example) in enumerate(_pairs(group, examples)):
@@ -185,7 +185,7 @@ def check_multiview_alone(case: ContractCase) -> None:
 
     A run calls the multi-view network with one view if an image overlaps no other image.
     """
-    case.run_on_group(case.example)
+    case.run_on_examples(case.example)
 
 
 def check_multiview_sizes(case: ContractCase) -> str:
@@ -196,7 +196,7 @@ def check_multiview_sizes(case: ContractCase) -> str:
         case.example.partner.sized(height, width),
         case.example.sized(149, 107),
     )
-    group = case.run_on_group(*examples)
+    group = case.run_on_examples(*examples)
     if case.truth_source == "none":
         return "the truth is unknown"
     for prior, example in _pairs(group, examples):
@@ -272,7 +272,7 @@ def _predict_poses(case: ContractCase) -> tuple[Float64, tuple[Example, ...]]:
         raise CheckSkipped("the provider does not declare 'proposes-poses'")
     case.require_truth("prepared", "image")
     examples = _make_group(case)
-    poses = case.run_on_group(*examples).poses
+    poses = case.run_on_examples(*examples).poses
     assert poses is not None  # The validator requires the predicted poses.
     return poses, examples
 

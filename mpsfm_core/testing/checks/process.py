@@ -7,26 +7,17 @@ provider must therefore neither change process state that other providers use no
 from __future__ import annotations
 
 import gc
-import os
 import pickle
-import sys
-import tempfile
 import time
 import tracemalloc
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 from mpsfm_core.testing.contract_case import ContractCase, describe_difference
 from mpsfm_core.testing.examples import Example
-from mpsfm_core.testing.leak_probe import measure_usage
+from mpsfm_core.testing.leak_probe import read_usage
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
-from mpsfm_core.testing.process_state import (
-    known_process_state,
-    read_process_settings,
-    read_process_state,
-)
+from mpsfm_core.testing.process_state import read_process_settings
 from mpsfm_core.testing.second_process import run_in_second_process
 
 MAX_CONSTRUCTION_S = 20.0
@@ -36,18 +27,19 @@ failure in ``expected_failures``."""
 MAX_CALL_S = 20.0
 """Time limit in seconds for one call with a view of 192 x 144 pixels. The largest networks need 5 s
 on a CPU."""
-_NUM_WARM_CALLS = 3
-_NUM_MEMORY_CALLS = 27
-_MEMORY_TIME_S = 1.5
-"""Time in seconds after which the check ``memory-released`` makes no further calls, after at least
-4 calls."""
+_NUM_MEMORY_CALLS = 28
+_MIN_MEMORY_CALLS = 2
+_MEMORY_TIME_S = 0.25
+"""Smallest number of calls in each half of the check ``memory-released``, and the CPU time in
+seconds after which a half makes no further calls."""
 _MAX_RETAINED_BYTES = 20_000
 """Bytes of Python and numpy memory that a call of a provider may retain. The pixels of a view have
 at least 83 kB, so a retained view is detected. Caches of the Python interpreter grow by less than 4
 kB."""
 _MAX_NATIVE_MB = 40.0
 """Growth of the resident memory in MB during all calls after which a native leak is reported. The
-memory pools of onnxruntime and torch grow by less than 20 MB after the first three calls."""
+memory pools of onnxruntime and torch grow by less than 20 MB after the first three calls of an
+instance."""
 
 
 def check_second_process(case: ContractCase) -> str:
@@ -80,19 +72,11 @@ def check_global_state(case: ContractCase) -> None:
     the working directory, threads, warning filters and error handling of numpy. Other providers in
     the process depend on the global state.
     """
-    case.prepare(case.example, case.example.partner)
-    auxiliary = case.make_auxiliary_input(case.example.view, case.example)
-    case.provider  # noqa: B018 - imports the provider's libraries, which may change the state
-    case.run_on_view(case.example.view, case.example, auxiliary=auxiliary)
-    _require_unchanged(case.process_before.changes(read_process_settings()), "the provider")
-    with known_process_state(case.process_before):
-        before = read_process_state()
-        provider = case.create_provider()
-        changes = before.changes(read_process_state(), without_torch_numbers=True)
-        _require_unchanged(changes, "constructing the provider")
-        before = read_process_state()
-        case.run_on_view(case.example.view, case.example, provider, auxiliary)
-        _require_unchanged(before.changes(read_process_state()), "a call of the provider")
+    case.run(case.example)  # imports the provider's libraries
+    imported = case.process_before.changes(read_process_settings())
+    for what, changed in {"the provider": imported, **case.observed.changes}.items():
+        if changed:
+            raise CheckFailed(f"{what} changes {changed}")
 
 
 def check_standard_output(case: ContractCase) -> None:
@@ -101,50 +85,45 @@ def check_standard_output(case: ContractCase) -> None:
     Standard output is reserved for the output of commands, which may be JSON. Messages belong in
     Python's ``logging`` or on standard error.
     """
-    case.prepare(case.example, case.example.partner)
-    case.make_auxiliary_input(case.example.view, case.example)
-    with _capture_output() as lines:
-        case.run(case.example, case.create_provider())
-    if lines:
-        raise CheckFailed(f"the provider prints on standard output: {lines[0][:80]!r}")
+    if case.observed.printed:
+        raise CheckFailed(
+            f"the provider prints on standard output: {case.observed.printed[0][:80]!r}"
+        )
 
 
 def check_memory_released(case: ContractCase) -> str:
     """Require that memory, open files and threads do not grow with the number of views.
 
-    The check ``memory-released`` makes 30 calls of the provider, or fewer if a call takes long. The
+    The check ``memory-released`` makes 28 calls of the provider, or fewer if a call takes long. The
     measured memory is that of Python and numpy. Growth of the memory of the whole process is
     reported above 40 MB only.
     """
-    num_views = _NUM_WARM_CALLS + _NUM_MEMORY_CALLS
-    examples = [_rename_example(case.example, f"memory/{i}.png") for i in range(num_views)]
     case.prepare(case.example, case.example.partner)
-    for example in examples:
-        case.prepare(example)
+    examples = [_rename_example(case.example, f"memory/{i}.png") for i in range(_NUM_MEMORY_CALLS)]
+    case.prepare(*examples)
     auxiliary = case.make_auxiliary_input(case.example.view, case.example)
-    inputs = [(e.view, auxiliary) for e in examples]
-    provider = case.create_provider()
+    provider = case.observed.provider
 
-    def run(view: Any, given: Any) -> None:
-        case.run_on_view(view, case.example, provider, given)
+    def run(example: Example) -> None:
+        case.run_on_view(example.view, case.example, provider, auxiliary)
 
+    gc.freeze()  # Collecting the objects of all imported libraries takes long.
     tracemalloc.start()
     try:
-        for view, given in inputs[:_NUM_WARM_CALLS]:
-            run(view, given)
-        before = next(measure_usage(lambda: None, 1))
-        traced = tracemalloc.get_traced_memory()[0]
-        started, count = time.perf_counter(), 0
-        for view, given in inputs[_NUM_WARM_CALLS:]:
-            run(view, given)
-            count += 1
-            if count >= 4 and time.perf_counter() - started > _MEMORY_TIME_S:
-                break
-        gc.collect()
-        retained = (tracemalloc.get_traced_memory()[0] - traced) / count
-        after = next(measure_usage(lambda: None, 1))
+        run(examples[0])
+        before = read_usage()
+        half = len(examples) // 2
+        counts, sizes = zip(
+            _measure_retained(run, examples[1:half]),
+            _measure_retained(run, examples[half:]),
+            strict=True,
+        )
+        after = read_usage()
     finally:
         tracemalloc.stop()
+        gc.unfreeze()
+    # A library may allocate memory once in any call.
+    count, retained = sum(counts), min(sizes)
     if retained > _MAX_RETAINED_BYTES:
         raise CheckFailed(f"the provider retains {retained / 1000:.0f} kB per view")
     for name in ("files", "threads"):
@@ -163,21 +142,15 @@ def check_speed(case: ContractCase) -> str:
     A reconstruction constructs one provider per thread and calls the provider for every image. If a
     provider needs more time, declare an expected failure with the reason.
     """
-    started = time.perf_counter()
-    provider = case.create_provider()
-    constructed = time.perf_counter()
-    case.run(case.example, provider)
-    first = time.perf_counter()
-    case.run(case.example, provider)
-    second = time.perf_counter() - first
+    construction_s, (first_s, next_s) = case.observed.construction_s, case.observed.call_s
     width, height = case.example.camera.size
-    times = (constructed - started, first - constructed, second)
-    text = "{:.3f} s to construct, {:.3f} s for the first and {:.3f} s for the next {} x {}".format(
-        *times, width, height
+    text = (
+        f"{construction_s:.3f} s to construct, {first_s:.3f} s for the first and {next_s:.3f} s "
+        f"for the next {width} x {height}"
     )
-    if times[0] > MAX_CONSTRUCTION_S:
+    if construction_s > MAX_CONSTRUCTION_S:
         raise CheckFailed(f"{text}: construction takes more than {MAX_CONSTRUCTION_S:.0f} s")
-    if max(times[1:]) > MAX_CALL_S:
+    if max(first_s, next_s) > MAX_CALL_S:
         raise CheckFailed(f"{text}: a call takes more than {MAX_CALL_S:.0f} s")
     return text
 
@@ -192,34 +165,19 @@ PROCESS_CHECKS = (
 """Contract checks of side effects, in the order to run them."""
 
 
+def _measure_retained(run: Callable[[Example], None], examples: list[Example]) -> tuple[int, float]:
+    """Run a provider on several views; return the number of calls and retained bytes per call."""
+    traced, started = tracemalloc.get_traced_memory()[0], time.process_time()
+    for count, example in enumerate(examples, 1):
+        run(example)
+        if count >= _MIN_MEMORY_CALLS and time.process_time() - started > _MEMORY_TIME_S:
+            break
+    gc.collect()
+    return count, (tracemalloc.get_traced_memory()[0] - traced) / count
+
+
 def _rename_example(example: Example, name: str) -> Example:
     renamed = replace(example, name=name)
     # Keep the rendered images of the example, which do not depend on the example's name.
     renamed.__dict__.update(view=replace(example.view, name=name), partner=example.partner)
     return renamed
-
-
-def _require_unchanged(changes: str, what: str) -> None:
-    if changes:
-        raise CheckFailed(f"{what} changes {changes}")
-
-
-@contextmanager
-def _capture_output() -> Iterator[list[str]]:
-    """Collect the lines that Python or native code writes to standard output."""
-    lines: list[str] = []
-    sys.stdout.flush()
-    saved = os.dup(1)
-    with tempfile.TemporaryFile() as file:
-        os.dup2(file.fileno(), 1)
-        stdout = sys.stdout
-        sys.stdout = open(1, "w", closefd=False)  # noqa: SIM115 - descriptor 1 must stay open
-        try:
-            yield lines
-        finally:
-            sys.stdout.flush()
-            sys.stdout = stdout
-            os.dup2(saved, 1)
-            os.close(saved)
-            file.seek(0)
-            lines += file.read().decode(errors="replace").splitlines()

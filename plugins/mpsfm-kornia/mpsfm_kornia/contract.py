@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from kornia.feature import DeDoDe, LightGlue, LoFTR
 
+from mpsfm_core.providers.torch_runtime import SkipRandomWeights
 from mpsfm_core.testing import ContractSetup
 from mpsfm_kornia.lightglue import LIGHTGLUE_256
 
@@ -15,6 +16,11 @@ def not_symmetric(folder: Path) -> ContractSetup:
     """Return a contract test setup for detectors that are not invariant to rotation."""
     reason = "the detector is not invariant to a rotation by 180 degrees"
     return ContractSetup(expected_failures={"features-pixel-convention": reason})
+
+
+def sift(folder: Path) -> ContractSetup:
+    """Return a contract test setup with few features, because kornia's SIFT is slow."""
+    return ContractSetup(options={"max_keypoints": 400})
 
 
 def loftr(folder: Path) -> ContractSetup:
@@ -33,11 +39,15 @@ def dedode(folder: Path) -> ContractSetup:
     """Write random weights of DeDoDe's detector and descriptor in separate files."""
     with torch.random.fork_rng():
         torch.manual_seed(3)
-        network = DeDoDe("L", "B", amp_dtype=torch.float32).eval()
+        with SkipRandomWeights():  # most layers of VGG are not part of DeDoDe
+            network = DeDoDe("L", "B", amp_dtype=torch.float32).eval()
+        for module in network.modules():
+            if hasattr(module, "reset_parameters"):
+                module.reset_parameters()
     paths = folder / "dedode_detector.pth", folder / "dedode_descriptor.pth"
     for path, module in zip(paths, (network.detector, network.descriptor), strict=True):
         torch.save(module.state_dict(), path)
-    options = {"detector_weights": str(paths[0]), "weights": str(paths[1]), "resize": 96}
+    options = {"detector_weights": str(paths[0]), "weights": str(paths[1]), "resize": 64}
     return ContractSetup(options={**options, "max_keypoints": 200}, truth_source="none")
 
 

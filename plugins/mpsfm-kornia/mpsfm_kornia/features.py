@@ -14,7 +14,7 @@ from kornia.color import rgb_to_grayscale
 from kornia.feature import ALIKED, DISK, DeDoDe, SIFTFeature, XFeat, get_laf_center
 
 from mpsfm_core import Features, ProviderContext, View
-from mpsfm_core.providers.torch_runtime import inference, use_threads
+from mpsfm_core.providers.torch_runtime import SkipRandomWeights, inference, use_threads
 from mpsfm_kornia.options import (
     AlikedOptions,
     DedodeOptions,
@@ -142,7 +142,8 @@ class DedodeFeatures(KorniaFeatures):
 
     def __init__(self, options: DedodeOptions, context: ProviderContext) -> None:
         super().__init__(options, context)
-        self._network = DeDoDe("L", "B", amp_dtype=torch.float32)
+        with SkipRandomWeights():
+            self._network = DeDoDe("L", "B", amp_dtype=torch.float32)
         for module, uri, sha256 in (
             (self._network.detector, options.detector_weights, options.detector_sha256),
             (self._network.descriptor, options.weights, options.sha256),

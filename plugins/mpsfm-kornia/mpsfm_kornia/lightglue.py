@@ -11,7 +11,7 @@ from kornia.feature import LightGlue
 from mpsfm_core import Features, PairMatches, ProviderContext, SparseMatches, View
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.providers import require_features
-from mpsfm_core.providers.torch_runtime import inference, use_threads
+from mpsfm_core.providers.torch_runtime import SkipRandomWeights, inference, use_threads
 from mpsfm_kornia.attention import fuse_cross_attention
 from mpsfm_kornia.options import LightGlueOptions
 from mpsfm_kornia.runtime import load_state, load_weights
@@ -40,14 +40,15 @@ class LightGlueMatcher:
     def __init__(self, options: LightGlueOptions, context: ProviderContext) -> None:
         use_threads(context)
         self._device = context.device
-        self._network = LightGlue(
-            None,  # type: ignore[arg-type]  # None loads no published weights
-            **self.architecture,
-            **_FIXED,
-            depth_confidence=options.depth_confidence,
-            width_confidence=options.width_confidence,
-            filter_threshold=options.filter_threshold,
-        )
+        with SkipRandomWeights():
+            self._network = LightGlue(
+                None,  # type: ignore[arg-type]  # None loads no published weights
+                **self.architecture,
+                **_FIXED,
+                depth_confidence=options.depth_confidence,
+                width_confidence=options.width_confidence,
+                filter_threshold=options.filter_threshold,
+            )
         state = load_weights(context, options.weights, options.sha256)
         load_state(self._network, _renamed(state), options.weights)
         if self._device == "cpu":

@@ -11,7 +11,7 @@ from kornia.feature import LoFTR
 from kornia.feature.loftr.loftr import default_cfg
 
 from mpsfm_core import DenseMatches, Features, PairMatches, ProviderContext, View
-from mpsfm_core.providers.torch_runtime import inference, use_threads
+from mpsfm_core.providers.torch_runtime import SkipRandomWeights, inference, use_threads
 from mpsfm_kornia.options import LoftrOptions
 from mpsfm_kornia.runtime import Grid, is_inside_mask, load_state, load_weights
 
@@ -37,7 +37,8 @@ class LoftrMatcher:
         config: Any = copy.deepcopy(default_cfg)
         config["match_coarse"]["thr"] = options.match_threshold
         config["coarse"]["temp_bug_fix"] = options.corrected_encoding
-        self._network = LoFTR(pretrained=None, config=config)
+        with SkipRandomWeights():
+            self._network = LoFTR(pretrained=None, config=config)
         state = load_weights(context, options.weights, options.sha256)
         load_state(self._network, state.get("state_dict", state), options.weights)
         self._network.to(self._device)

@@ -75,6 +75,7 @@ def mpsfm_providers() -> list[ProviderSpec]:
             name="kornia-sift",
             factory="mpsfm_kornia.features:SiftFeatures",
             options=opt.SiftOptions,
+            contract="mpsfm_kornia.contract:sift",
             summary="RootSIFT, on a GPU if available; no weights",
             requires=_REQUIRES,
             install_hint="pip install mpsfm-kornia",

@@ -19,6 +19,7 @@ from mpsfm_core.report.viewing import (
 
 RECORDING = "scene.rrd"
 TIMELINE = "step"
+_DEPTH = "world/depth"
 
 
 class RerunViewer:
@@ -63,6 +64,9 @@ class RerunViewer:
         names = {image.name for image in scene.images}
         for name in self._shown - names:
             self._recording.log(_place(name), rerun.Clear(recursive=True))
+            self._recording.log(_depth_place(name), rerun.Clear(recursive=True))
+        if cloud is not None:
+            self._recording.log(_DEPTH, rerun.Clear(recursive=True))
         for image in scene.images:
             self._log_image(image, as_points=cloud is None)
         self._recording.log("world/points", rerun.Points3D(scene.points))
@@ -105,8 +109,8 @@ class RerunViewer:
             self._recording.log(f"depth/{_key(image.name)}", _depth_image(image.depth))
         elif as_points:
             points = unproject_depth_map(image, picture)
-            depth_place = f"world/depth/{_key(image.name)}"
-            self._recording.log(depth_place, rerun.Points3D(points.xyz, colors=points.rgb))
+            shown = rerun.Points3D(points.xyz, colors=points.rgb)
+            self._recording.log(_depth_place(image.name), shown)
 
 
 def _depth_image(depth: DepthPrior) -> rerun.DepthImage:
@@ -118,6 +122,10 @@ def _depth_image(depth: DepthPrior) -> rerun.DepthImage:
 
 def _place(name: str) -> str:
     return f"world/cameras/{_key(name)}"
+
+
+def _depth_place(name: str) -> str:
+    return f"{_DEPTH}/{_key(name)}"
 
 
 def _key(name: str) -> str:

@@ -58,17 +58,57 @@ def test_run_is_recorded_step_by_step(tmp_path: Path) -> None:
     assert rows["/log"] == 1
 
 
-def test_finished_scene_is_recorded_with_its_cloud(tmp_path: Path) -> None:
+def test_cameras_photos_and_depth_maps_are_recorded_at_their_places(tmp_path: Path) -> None:
+    viewer = RerunViewer(tmp_path, lambda name: np.full((24, 32, 3), 90, np.uint8))
+    viewer.show(scene(3))
+    viewer.finish()
+    recording = tmp_path / RECORDING
+    camera = values_of(recording, r"/world/cameras/room\/2.jpg")
+    assert camera["Transform3D:translation"] == [[2, 0, 0]]
+    photo = values_of(recording, r"/world/cameras/room\/2.jpg/photo")
+    assert photo["Pinhole:resolution"] == [[32, 24]]
+    columns = photo["Pinhole:image_from_camera"][0]
+    np.testing.assert_allclose(columns, [30, 0, 0, 0, 30, 0, 16, 12, 1])
+    blob = np.array(photo["EncodedImage:blob"][0], np.uint8)
+    shown = cv2.imdecode(blob, cv2.IMREAD_COLOR)
+    assert shown.shape == (24, 32, 3) and abs(int(shown.mean()) - 90) <= 2
+    points = np.array(values_of(recording, r"/world/depth/room\/2.jpg")["Points3D:positions"])
+    np.testing.assert_allclose(points[:, 2], 2, atol=1e-2)
+    assert points[:, 0].min() < 2 < points[:, 0].max(), "in front of the camera at x = 2"
+
+
+def test_removed_images_are_cleared_with_their_depth_maps(tmp_path: Path) -> None:
     viewer = RerunViewer(tmp_path, lambda name: None)
+    viewer.show(scene(3))
+    viewer.show(scene(2))
+    viewer.finish()
+    cleared = {entity for step, entity in clears(tmp_path / RECORDING) if step == 2}
+    assert cleared == {r"/world/cameras/room\/2.jpg", r"/world/depth/room\/2.jpg"}
+
+
+def test_final_cloud_replaces_the_depth_maps(tmp_path: Path) -> None:
+    viewer = RerunViewer(tmp_path, lambda name: None)
+    viewer.show(scene(2))
     viewer.show(scene(2), ColoredPoints(np.zeros((4, 3)), np.zeros((4, 3), np.uint8)))
     viewer.finish()
     rows = recorded(tmp_path / RECORDING)
     assert rows["/world/dense"] == 1
-    assert not any(path.startswith("/world/depth") for path in rows), "maps, not points"
+    assert rows[r"/world/depth/room\/0.jpg"] == 1, "only in the first step"
+    assert clears(tmp_path / RECORDING) == {(2, "/world/depth")}
+
+
+def clears(path: Path) -> set[tuple[int, str]]:
+    """Return the steps and entities at which a recording clears an entity and its children."""
+    found = set()
+    for chunk in RrdReader(str(path)).stream():
+        batch = chunk.to_record_batch()
+        if "Clear:is_recursive" in batch.schema.names:
+            found |= {(step, str(chunk.entity_path)) for step in batch["step"].to_pylist()}
+    return found
 
 
 def values_of(path: Path, entity: str) -> dict[str, Any]:
-    """Return the values of each component in the only row of an entity."""
+    """Return the values of each component in the only row of an entity, by component."""
     return {
         name: column.to_pylist()[0]
         for chunk in RrdReader(str(path)).stream()
