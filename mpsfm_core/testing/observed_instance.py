@@ -1,4 +1,4 @@
-"""Instance of a provider whose construction and calls are observed for several contract checks."""
+"""Provider instance whose construction and calls are observed for contract checks."""
 
 from __future__ import annotations
 

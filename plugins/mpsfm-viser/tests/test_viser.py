@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import struct
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("viser", reason="viser is not installed")
-
+import msgspec
+import viser
+import websockets.sync.client
+import zstandard
 from mpsfm_viser.viewer import ViserViewer
 
 from mpsfm_core.data import DepthPrior, PinholeCamera, PosedImage, SceneState
@@ -43,6 +48,37 @@ def test_web_page_is_served(viewer: ViserViewer) -> None:
         assert page.status == 200
         assert b"<html" in page.read()
     assert viewer.address in viewer.finish()
+
+
+def messages_to_browser(viewer: ViserViewer) -> dict[str, dict[str, Any]]:
+    """Connect as viser's web page does; return the received messages by type and scene node."""
+    address = viewer.address.replace("http:", "ws:")
+    protocol = [f"viser-v{viser.__version__}"]
+    with websockets.sync.client.connect(address, subprotocols=protocol, max_size=None) as socket:
+        data = socket.recv(timeout=20)
+    _, size = struct.unpack("<QQ", data[:16])  # sizes with and without decompression
+    packed = zstandard.ZstdDecompressor().decompress(data[16 : 16 + size])
+    messages: dict[str, dict[str, Any]] = {}
+    for message in msgspec.msgpack.decode(packed)["messages"]:
+        messages.setdefault(message["type"], {})[message.get("name", "")] = message
+    return messages
+
+
+def test_browser_receives_cameras_photos_and_points(viewer: ViserViewer) -> None:
+    viewer.show(scene(3))
+    messages = messages_to_browser(viewer)
+    cameras = messages["CameraFrustumMessage"]
+    assert cameras.keys() == {f"/cameras/room%2F{i}.jpg" for i in range(3)}
+    props = cameras["/cameras/room%2F2.jpg"]["props"]
+    assert props["fov"] == pytest.approx(2 * np.arctan(24 / 60))
+    assert props["_image_data"] is not None
+    np.testing.assert_allclose(
+        messages["SetPositionMessage"]["/cameras/room%2F2.jpg"]["position"], [2, 0, 0]
+    )
+    assert messages["PointCloudMessage"].keys() == {
+        "/sparse",
+        *(f"/depth/room%2F{i}.jpg" for i in range(3)),
+    }
 
 
 def test_scene_has_cameras_and_depth_maps(viewer: ViserViewer) -> None:
