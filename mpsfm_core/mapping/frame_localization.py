@@ -46,6 +46,9 @@ _SCALES = np.array([16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 1.0])
 """Factors on :data:`MAX_ERROR_PX` in the steps of pose refinement, for a wrong prediction."""
 _RAYLEIGH_MEDIAN = 1.1774
 """Ratio of the median distance to the std per axis of errors with a normal distribution."""
+_CELL_RATIO = 0.25
+"""Width of the cells in which the errors of all points of a keyframe are equal, because the depth
+errors of neighboring points are, relative to the image width. [tuned: benchmarks.walks]"""
 _MIN_STD_PX = 0.1
 """Minimum standard deviation of a tracked point in pixels, which includes its 3D point. [ours]"""
 _CENTER = np.float32(0.5)
@@ -75,9 +78,12 @@ class FramePose:
     """``cam_from_world`` as rotation (3, 3) and translation (3,)."""
     covariance: Float64
     """(6, 6) covariance of ``w`` and ``dt`` in ``R <- exp(w) R, t <- t + dt``, relative to the
-    keyframes."""
+    keyframes, for independent errors of all points."""
     num_inliers: int
     """Number of tracked points that fit the pose."""
+    inflation: float
+    """Factor of the covariance because the depth errors of neighboring points are equal. This part
+    of the error is almost constant from frame to frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,9 +173,13 @@ def localize_frame(
     rotation, translation = map(np.ascontiguousarray, pose)
     linearize_pose(rotation, translation, camera.pinhole.params, segments, 1.0, matrix, gradient)
     std_px = max(float(np.median(distances[inlier])) / _RAYLEIGH_MEDIAN, _MIN_STD_PX)
+    source = np.repeat(np.arange(len(tracked)), [len(part[0]) for part in tracked])
+    cells = np.column_stack([source, np.floor(xy / (_CELL_RATIO * gray.shape[1]))])[inlier]
+    num_cells = len(np.unique(cells, axis=0))
     inverse: Float64 = np.linalg.pinv(matrix, hermitian=True).astype(np.float64)
     covariance: Float64 = std_px**2 * inverse
-    return FramePose((rotation, translation), covariance, int(inlier.sum()))
+    num_inliers = int(inlier.sum())
+    return FramePose((rotation, translation), covariance, num_inliers, num_inliers / num_cells)
 
 
 def _track(keyframe: Keyframe, gray: UInt8, predicted: Pose) -> tuple[Float32, Float64, Float64]:

@@ -163,19 +163,24 @@ def _smooth(
         state[:_DOF] -= increments[row - 1]
         spread = transition @ spread @ transition.T + drift
         predicted.append((state, spread))
-        transitions.append(transition)
+        transitions.append((transition, drift))
         measurement = noise[row]
         if measurement is not None:
             gain = np.linalg.solve(spread[:_DOF, :_DOF] + measurement, spread[:_DOF]).T
             state = state - gain @ state[:_DOF]
-            spread = spread - gain @ spread[:_DOF]
+            kept = np.eye(2 * _DOF)
+            kept[:, :_DOF] -= gain
+            spread = kept @ spread @ kept.T + gain @ measurement @ gain.T  # Joseph form
         filtered.append((state, spread))
     states, spreads = [filtered[-1][0]], [filtered[-1][1]]
     for row in range(count - 2, -1, -1):
         (state, spread), (ahead, ahead_spread) = filtered[row], predicted[row]
-        gain = np.linalg.solve(ahead_spread, transitions[row] @ spread).T
+        transition, drift = transitions[row]
+        gain = np.linalg.solve(ahead_spread, transition @ spread).T
+        kept = np.eye(2 * _DOF) - gain @ transition
         states.append(state + gain @ (states[-1] - ahead))
-        spreads.append(spread + gain @ (spreads[-1] - ahead_spread) @ gain.T)
+        # This form of the covariance is positive semidefinite despite rounding.
+        spreads.append(kept @ spread @ kept.T + gain @ (spreads[-1] + drift) @ gain.T)
     return (
         np.stack(states[::-1])[:, :_DOF],
         np.stack(spreads[::-1])[:, :_DOF, :_DOF],

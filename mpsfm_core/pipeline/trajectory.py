@@ -56,6 +56,8 @@ class _Placed:
     frame: TrajectoryFrame
     measured: tuple[Pose, Float64] | None
     shot: int
+    inflation: float = 1.0
+    """Factor of the smoothed covariance, see :class:`FramePose`."""
 
 
 def localize_frames(
@@ -137,7 +139,7 @@ class _Tracker:
         placed = TrajectoryFrame(
             *(number, time_s, source, neighbors.component), num_inliers=outcome.num_inliers
         )
-        return _Placed(placed, (pose, outcome.covariance), shot)
+        return _Placed(placed, (pose, outcome.covariance), shot, outcome.inflation)
 
     def _find_neighbors(self, frame: VideoFrame, after: int, shot: int) -> _Neighbors | None:
         """Find the nearest registered keyframes of the shot; the keyframe itself has no other."""
@@ -241,6 +243,7 @@ def _smooth(run: Sequence[_Placed]) -> Iterator[TrajectoryFrame]:
     smoothed = smooth_trajectory(
         [entry.frame.time_s for entry in run], [entry.measured for entry in run]
     )
+    typical = float(np.median([entry.inflation for entry in run if entry.measured is not None]))
     for entry, result in zip(run, smoothed, strict=True):
         is_measured = entry.measured is not None
         yield replace(
@@ -248,5 +251,5 @@ def _smooth(run: Sequence[_Placed]) -> Iterator[TrajectoryFrame]:
             source=entry.frame.source if is_measured else "interpolated",
             component=run[0].frame.component,
             pose=result.pose,
-            covariance=result.covariance,
+            covariance=result.covariance * (entry.inflation if is_measured else typical),
         )

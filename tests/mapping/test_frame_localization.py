@@ -94,3 +94,11 @@ def test_smoothing_halves_noise_and_fills_gaps_with_larger_std() -> None:
     spread = np.sqrt([np.diag(smoothed[k].covariance)[3:] for k in (40, 65)])
     assert np.abs(gap).max() < 0.04 and (spread[1] > 1.5 * spread[0]).all()
     assert np.abs(gap / spread[1]).max() < 3
+
+
+def test_covariance_is_positive_with_frames_of_very_different_accuracy() -> None:
+    times, true = make_walk(40)
+    stds = [1e-7 if number % 8 == 0 else 1e-2 for number in range(40)]
+    measured = [(pose, np.eye(6) * std**2) for pose, std in zip(true, stds, strict=True)]
+    smoothed = smooth_trajectory(times, measured)
+    assert all(np.linalg.eigvalsh(frame.covariance).min() > 0 for frame in smoothed)
