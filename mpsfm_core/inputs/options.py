@@ -21,7 +21,7 @@ class VideoOptions(Options):
     overlap: float = expert(0.7, gt=0, lt=1)
     """Share of still tracked points below which the next frame is selected. A larger share of
     tracked points selects more frames."""
-    max_frames: int = Field(600, ge=2)
+    max_frames: int = Field(300, ge=2)
     """Maximum number of keyframes of a video. If more keyframes are selected, those with the least
     motion are dropped. More keyframes take proportionally more time. [ours]"""
     trajectory_every: int = Field(1, ge=0)
