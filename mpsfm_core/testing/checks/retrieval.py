@@ -30,7 +30,7 @@ def check_retrieval_self_similarity(case: ContractCase) -> str:
     Descriptors of unit norm always pass the check. If descriptors have different norms, the
     descriptors of bright or detailed views can be similar to those of all views.
     """
-    flat = replace(case.example.view, image=np.full_like(case.example.view.image, 200))
+    flat = replace(case.example.view, image=np.full_like(case.example.view.image, 255))
     descriptors = np.stack(
         [
             case.run(case.example),
