@@ -94,9 +94,8 @@ class SelectedFrame:
 
     @property
     def name(self) -> str:
-        """File name, numbered within the shot, so that no neighbors are matched across a cut."""
-        shot = f"shot{self.shot + 1}_" if self.shot else ""
-        return f"{shot}frame_{self.number:06d}.jpg"
+        """File name with the number of the frame."""
+        return f"frame_{self.number:06d}.jpg"
 
     def to_json(self) -> dict[str, Any]:
         """Convert the keyframe to an entry of ``frames.json``."""
