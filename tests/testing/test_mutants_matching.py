@@ -369,11 +369,24 @@ class LimitedMatcher(MutualNearest):
         return super().match(a, b, fa, fb)
 
 
+class UnlocksDescriptors(LimitedMatcher):
+    """Fault: makes the descriptors of the given features writable, and normalizes them in place."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        for descriptors in (fa.descriptors, fb.descriptors):
+            descriptors.setflags(write=True)
+            descriptors /= 2
+        return super().match(a, b, fa, fb)
+
+
 @pytest.mark.parametrize(
     ("factory", "check", "message"),
-    [(LimitedMatcher, "matcher-many-features", "out of bounds")],
+    [
+        (LimitedMatcher, "matcher-many-features", "out of bounds"),
+        (UnlocksDescriptors, "inputs-unchanged", "descriptors differs"),
+    ],
 )
-def test_matchers_of_many_features(
+def test_matchers_of_given_features(
     caught: Callable[..., None], factory: type, check: str, message: str
 ) -> None:
     caught("matcher", factory, check, message, None, "sparse")
