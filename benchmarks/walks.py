@@ -41,7 +41,7 @@ from mpsfm_core.data import (
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.trajectories import (
     Trajectory,
-    count_missing,
+    count_frames_outside_largest,
     evaluate_trajectory,
     read_trajectory,
 )
@@ -293,7 +293,7 @@ def run_walk(
     }
     if summary["status"] == "success":
         found = read_trajectory(output / "trajectory.txt")
-        record["mpsfm"] = evaluate_trajectory(found, truth, count_missing(output))
+        record["mpsfm"] = evaluate_trajectory(found, truth, count_frames_outside_largest(output))
         record["keyframes"] = _evaluate_model(output / "sparse", poses)
     start = time.process_time()
     database, mapped = output / "colmap.db", output / "colmap"

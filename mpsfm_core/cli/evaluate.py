@@ -85,7 +85,7 @@ def evaluate(
     from mpsfm_core.evaluation import CONVENTIONS, evaluate, read_poses
     from mpsfm_core.evaluation.result_folder import find_photos
     from mpsfm_core.evaluation.trajectories import (
-        count_missing,
+        count_frames_outside_largest,
         evaluate_trajectory,
         find_trajectory,
         read_trajectory,
@@ -111,7 +111,7 @@ def evaluate(
         if found is None:
             raise InputError(f"{model}: the folder has no trajectory.txt to compare with {truth}")
         compared = read_trajectory(found), read_trajectory(trajectory)
-        report |= evaluate_trajectory(*compared, count_missing(model))
+        report |= evaluate_trajectory(*compared, count_frames_outside_largest(model))
         typer.echo(json.dumps(report, indent=2))
         return
     photos = photos or find_photos(model)

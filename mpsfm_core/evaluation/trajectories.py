@@ -28,11 +28,12 @@ MAX_TIME_DIFFERENCE_S = 0.01
 WINDOWS_M = (10.0, 25.0, 50.0, 100.0)
 """Path lengths of the windows of WATE-AUC, in units of the true trajectory. [VidMap]"""
 MAX_ERROR_RATIO = 0.05
-"""Ratio of the largest position error of WATE-AUC to the path length. [VidMap]"""
+"""Upper limit of the position error in WATE-AUC, relative to the path length. [VidMap]"""
 THRESHOLDS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
-"""Maximum position errors in meters and rotation errors in degrees of the recall. [Aachen]"""
+"""Maximum position errors in meters and rotation errors in degrees of the recall. [Aachen Day-
+Night]"""
 _MIN_FRAMES = 3
-"""Minimum number of frames that are aligned."""
+"""Minimum number of frames in a window that is aligned."""
 _SUFFIXES = (".txt", ".tum", ".csv")
 
 
@@ -111,9 +112,10 @@ def evaluate_trajectory(
         Report as plain data for JSON. Areas and recalls are percentages.
 
     Raises:
-        InputError: fewer than three poses have the same time stamps.
+        InputError: fewer than three estimated poses at different positions have a true pose within
+            :data:`MAX_TIME_DIFFERENCE_S`.
     """
-    rows, true_rows = associate(estimated.times, truth.times)
+    rows, true_rows = associate_time_stamps(estimated.times, truth.times)
     poses = {str(k): estimated.poses[row] for k, row in enumerate(rows)}
     true_poses = {str(k): truth.poses[row] for k, row in enumerate(true_rows)}
     errors = trajectory_errors(poses, true_poses)
@@ -160,8 +162,8 @@ def evaluate_trajectory(
     }
 
 
-def count_missing(folder: Path) -> int:
-    """Count the frames without a pose of the largest component in a result folder of a video."""
+def count_frames_outside_largest(folder: Path) -> int:
+    """Count the frames of a video that have no pose in the largest component."""
     table = folder / FRAME_TABLE
     if not table.is_file():
         return 0
@@ -169,7 +171,7 @@ def count_missing(folder: Path) -> int:
     return sum(row.split(",")[3] != "0" for row in rows)
 
 
-def associate(times: Float64, true_times: Float64) -> tuple[Int64, Int64]:
+def associate_time_stamps(times: Float64, true_times: Float64) -> tuple[Int64, Int64]:
     """Associate each time stamp of the shorter trajectory with the nearest of the longer one.
 
     Returns:
@@ -177,7 +179,7 @@ def associate(times: Float64, true_times: Float64) -> tuple[Int64, Int64]:
         :data:`MAX_TIME_DIFFERENCE_S`. [evo associate_trajectories]
     """
     if len(times) > len(true_times):
-        true_rows, rows = associate(true_times, times)
+        true_rows, rows = associate_time_stamps(true_times, times)
         return rows, true_rows
     after = np.clip(np.searchsorted(true_times, times), 1, max(1, len(true_times) - 1))
     before = after - 1
@@ -191,7 +193,10 @@ def associate(times: Float64, true_times: Float64) -> tuple[Int64, Int64]:
 def _windowed_errors(
     centers: Float64, true_centers: Float64, path: Float64, window: float
 ) -> Float64:
-    """Compute the position error (n,) of each frame after alignment of the window around it."""
+    """Compute position errors (m,) of frames, each after alignment of the window around it.
+
+    Frames with fewer than three frames in their window are omitted.
+    """
     start = np.clip(path - window / 2, 0, path[-1] - window)
     low = np.searchsorted(path, start, side="left")
     high = np.searchsorted(path, start + window, side="right")

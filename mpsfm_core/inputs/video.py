@@ -48,7 +48,7 @@ _SHARPNESS_SIDE = 960
 _MAX_BACKWARD_ERROR_PX = 1.0
 """Maximum forward-backward error in pixels of a tracked point."""
 _EARLY_RATIO = 0.5
-"""Share of the required motion from which a sharper frame may be selected earlier."""
+"""Share of the required motion from which an earlier, sharper frame may be selected instead."""
 _MIN_POINTS = 20
 """Minimum number of tracked points to measure the motion of a frame."""
 _MAX_CANDIDATES = 300
@@ -59,9 +59,10 @@ _MAX_CUT_RATIO = 0.2
 _MAX_CUT_CORRELATION = 0.5
 """Correlation of two successive frames below which there is a cut, if tracking fails too. [ours]"""
 _MIN_CONTRAST = 4.0
-"""Minimum std of the gray levels of a frame before or after a cut, so that black is no cut."""
+"""Minimum std of the gray levels of a frame before or after a cut, so that a black
+frame is no cut."""
 _THUMBNAIL = 16, 12
-"""Size of the small pictures that are correlated to detect cuts."""
+"""Size of the thumbnails that are correlated to detect cuts."""
 _DEFAULT_FPS = 30.0
 """Frame rate of a video whose container has neither time stamps nor a frame rate."""
 _MIN_FRAME_RATIO = 0.9
@@ -394,7 +395,7 @@ class _Track:
         if len(self._now) < _MAX_CUT_RATIO * count and _is_cut(last, gray):
             return _Motion(1.0, KeyframeReason.CUT.because())
         if len(self._now) < _MIN_POINTS:
-            # If a blank wall hides the motion, the frame is selected.
+            # The motion is unknown, for example in front of a blank wall, so the frame is selected.
             reason = KeyframeReason.UNTRACKED.because(num_tracks=len(self._now))
             return _Motion(1.0, reason)
         moved = float(np.median(np.linalg.norm(self._now - self._start, axis=2)))
@@ -409,7 +410,7 @@ class _Track:
 
 
 def _is_cut(last: UInt8, gray: UInt8) -> bool:
-    """Return whether two successive frames look different as small pictures without contrast."""
+    """Return whether thumbnails of two successive frames have a low correlation."""
     small = [
         cv2.resize(frame, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64).ravel()
         for frame in (last, gray)
@@ -449,8 +450,8 @@ class VideoFrame(NamedTuple):
 def read_frames(video: Path, wanted: frozenset[int] | None = None) -> Iterator[VideoFrame]:
     """Yield all frames of a video, or the frames with a number in ``wanted``.
 
-    Time stamps are those of the container, so the frame rate may vary. A container without
-    ascending time stamps has the time stamps of a constant frame rate.
+    Time stamps are those of the container, so the frame rate may vary. If they do
+    not ascend, a constant frame rate is assumed.
     """
     with _opened(video) as capture:
         step_s = 1 / (capture.get(cv2.CAP_PROP_FPS) or _DEFAULT_FPS)

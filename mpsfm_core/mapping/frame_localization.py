@@ -2,7 +2,7 @@
 
 Usage::
 
-    keyframe = Keyframe.build(gray, camera, pose, points, observed, depth)   # for each keyframe
+    keyframe = Keyframe.build(gray, camera, pose, (keypoints, points), depth)   # of the model
     outcome = localize_frame([previous, next], gray, predicted_pose)         # pose or reason
 
 The points of a keyframe are 3D points that the keyframe observes, and corners with depth from the
@@ -41,16 +41,19 @@ _MIN_DISTANCE_RATIO = 0.015
 _MAX_BACKWARD_ERROR_PX = 1.0
 """Maximum forward-backward error of a tracked point in pixels."""
 _DEPTH_DEVIATION = 2.0
-"""Half length of the depth interval of a corner, in standard deviations of depth. [ours]"""
+"""Half length of the ray segment that contains a corner, in standard deviations of log depth.
+[ours]"""
 _SCALES = np.array([16.0, 8.0, 4.0, 2.0, 1.0, 1.0, 1.0])
-"""Factors on :data:`MAX_ERROR_PX` in the steps of pose refinement, for a wrong prediction."""
+"""Factors on :data:`MAX_ERROR_PX` in the steps of pose refinement, large at first because the
+predicted pose may be wrong."""
 _RAYLEIGH_MEDIAN = 1.1774
 """Ratio of the median distance to the std per axis of errors with a normal distribution."""
 _CELL_RATIO = 0.25
 """Width of the cells in which the errors of all points of a keyframe are equal, because the depth
 errors of neighboring points are, relative to the image width. [tuned: benchmarks.walks]"""
 _MIN_STD_PX = 0.1
-"""Minimum standard deviation of a tracked point in pixels, which includes its 3D point. [ours]"""
+"""Minimum standard deviation of a tracked point in pixels, including the error of its 3D point.
+[ours]"""
 _CENTER = np.float32(0.5)
 """Coordinate of the center of the first pixel in COLMAP, which is 0 in OpenCV."""
 _WINDOW = 21, 21
@@ -60,7 +63,7 @@ PixelMap = Callable[[Float64], Float64]
 
 
 class FrameCamera(NamedTuple):
-    """Camera of the frames of a video, whose undistorted view is a pinhole image."""
+    """Camera of the frames of a video; undistorted frames are pinhole images."""
 
     pinhole: PinholeCamera
     """Intrinsics of the undistorted view."""
@@ -98,7 +101,7 @@ class Keyframe:
     xy: Float32
     """(n, 2) pixels of the points in the keyframe."""
     near: Float64
-    """(n, 3) near end in the world frame of the ray segment that contains each point."""
+    """(n, 3) near end of the ray segment that contains each point, in the world frame."""
     far: Float64
     """(n, 3) far end of the segment, equal to ``near`` for triangulated points."""
 
@@ -211,7 +214,7 @@ def _track(keyframe: Keyframe, gray: UInt8, predicted: Pose) -> tuple[Float32, F
 def _lift_corners(
     gray: UInt8, camera: FrameCamera, pose: Pose, depth: DepthPrior, occupied: Float64
 ) -> tuple[Float64, Float64, Float64]:
-    """Detect corners away from other points; return pixels and ends of their depth intervals."""
+    """Detect corners away from other points; return pixels and ends of their ray segments."""
     width = gray.shape[1]
     distance = _MIN_DISTANCE_RATIO * width
     free = np.full(gray.shape, 255, np.uint8)
@@ -245,7 +248,7 @@ def _lift_corners(
 
 
 def _spread(xy: Float64, width: int, count: int) -> list[int]:
-    """Select at most ``count`` points of ``xy`` (n, 2), one for each cell of a grid first."""
+    """Select at most ``count`` points of ``xy`` (n, 2), and at most one in each cell of a grid."""
     cells = np.floor(xy / (_MIN_DISTANCE_RATIO * width)).astype(np.int64)
     _, first = np.unique(cells, axis=0, return_index=True)
     step = max(1.0, len(first) / count)

@@ -21,7 +21,7 @@ _DOF = 6
 """Degrees of freedom of a pose: rotation vector and camera center, in the world frame."""
 _MEDIAN_CHI2 = 0.4549
 """Median of the chi-squared distribution with one degree of freedom."""
-_MIN_NOISE_RATIO = 0.05
+_MIN_MOTION_RATIO = 0.05
 """Minimum share of the observed variance of acceleration that is not measurement noise. [ours]"""
 _NO_MOTION = 1e-12
 """Lower bound of variances, for a trajectory without motion."""
@@ -50,11 +50,11 @@ def smooth_trajectory(
     """
     seconds = np.asarray(times, dtype=np.float64)
     measured = np.array([pose is not None for pose in poses])
-    rotations, centers = _interpolate(seconds, poses)
-    noise = [None if pose is None else _to_world(*pose) for pose in poses]
+    rotations, centers = _fill_gaps(seconds, poses)
+    noise = [None if pose is None else _covariance_in_world(*pose) for pose in poses]
     if len(poses) == 1:
         assert noise[0] is not None
-        return [_describe(rotations[0], centers[0], np.zeros(_DOF), noise[0])]
+        return [_correct_pose(rotations[0], centers[0], np.zeros(_DOF), noise[0])]
     steps = np.diff(seconds)
     increments = np.column_stack(
         [
@@ -65,7 +65,7 @@ def smooth_trajectory(
     power = _estimate_power(steps, increments, measured, noise)
     states, covariances = _smooth(steps, increments, noise, power)
     return [
-        _describe(rotation, center, state, covariance)
+        _correct_pose(rotation, center, state, covariance)
         for rotation, center, state, covariance in zip(
             rotations, centers, states, covariances, strict=True
         )
@@ -80,10 +80,10 @@ def interpolate_pose(first: Pose, second: Pose, ratio: float) -> Pose:
     return rotation, -rotation @ center
 
 
-def _interpolate(
+def _fill_gaps(
     seconds: Float64, poses: Sequence[tuple[Pose, Float64] | None]
 ) -> tuple[Float64, Float64]:
-    """Return rotations ``world_from_cam`` (n, 3, 3) and centers (n, 3) of all frames."""
+    """Interpolate missing poses; return rotations ``world_from_cam`` and centers of all frames."""
     known = [row for row, pose in enumerate(poses) if pose is not None]
     filled: list[Pose] = []
     for row in range(len(poses)):
@@ -101,7 +101,7 @@ def _interpolate(
     return rotations, np.stack([camera_center(*pose) for pose in filled])
 
 
-def _to_world(pose: Pose, covariance: Float64) -> Float64:
+def _covariance_in_world(pose: Pose, covariance: Float64) -> Float64:
     """Convert the covariance of ``w`` and ``dt`` to rotation and camera center in the world."""
     rotation, (x, y, z) = pose
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
@@ -133,7 +133,7 @@ def _estimate_power(
     scale = 3 / (before + after)
     observed = np.median(change * scale, axis=0) / _MEDIAN_CHI2
     explained = np.median(expected * scale, axis=0)
-    power = np.maximum(observed - explained, _MIN_NOISE_RATIO * observed)
+    power = np.maximum(observed - explained, _MIN_MOTION_RATIO * observed)
     return np.maximum(_pool(power), _NO_MOTION)
 
 
@@ -187,7 +187,7 @@ def _smooth(
     )
 
 
-def _describe(
+def _correct_pose(
     rotation: Float64, center: Float64, correction: Float64, covariance: Float64
 ) -> SmoothedPose:
     cam_from_world = (_rotation(correction[:3]) @ rotation).T

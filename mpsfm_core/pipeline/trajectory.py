@@ -38,8 +38,8 @@ from mpsfm_core.results.trajectory import TrajectoryFrame
 TRACKED_SIDE = 1280
 """Maximum longer side in pixels of the frames in which points are tracked. [ours]"""
 MAX_GAP_S = 1.0
-"""Maximum time in seconds between two localized frames whose frames between are interpolated, and
-maximum time from a frame to its nearest keyframe outside of all keyframes. [ours]"""
+"""Longest gap in seconds whose frames are interpolated, and longest time to the nearest keyframe of
+a frame that has keyframes on one side only. [ours]"""
 
 
 class _Neighbors(NamedTuple):
@@ -50,11 +50,12 @@ class _Neighbors(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class _Placed:
+class _LocalizedFrame:
     """Frame with its localization."""
 
     frame: TrajectoryFrame
     measured: tuple[Pose, Float64] | None
+    """Pose and covariance from tracked points, before smoothing."""
     shot: int
     inflation: float = 1.0
     """Factor of the smoothed covariance, see :class:`FramePose`."""
@@ -74,26 +75,26 @@ def localize_frames(
         video: Path of the video.
         selection: Keyframes of the video.
         components: Reconstructed components, the largest first.
-        originals: Keyframes as images.
+        originals: Original images of the keyframes.
         every: Interval of the frames that are localized, in addition to the keyframes.
         progress: Callback with the number of read frames and the number of all frames.
 
     Returns:
         The localized frames and the frames without pose, ascending by number.
     """
-    tracker = _Tracker(selection, components, originals)
+    localizer = _FrameLocalizer(selection, components, originals)
     placed = []
     keyframes = frozenset(selection.numbers)
     for frame in read_frames(video):
         if frame.number % every == 0 or frame.number in keyframes:
-            placed.append(tracker.localize(frame))
+            placed.append(localizer.localize(frame))
         if progress is not None:
             progress(frame.number + 1, max(selection.num_frames, frame.number + 1))
-    return [frame for run in _split(placed) for frame in _smooth(run)]
+    return [frame for run in _split_at_gaps(placed) for frame in _smooth(run)]
 
 
-class _Tracker:
-    """Localization of frame after frame, with the keyframes before and after the frame."""
+class _FrameLocalizer:
+    """Localizer of frames in ascending order, by the keyframes before and after each frame."""
 
     def __init__(
         self,
@@ -109,10 +110,10 @@ class _Tracker:
             for number, part in reversed(list(enumerate(components)))
             for image in part.confirmed_images
         }
-        self._build = lru_cache(maxsize=3)(self._build_keyframe)
+        self._read_keyframe = lru_cache(maxsize=3)(self._build_keyframe)
         self._last: tuple[_Neighbors, Pose, Pose] | None = None
 
-    def localize(self, frame: VideoFrame) -> _Placed:
+    def localize(self, frame: VideoFrame) -> _LocalizedFrame:
         """Estimate the pose of a frame; frames come in ascending order."""
         after = int(np.searchsorted(self._numbers, frame.number, side="right"))
         shot = self._keyframes[max(after - 1, 0)].shot
@@ -120,10 +121,12 @@ class _Tracker:
         number, time_s = frame.number, frame.time_s
         if neighbors is None:
             reason = FrameReason.NO_KEYFRAME.because()
-            return _Placed(TrajectoryFrame(number, time_s, "none", reason=reason), None, shot)
+            return _LocalizedFrame(
+                TrajectoryFrame(number, time_s, "none", reason=reason), None, shot
+            )
         interpolated = self._interpolate(neighbors, time_s)
         gray = gray_image(frame.image, TRACKED_SIDE)
-        keyframes = [self._build(key.name) for key in neighbors.frames]
+        keyframes = [self._read_keyframe(key.name) for key in neighbors.frames]
         outcome: FramePose | Reason | None = None
         for predicted in self._predict(neighbors, interpolated):
             outcome = localize_frame(keyframes, gray, predicted)
@@ -132,17 +135,17 @@ class _Tracker:
         if not isinstance(outcome, FramePose):
             self._last = None
             placed = TrajectoryFrame(number, time_s, "none", neighbors.component, reason=outcome)
-            return _Placed(placed, None, shot)
+            return _LocalizedFrame(placed, None, shot)
         self._last = neighbors, interpolated, outcome.pose
         source = "keyframe" if neighbors.frames[0].number == number else "tracked"
         pose = keyframes[0].pose if source == "keyframe" else outcome.pose
         placed = TrajectoryFrame(
             *(number, time_s, source, neighbors.component), num_inliers=outcome.num_inliers
         )
-        return _Placed(placed, (pose, outcome.covariance), shot, outcome.inflation)
+        return _LocalizedFrame(placed, (pose, outcome.covariance), shot, outcome.inflation)
 
     def _find_neighbors(self, frame: VideoFrame, after: int, shot: int) -> _Neighbors | None:
-        """Find the nearest registered keyframes of the shot; the keyframe itself has no other."""
+        """Find the nearest registered keyframes of the shot, or only the frame if it is one."""
         before = self._search(range(after - 1, -1, -1), shot)
         following = self._search(range(after, len(self._keyframes)), shot)
         if before is not None and before.number == frame.number:
@@ -175,7 +178,7 @@ class _Tracker:
         return interpolate_pose(poses[0], poses[1], ratio)
 
     def _predict(self, neighbors: _Neighbors, interpolated: Pose) -> Iterator[Pose]:
-        """Yield predicted poses: with the last frame's deviation from interpolation, without."""
+        """Yield the interpolated pose, first corrected by the last frame's deviation from it."""
         if self._last is not None and self._last[0] == neighbors:
             _, last_interpolated, last = self._last
             yield compose(compose(last, invert(*last_interpolated)), interpolated)
@@ -209,10 +212,10 @@ def _frame_camera(source: SourceImage, image: RegisteredImage, gray: UInt8) -> F
     )
 
 
-def _split(placed: Sequence[_Placed]) -> Iterator[list[_Placed]]:
+def _split_at_gaps(placed: Sequence[_LocalizedFrame]) -> Iterator[list[_LocalizedFrame]]:
     """Split frames where the component or shot changes, and at gaps that are too long."""
-    run: list[_Placed] = []
-    pending: deque[_Placed] = deque()
+    run: list[_LocalizedFrame] = []
+    pending: deque[_LocalizedFrame] = deque()
     for entry in placed:
         if entry.measured is None:
             pending.append(entry)
@@ -235,7 +238,7 @@ def _split(placed: Sequence[_Placed]) -> Iterator[list[_Placed]]:
         yield [gap]
 
 
-def _smooth(run: Sequence[_Placed]) -> Iterator[TrajectoryFrame]:
+def _smooth(run: Sequence[_LocalizedFrame]) -> Iterator[TrajectoryFrame]:
     """Yield the frames of a run with smoothed poses, and with interpolated poses in gaps."""
     if run[0].measured is None:
         yield run[0].frame

@@ -15,8 +15,8 @@ from mpsfm_core.data import Pose
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.evaluation.alignment import umeyama
 from mpsfm_core.evaluation.trajectories import (
-    associate,
-    count_missing,
+    associate_time_stamps,
+    count_frames_outside_largest,
     evaluate_trajectory,
     read_trajectory,
 )
@@ -76,7 +76,9 @@ def test_line_that_is_no_pose_is_named(tmp_path: Path) -> None:
 
 
 def test_time_stamps_are_associated_with_the_nearest_at_a_higher_rate() -> None:
-    rows, true_rows = associate(np.array([0.0, 0.5, 1.0]), np.array([0.004, 0.2, 0.495, 0.6, 1.3]))
+    rows, true_rows = associate_time_stamps(
+        np.array([0.0, 0.5, 1.0]), np.array([0.004, 0.2, 0.495, 0.6, 1.3])
+    )
     assert rows.tolist() == [0, 1] and true_rows.tolist() == [0, 2]
 
 
@@ -112,4 +114,4 @@ def test_windowed_error_equals_alignment_of_each_window(tmp_path: Path) -> None:
     exact = np.maximum(0, 1 - np.array(errors) / 0.5).mean()
     assert report["wate_auc"]["10"] == pytest.approx(100 * exact, abs=0.5)
     assert "25" in report["wate_auc"] and "50" not in report["wate_auc"]
-    assert count_missing(tmp_path) == 0
+    assert count_frames_outside_largest(tmp_path) == 0
