@@ -10,7 +10,7 @@ _METRIC3D = ("metric3d-v2-small", "metric3d-v2-large", "metric3d-v2-giant2")
 
 PLUGIN_PROVIDERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
-        "mpsfm-compact": ("depth/compact", "normals/compact", "mask/compact"),
+        "mpsfm-compact": ("depth/compact", "normals/compact", "mask/compact", "camera/compact"),
         "mpsfm-onnx": tuple(f"{k}/{n}" for k in ("depth", "normals") for n in _ONNX),
         "mpsfm-metric3d-onnx": tuple(f"{k}/{n}" for k in ("depth", "normals") for n in _METRIC3D),
         "mpsfm-dsine": ("normals/dsine",),

@@ -7,6 +7,7 @@ from pydantic import Field
 from mpsfm_core import Options
 
 WEIGHTS = "package:mpsfm_compact/compact.onnx"
+CAMERA_WEIGHTS = "package:mpsfm_compact/camera.onnx"
 
 
 class CompactOptions(Options):
@@ -21,3 +22,12 @@ class CompactOptions(Options):
     256 x 192 pixels. Larger network inputs resolve thinner structures, but the depth is less
     accurate on average.
     """
+
+
+class CameraOptions(Options):
+    """Options of the compact camera network."""
+
+    weights: str = CAMERA_WEIGHTS
+    """Path or URI of the ONNX file; the default file is part of this package."""
+    sha256: str | None = None
+    """Expected SHA-256 hash of the file ``weights``."""

@@ -9,8 +9,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from mpsfm_compact.options import CompactOptions
-from mpsfm_compact.provider import CompactDepth, CompactMask, CompactNormals
+from mpsfm_compact.options import CameraOptions, CompactOptions
+from mpsfm_compact.provider import CompactCamera, CompactDepth, CompactMask, CompactNormals
 
 from mpsfm_core import PinholeCamera, ProviderContext, View
 from mpsfm_core.data import Float32
@@ -111,6 +111,32 @@ def test_sky_is_no_surface(context: ProviderContext) -> None:
     mask = CompactMask(CompactOptions(), context).mask(view)
     assert mask[:160].mean() < 0.1
     assert mask[300:].mean() > 0.9
+
+
+def test_camera_estimates_focal_length_and_gravity_of_upright_photos(
+    views: list[View], context: ProviderContext
+) -> None:
+    """Check the focal lengths of cropped photos against the truth, within 3 std."""
+    provider = CompactCamera(CameraOptions(), context)
+    for view in views[:2]:
+        for part in (1.0, 0.7):
+            prior = provider.calibrate(central_part(view, part))
+            assert prior is not None
+            error = abs(np.log(prior.focal_px / view.camera.fx))
+            assert error < 3 * prior.focal_std_px / prior.focal_px
+            assert error < np.log(2)
+            assert 0.05 < prior.focal_std_px / prior.focal_px <= 0.3
+            assert abs(prior.radial) < 0.3
+            assert prior.gravity[1] > 0.5
+
+
+def central_part(view: View, part: float) -> View:
+    """Crop a view around the image center to a share of its sides."""
+    height, width = view.image.shape[:2]
+    w, h = round(part * width), round(part * height)
+    x, y = (width - w) // 2, (height - h) // 2
+    camera = replace(view.camera, width=w, height=h, cx=w / 2, cy=h / 2)
+    return replace(view, image=view.image[y : y + h, x : x + w], camera=camera)
 
 
 def load_view(image: np.ndarray) -> View:

@@ -190,9 +190,51 @@ def test_guessed_depth_teaches_no_std() -> None:
             "normals": torch.nn.functional.normalize(torch.ones(1, 3, 96, 128), dim=1),
             "log_angle": torch.zeros(shape),
             "validity": torch.zeros(shape),
-            "log_focal": torch.zeros(1, 1),
         }
         parts = losses(out, batch)
         assert parts["shape"] > 0
         torch.stack(list(parts.values())).sum().backward()
         assert bool(log_std.grad.abs().sum() > 0) == taught
+
+
+def test_cameras_cut_from_a_panorama_have_the_latitude_of_their_pixels(tmp_path: Path) -> None:
+    """Check labels of random cameras with distortion on a panorama that shows its latitude."""
+    import cv2
+    import torch
+    from training.camera_views import Panoramas, augmented
+
+    latitude = np.pi * (0.5 - (np.arange(512) + 0.5) / 512)
+    shade = np.rint(127.5 + 127.5 * np.sin(latitude)).astype(np.uint8)
+    picture = np.broadcast_to(shade[:, None, None], (512, 1024, 3))
+    cv2.imwrite(str(tmp_path / "latitude.jpg"), picture)
+    cut = Panoramas([tmp_path / "latitude.jpg"], torch.device("cpu")).batch(16, (256, 192))
+    shown = cut.image[:, 0, 15::32, 15::32] / 127.5 - 1
+    np.testing.assert_allclose(shown, cut.up[:, 2], atol=0.05)
+    np.testing.assert_allclose(cut.gravity.norm(dim=1), 1, rtol=1e-5)
+    slope = -cut.gravity[:, 2]  # the latitude of the optical axis
+    np.testing.assert_allclose(cut.up[:, 2, 2:4, 3:5].mean((1, 2)), slope, atol=0.05)
+    changed = augmented(cut, torch.Generator().manual_seed(0))
+    np.testing.assert_allclose(changed.gravity[:, 1:], cut.gravity[:, 1:])
+    assert torch.any(changed.gravity[:, 0] != cut.gravity[:, 0])
+
+
+@pytest.mark.slow
+def test_camera_training_runs_from_rendering_to_onnx(tmp_path: Path) -> None:
+    """Check a tiny training run of the camera branch on a panorama and rendered images."""
+    import cv2
+    import training.train_camera as train_camera
+    from training.export import export_camera
+    from training.synthetic.make import draw_cameras
+
+    image, focal, rotation = next(draw_cameras((1, 3)))
+    assert image.shape == (240, 320, 3)
+    assert 0.2 < focal / 320 < 4
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-9)
+    rng = np.random.default_rng(0)
+    for name in ("a.jpg", "b.jpg"):
+        noise = cv2.resize(rng.integers(0, 255, (16, 32, 3)).astype(np.uint8), (512, 256))
+        cv2.imwrite(str(tmp_path / name), noise)
+    start = Path(train_camera.__file__).with_name("checkpoint.pt")
+    train_camera.train_camera(tmp_path, None, tmp_path / "run", start, ["b.jpg"], 2, 2)
+    differences = export_camera(tmp_path / "run" / "camera.pt", tmp_path / "camera.onnx")
+    assert max(differences.values()) < 0.05

@@ -85,6 +85,36 @@ def train(
     run_training(data, run, schedule, held_out or ["drawn-1-0000"], seed, start, minutes)
 
 
+@app.command("cameras")
+def cameras(
+    output: Path, files: int = 40, per_file: int = 100, seed: int = 1, workers: int = 2
+) -> None:
+    """Render images with a wide range of focal lengths, for ``camera``."""
+    from training.make_data import make_cameras
+
+    make_cameras(output, files, per_file, seed, workers)
+
+
+@app.command("camera")
+def camera(
+    panoramas: Path,
+    start: Path,
+    run: Annotated[Path, typer.Option(help="folder of the checkpoint")],
+    renders: Annotated[Path | None, typer.Option(help="output of the command cameras")] = None,
+    held_out: Annotated[list[str] | None, typer.Option(help="file names of panoramas")] = None,
+    steps: int = 20_000,
+    batch: int = 256,
+    rate: float = 1e-3,
+    minutes: Annotated[float | None, typer.Option(help="train this long instead of steps")] = None,
+    seed: int = 0,
+) -> None:
+    """Train the camera branch, and leave depth and normals as they are."""
+    from training.train_camera import train_camera
+
+    held = held_out or []
+    train_camera(panoramas, renders, run, start, held, steps, batch, rate, minutes, seed)
+
+
 @app.command("average")
 def average(checkpoints: list[Path], output: Path) -> None:
     """Average the weights of checkpoints, and write a checkpoint for ``export``."""
@@ -105,6 +135,15 @@ def export(
 
     if weights is not None:
         keep(checkpoint, weights)
+    for name, gap in run_export(checkpoint, output).items():
+        typer.echo(f"{name}: {gap:.1e}")
+
+
+@app.command("export-camera")
+def export_camera(checkpoint: Path, output: Path) -> None:
+    """Export the camera branch of a checkpoint to ONNX, and compare its outputs with torch."""
+    from training.export import export_camera as run_export
+
     for name, gap in run_export(checkpoint, output).items():
         typer.echo(f"{name}: {gap:.1e}")
 

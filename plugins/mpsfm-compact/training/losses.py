@@ -19,7 +19,6 @@ _WEIGHTS = {
     "normals": 0.7,
     "angle": 0.2,
     "validity": 0.1,
-    "focal": 0.1,
 }
 """Weight of each loss term. The weights give the gradients of all loss terms a similar initial norm
 in shared layers.
@@ -63,7 +62,6 @@ def losses(out: Mapping[str, Tensor], batch: Batch) -> dict[str, Tensor]:
         out["validity"], 1 - empty, reduction="none"
     )
     parts["validity"] = _mean(cross * (1 + (_EMPTY_WEIGHT - 1) * empty), batch.kind != UNKNOWN)
-    parts["focal"] = (out["log_focal"] - batch.log_focal).abs().mean()
     return {name: _WEIGHTS[name] * part for name, part in parts.items()}
 
 

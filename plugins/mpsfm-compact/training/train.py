@@ -143,8 +143,7 @@ def judge(
     """Compute accuracy metrics of the network on each shard, by the name of the shard.
 
     Depth metrics are AbsRel and delta < 1.25 after median scaling, and the median ratio of
-    predicted to true scale. Further metrics are the median angular error of normals in degrees, and
-    the median ratio of predicted to true focal length.
+    predicted to true scale. A further metric is the median angular error of normals in degrees.
     """
     was = network.training
     network.eval()
@@ -163,7 +162,7 @@ def judge(
 def _scores(out: dict[str, Tensor], batch) -> dict[str, float]:
     known = batch.known
     if not known.any():
-        return dict.fromkeys(("absrel", "delta", "scale", "angle", "focal", "inside"), float("nan"))
+        return dict.fromkeys(("absrel", "delta", "scale", "angle", "inside"), float("nan"))
     residual = (out["log_depth"] - batch.log_depth)[known]
     offset = residual.median()
     ratio = torch.exp(residual - offset)
@@ -175,7 +174,6 @@ def _scores(out: dict[str, Tensor], batch) -> dict[str, float]:
         "delta": float(((ratio < 1.25) & (ratio > 0.8)).float().mean()),
         "scale": float(offset.exp()),
         "angle": float(torch.rad2deg(torch.acos(cosine)).median()) if seen.any() else float("nan"),
-        "focal": float((out["log_focal"] - batch.log_focal).abs().exp()),
         "inside": float(((residual - offset).abs() < std).float().mean()),
     }
 

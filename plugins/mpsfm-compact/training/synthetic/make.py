@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -38,6 +39,33 @@ def draw_samples(seed: Sequence[int], photos: Sequence[Path] = ()) -> Iterator[S
             sample = _view(rng, scene, shows, sky, shoot())
             if sample is not None:
                 yield sample
+
+
+def draw_cameras(
+    seed: Sequence[int], photos: Sequence[Path] = ()
+) -> Iterator[tuple[NDArray[np.uint8], float, NDArray[np.float64]]]:
+    """Yield rendered images, focal lengths in pixels and rotations world_from_camera.
+
+    The sequence is endless. The focal lengths have a wide range, and a third of the images are rolled by up to 45 degrees.
+    """
+    rng = np.random.default_rng(seed)
+    bank = make_textures(rng, _TEXTURES, photos)
+    worlds, shares = zip(*WORLDS, strict=True)
+    while True:
+        build = Builder(rng, _TEXTURES)
+        shoot = worlds[rng.choice(len(worlds), p=shares)](build)
+        scene, shows, sky = build.arrays(bank)
+        for _ in range(_VIEWS):
+            shot = shoot()
+            roll = rng.normal(0, 0.06) if rng.random() < 0.7 else rng.uniform(-0.8, 0.8)
+            c, s = np.cos(roll), np.sin(roll)
+            rotation = shot.rotation @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+            usual = rng.random() < 0.5
+            log_focal = rng.normal(-0.3, 0.35) if usual else rng.uniform(np.log(0.33), np.log(2.4))
+            focal = float(np.exp(log_focal)) * WIDTH / float(np.hypot(WIDTH, HEIGHT))
+            sample = _view(rng, scene, shows, sky, replace(shot, rotation=rotation, focal=focal))
+            if sample is not None:
+                yield sample.image, float(sample.camera[0]), rotation
 
 
 def _view(rng: np.random.Generator, scene, shows, sky, shot: Shot) -> Sample | None:
