@@ -40,7 +40,7 @@ def camera(folder: Path) -> ContractSetup:
         constant("radial", [0.0]),
         constant("radial_std", [0.05]),
     ]
-    shape = [1, 3, "height", "width"]
+    shape: list[str | int | None] = [1, 3, "height", "width"]
     image = helper.make_tensor_value_info("image", TensorProto.FLOAT, shape)
     outputs = [
         helper.make_tensor_value_info(name, TensorProto.FLOAT, None)

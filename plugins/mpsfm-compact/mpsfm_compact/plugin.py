@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 from mpsfm_compact.options import CAMERA_WEIGHTS, WEIGHTS, CameraOptions, CompactOptions
 from mpsfm_core import ProviderSpec, WeightsFile, hookimpl
@@ -49,7 +50,9 @@ def _camera_spec() -> ProviderSpec:
     )
 
 
-def _spec(kind: Kind, factory: str, summary: str, *capabilities: Capability) -> ProviderSpec:
+def _spec(
+    kind: Literal["depth", "normals", "mask"], factory: str, summary: str, *capabilities: Capability
+) -> ProviderSpec:
     return ProviderSpec(
         kind=kind,
         name="compact",

@@ -22,6 +22,7 @@ MAX_FOCAL_STD = 0.3
 """Largest std of the log focal length of an estimate. The provider returns no estimate if the std
 is larger, because the estimate then says little more than a default focal length.
 """
+_IMAGE = "image"
 _CAMERA = ("focal", "focal_std", "gravity", "gravity_std", "radial", "radial_std")
 
 
@@ -61,12 +62,12 @@ class CompactCamera:
         self._input = describe(CompactOptions()).input
         path = context.resolve_weights(options.weights, options.sha256)
         self._model = Model(path, context)
-        self._model.require({self._input.name}, _CAMERA, "compact camera")
+        self._model.require({_IMAGE}, _CAMERA, "compact camera")
 
     def calibrate(self, view: View) -> CameraPrior | None:
         """Estimate the camera of a view, or return None if the focal length is too uncertain."""
         canvas = Canvas.plan(self._input.size, view.camera.size)
-        feed = {self._input.name: canvas.paint(view.image, self._input)}
+        feed = {_IMAGE: canvas.paint(view.image, self._input)}
         outputs = self._model.run(feed, _CAMERA)
         focal, focal_std, gravity, gravity_std, radial, radial_std = (
             x.reshape(-1) for x in outputs

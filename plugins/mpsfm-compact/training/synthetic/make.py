@@ -46,7 +46,8 @@ def draw_cameras(
 ) -> Iterator[tuple[NDArray[np.uint8], float, NDArray[np.float64]]]:
     """Yield rendered images, focal lengths in pixels and rotations world_from_camera.
 
-    The sequence is endless. The focal lengths have a wide range, and a third of the images are rolled by up to 45 degrees.
+    The sequence is endless. The focal lengths have a wide range, and a third of the images are
+    rolled by up to 45 degrees.
     """
     rng = np.random.default_rng(seed)
     bank = make_textures(rng, _TEXTURES, photos)
