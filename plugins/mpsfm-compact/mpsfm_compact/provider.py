@@ -18,9 +18,9 @@ from mpsfm_core.data import Bool
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.providers.kinds.camera import CameraPrior
 
-MAX_FOCAL_STD = 0.3
+MAX_FOCAL_STD = 0.5
 """Largest std of the log focal length of an estimate. The provider returns no estimate if the std
-is larger, because the estimate then says little more than a default focal length.
+is larger, because the default focal length of a photo has a std of 0.7.
 """
 _IMAGE = "image"
 _CAMERA = ("focal", "focal_std", "gravity", "gravity_std", "radial", "radial_std")
