@@ -163,8 +163,7 @@ def check_hook_executor(case: HookCase) -> str:
     """Require that an executor runs each work item once in other processes and raises errors.
 
     The hook has to return None for the name of another executor. The name of the executor is the
-    name of the plugin without ``mpsfm-``, or ``executor`` in the arguments of
-    :func:`run_hook_checks`.
+    name of the plugin without ``mpsfm-``, or the argument ``executor`` of ``run_hook_checks``.
     """
     from mpsfm_core.testing import executor_contract
 

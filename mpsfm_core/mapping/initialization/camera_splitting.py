@@ -33,12 +33,11 @@ MIN_FOCAL_RATIO = 1.05
 gets its own camera. [ours]"""
 MAX_COST_RATIO = 0.6
 """Ratio of the costs of the poses with own and shared focal length below which an image gets its
-own camera. A cost is a sum of squared errors, at most ``MAX_ERROR_PX`` each. The ratio of zoomed
-images is below 0.45, that of others above 0.9. [tuned: benchmarks.verdicts]"""
+own camera. A cost is the mean of ``min(1, (error / MAX_ERROR_STDS)^2)``. The ratio of zoomed images
+is below 0.45, that of others above 0.9. [tuned: benchmarks.verdicts]"""
 MIN_COST = 0.03
-"""Mean of the squared errors in squares of ``MAX_ERROR_PX``, below which no other focal length is
-tried. [ours]"""
-MAX_ERROR_PX = 4.0
+"""Cost of the pose with shared focal length below which no other focal length is tried. [ours]"""
+MAX_ERROR_STDS = 4.0
 """Largest reprojection error of a match that supports a pose, in standard deviations of the
 keypoint position. A wrong focal length causes reprojection errors of only a few pixels. [COLMAP
 filter_max_reproj_error]"""
@@ -62,7 +61,8 @@ def find_deviating_focals(
         model: Largest component of the reconstruction.
         options: Options of absolute pose estimation.
         seed: Seed of RANSAC.
-        is_shared: Examine the images that share a camera, else the images with their own cameras.
+        is_shared: True to examine images that share a camera, False to examine images with their
+            own.
 
     Returns:
         Focal lengths ``fx`` in pixels of the images with a deviating focal length, by image index.
@@ -90,7 +90,7 @@ def find_deviating_focals(
         xy, xyz = image.keypoints[keypoints[::step]], model.points[points[::step]]
         distortion = distortions.get(image.shared_camera, image.distortion)
         xy = change_distortion(xy, (image.camera, image.distortion), (camera, distortion))
-        max_error_px = MAX_ERROR_PX * image.keypoint_std_px
+        max_error_px = MAX_ERROR_STDS * image.keypoint_std_px
         shared = estimate_absolute_pose(camera, xy, xyz, options, seed)
         cost = _measure_cost(camera, shared[:2], xy, xyz, max_error_px) if shared else 1.0
         if cost < MIN_COST:

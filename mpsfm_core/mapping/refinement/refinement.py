@@ -22,7 +22,7 @@ from mpsfm_core.mapping.refinement.keypoint_noise import measure_loss_scale
 from mpsfm_core.mapping.refinement.self_calibration import (
     calibrate_cameras,
     compute_intrinsic_priors,
-    has_guessed_camera,
+    mask_guessed_focals,
 )
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     MIN_FOCAL_IMAGES,
@@ -291,7 +291,7 @@ class Refiner:
         errors = predict_calibration_errors(
             problem,
             self._scale_losses(),
-            ~has_guessed_camera(scene, bundle.representatives),
+            ~mask_guessed_focals(scene, bundle.representatives),
             np.array([max(image.camera.size) for image in cameras], dtype=np.float64),
         )
         if errors is not None:
@@ -534,7 +534,7 @@ class Refiner:
         images = self.scene.registered_images()
         if not self.options.refine_focal or len(images) < MIN_FOCAL_IMAGES:
             return False
-        return bool(has_guessed_camera(self.scene, images).any())
+        return bool(mask_guessed_focals(self.scene, images).any())
 
     def _measure_keypoint_noise(self) -> None:
         """Measure the scale of the Cauchy loss from the epipolar errors of matches."""

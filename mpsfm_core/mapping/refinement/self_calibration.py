@@ -36,10 +36,10 @@ from mpsfm_core.optimize.options import BundleOptions
 MAX_STD_RATIO = 0.5
 """Ratio of posterior and prior standard deviation above which an intrinsic parameter keeps its
 guess. At a ratio of 0.5, the observations add three times the information of the prior. [ours]"""
-MIN_DEVIATION_OF_FEW = 15.0
-"""Smallest deviation of the other intrinsic parameters from the mean of their prior, in posterior
-standard deviations, that a camera of fewer than ``MIN_FOCAL_IMAGES`` images takes. Systematic
-errors of few images resemble distortion of many standard deviations. [tuned:
+MIN_DEVIATION_FEW_IMAGES = 15.0
+"""Smallest deviation of distortion or principal point from the mean of the prior, in posterior
+standard deviations, at which a camera of fewer than ``MIN_FOCAL_IMAGES`` images takes the estimate.
+Systematic errors of few images resemble distortion of many standard deviations. [tuned:
 benchmarks.mixed_cameras]"""
 DISTORTION_PRIOR_STD = 0.1
 """Standard deviation of the zero-mean prior on radial distortion coefficients. The coefficient k1
@@ -62,7 +62,7 @@ FOCAL = IntrinsicParameter.FOCAL_LENGTH
 CENTER = [IntrinsicParameter.PRINCIPAL_POINT_X, IntrinsicParameter.PRINCIPAL_POINT_Y]
 
 
-def has_guessed_camera(scene: Scene, images: Int64) -> Bool:
+def mask_guessed_focals(scene: Scene, images: Int64) -> Bool:
     """Return a bool mask (m,) of the given images whose focal length is a guess."""
     known = [scene.problem.images[image].focal_known for image in images]
     return ~np.array(known, dtype=np.bool_)
@@ -80,7 +80,7 @@ def calibrate_cameras(
     """Run bundle adjustment with guessed intrinsics, and apply well-determined estimates.
 
     The other intrinsic parameters of a camera become variable after its focal length is refined,
-    because they would otherwise compensate a wrong focal length. An intrinsic parameter whose
+    because they would otherwise compensate for a wrong focal length. An intrinsic parameter whose
     estimate is implausible or undetermined keeps the guess, and bundle adjustment is repeated with
     this parameter fixed. The outcome of each camera is recorded in the scene.
 
@@ -97,7 +97,7 @@ def calibrate_cameras(
         [i.camera_model.free_parameters(principal_point=refine_principal_point) for i in images]
     )
     free[:, IntrinsicParameter.RADIAL_DISTORTION :] &= refine_distortion
-    free &= has_guessed_camera(scene, representatives)[:, None]
+    free &= mask_guessed_focals(scene, representatives)[:, None]
     estimated = free.copy()
     active = free.copy()
     active[:, 1:] &= scene.estimated_intrinsics.is_refined(FOCAL)[representatives][:, None]
@@ -146,9 +146,9 @@ def _reset_intrinsics(
     representatives: Int64,
     refused: Bool,
 ) -> BundleProblem:
-    """Return the problem with the intrinsics of the scene, and guesses for refused parameters.
+    """Reset principal points and distortion to the scene, and refused parameters to their guess.
 
-    Refused focal lengths keep the value of the problem.
+    Focal lengths keep the value of the problem.
     """
     intrinsics = problem.intrinsics.copy()
     for row, image in enumerate(images):
@@ -174,7 +174,7 @@ def _decide(
 ) -> Bool:
     """Record the outcome of each variable intrinsic parameter, and return those refused.
 
-    If the focal length of a camera is refused, only its other variable parameters are fixed at
+    If the focal length of a camera is refused, only the other parameters of the camera are fixed at
     first, because the focal length may be determined without them. If only other parameters are
     refused, the last one is fixed first, because the others may be determined without it.
 
@@ -193,7 +193,7 @@ def _decide(
             parameter, value = IntrinsicParameter(column), float(values[row, column])
             std, deviation = float(result.std_intrinsics[row, column]), value - means[row, column]
             has_few_images = parameter != FOCAL and num_images[row] < MIN_FOCAL_IMAGES
-            is_small = has_few_images and abs(deviation) < MIN_DEVIATION_OF_FEW * std
+            is_small = has_few_images and abs(deviation) < MIN_DEVIATION_FEW_IMAGES * std
             if parameter == FOCAL:
                 value = float(result.intrinsics[row, 0])
                 size = images[row].camera.size
@@ -221,8 +221,7 @@ def judge_estimate(
     Args:
         value: Estimated value.
         posterior_std: Posterior standard deviation of the parameter, given observations and prior.
-            If the reduced camera system is singular, the computed value may exceed its upper bound
-            ``prior_std``.
+            The computed value may exceed ``prior_std`` if the reduced camera system is singular.
         prior_std: Prior standard deviation.
         is_plausible: True if a lens with the estimated value exists.
     """

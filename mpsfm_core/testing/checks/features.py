@@ -179,8 +179,8 @@ def check_features_pixel_convention(case: ContractCase) -> str:
     """Require keypoints for which the center of the first pixel is (0.5, 0.5).
 
     If the view is rotated by 180 degrees, a keypoint (x, y) has to be found at (width - x, height -
-    y). A wrong pixel convention shifts x and y of all keypoints by the same amount. The check is
-    undecided for networks that shift keypoints only in x or only in y.
+    y). A wrong pixel convention shifts x and y of all keypoints by the same amount. The check fails
+    with "cannot tell" for networks that shift keypoints only in x or only in y.
     """
     case.require_truth("image")
     view = case.example.view

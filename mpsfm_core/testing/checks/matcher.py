@@ -72,8 +72,8 @@ def check_matcher_sizes(case: ContractCase) -> str:
     """Require correct matches of two views with different sizes, in both orders.
 
     The second view is a wide, a portrait or a larger rectangle of a neighboring view, at the same
-    scale. A dense matcher that resizes each view to one size and is not invariant to scale has to
-    match at least one of the pairs of views.
+    scale. A dense matcher that resizes all views to one size and is not invariant to scale may fail
+    for some of these pairs, but has to match at least one of them.
     """
     case.require_truth("image")
     width, height = case.example.camera.size

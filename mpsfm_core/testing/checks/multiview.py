@@ -152,7 +152,7 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
 def check_multiview_group_sizes(case: ContractCase) -> str:
     """Require the usual accuracy for groups of 2, 5 and 9 views of different sizes.
 
-    A reconstruction calls the multi-view network with as many views as overlap.
+    A group in a reconstruction is an image with the images that overlap it.
     """
     views, width, height = [case.example], *case.example.camera.size
     for index in range(1, max(_GROUP_SIZES)):
