@@ -5,6 +5,7 @@ Only modules with provider code may import this module, because it imports torch
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -13,6 +14,9 @@ import torch
 from torch.overrides import TorchFunctionMode
 
 from mpsfm_core.providers import ProviderContext
+
+_DETERMINISTIC = threading.Lock()
+"""Lock of torch's process-wide switch for deterministic algorithms."""
 
 
 def use_threads(context: ProviderContext) -> None:
@@ -43,3 +47,20 @@ def inference() -> Iterator[None]:
         torch.backends.cudnn.flags(enabled=True, benchmark=False, deterministic=True),
     ):
         yield
+
+
+@contextmanager
+def deterministic_algorithms() -> Iterator[None]:
+    """Use torch's deterministic algorithms in a ``with`` block, in one thread at a time.
+
+    Some functions of torch, such as ``scatter_add_``, add in any order on a GPU, and then repeated
+    calls differ in the last bits.
+    """
+    with _DETERMINISTIC:
+        enabled = torch.are_deterministic_algorithms_enabled()
+        warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
+        torch.use_deterministic_algorithms(True, warn_only=True)
+        try:
+            yield
+        finally:
+            torch.use_deterministic_algorithms(enabled, warn_only=warn_only)

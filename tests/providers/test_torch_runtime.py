@@ -22,3 +22,13 @@ def test_skip_random_weights_draws_no_random_numbers_and_keeps_loaded_weights() 
     network.load_state_dict(expected.state_dict())
     image = torch.ones(1, 3, 8, 8)
     assert torch.equal(network(image), expected(image))
+
+
+def test_deterministic_algorithms_are_used_in_the_block_only() -> None:
+    from mpsfm_core.providers.torch_runtime import deterministic_algorithms
+
+    assert not torch.are_deterministic_algorithms_enabled()
+    with pytest.raises(KeyError), deterministic_algorithms():
+        assert torch.are_deterministic_algorithms_enabled()
+        raise KeyError
+    assert not torch.are_deterministic_algorithms_enabled()

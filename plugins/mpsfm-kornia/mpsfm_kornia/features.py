@@ -7,6 +7,7 @@ Keypoints from kornia are in pixels of the resized image, with the center of the
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from contextlib import nullcontext
 
 import numpy as np
 import torch
@@ -14,7 +15,12 @@ from kornia.color import rgb_to_grayscale
 from kornia.feature import ALIKED, DISK, DeDoDe, SIFTFeature, XFeat, get_laf_center
 
 from mpsfm_core import Features, ProviderContext, View
-from mpsfm_core.providers.torch_runtime import SkipRandomWeights, inference, use_threads
+from mpsfm_core.providers.torch_runtime import (
+    SkipRandomWeights,
+    deterministic_algorithms,
+    inference,
+    use_threads,
+)
 from mpsfm_kornia.options import (
     AlikedOptions,
     DedodeOptions,
@@ -170,6 +176,8 @@ class SiftFeatures(KorniaFeatures):
         ).eval()
 
     def _detect(self, image: torch.Tensor) -> _Detections:
-        frames, contrast, descriptors = self._network(rgb_to_grayscale(image))
+        # The histograms of gradient orientations are sums in any order on a GPU.
+        with deterministic_algorithms() if self._device != "cpu" else nullcontext():
+            frames, contrast, descriptors = self._network(rgb_to_grayscale(image))
         clear = contrast[0] > self._threshold
         return get_laf_center(frames)[0][clear], contrast[0][clear], descriptors[0][clear]
