@@ -7,6 +7,7 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.data.result_layout import SUMMARY
@@ -44,52 +45,38 @@ def find_images(folder: Path, without: Path | None = None) -> list[str]:
         InputError: the path does not exist, is not a folder, or is a phone capture with sensor
             depth.
     """
-    if (capture := find_format(folder)) is not None:
-        raise InputError(
-            f"{folder} is a capture of {capture.name}; convert the capture first: "
-            f"mpsfm import '{folder}' --output DIR"
-        )
-    if not folder.is_dir():
-        if folder.exists():
-            raise InputError(
-                f"{folder} is neither a folder of photos nor a video; give one of the two"
-            )
-        raise InputError(f"images folder {folder} does not exist")
-    names, unread, undecodable = [], [], []
-    for name in _walk_input_files(folder, without):
-        if not is_utf8(name):
-            undecodable.append(name)
-            continue
-        extension = PurePosixPath(name).suffix.lower()
-        if extension in EXTENSIONS:
-            names.append(name)
-        elif extension in _UNREADABLE or (not extension and _has_signature(folder / name)):
-            unread.append(name)
-    names = sorted(names, key=_natural_sort_key)
-    masks = _find_mask_names(names)
-    if undecodable:
+    found = _search_folder(folder, without)
+    if found.undecodable:
         _log.warning(
             "files in %s are skipped because their names are not UTF-8: %s; rename these files, "
             "for example with convmv",
             escape(str(folder)),
-            escape(list_names(undecodable)),
+            escape(list_names(found.undecodable)),
         )
-    if unread:
+    if found.unread:
         _log.warning(
             "pictures in %s are skipped because their format is not supported: %s; convert the "
             "pictures to JPEG or PNG, with the extension in their names",
             folder,
-            list_names(sorted(unread, key=_natural_sort_key)),
+            list_names(sorted(found.unread, key=_natural_sort_key)),
         )
-    if masks:
+    if found.masks:
         _log.warning(
             "masks in %s are not reconstructed: %s. To use these masks: --set inputs.masks=%s",
             folder,
-            list_names(masks),
+            list_names(found.masks),
             folder,
         )
-    excluded = set(masks)
-    return [name for name in names if name not in excluded]
+    return found.images
+
+
+def check_images_folder(folder: Path, without: Path | None = None) -> None:
+    """Raise :class:`InputError` if a folder does not exist or has fewer than two images.
+
+    The subfolder ``without`` is skipped. Other than :func:`find_images`, the check gives no
+    warnings.
+    """
+    require_two_images(folder, _search_folder(folder, without).images, folder)
 
 
 def find_videos(folder: Path) -> list[str]:
@@ -214,6 +201,47 @@ def list_names(names: list[str]) -> str:
     """Join at most :data:`MAX_LISTED` file names for a message."""
     rest = len(names) - MAX_LISTED
     return ", ".join(names[:MAX_LISTED]) + (f" and {rest} more" if rest > 0 else "")
+
+
+class _FolderContent(NamedTuple):
+    """Names of the files in a folder by their use."""
+
+    images: list[str]
+    masks: list[str]
+    unread: list[str]
+    """Images of unsupported formats."""
+    undecodable: list[str]
+    """Files whose names are not UTF-8."""
+
+
+def _search_folder(folder: Path, without: Path | None) -> _FolderContent:
+    """List the files in a folder of images; raise :class:`InputError` if it is none."""
+    if (capture := find_format(folder)) is not None:
+        raise InputError(
+            f"{folder} is a capture of {capture.name}; convert the capture first: "
+            f"mpsfm import '{folder}' --output DIR"
+        )
+    if not folder.is_dir():
+        if folder.exists():
+            raise InputError(
+                f"{folder} is neither a folder of photos nor a video; give one of the two"
+            )
+        raise InputError(f"images folder {folder} does not exist")
+    names, unread, undecodable = [], [], []
+    for name in _walk_input_files(folder, without):
+        if not is_utf8(name):
+            undecodable.append(name)
+            continue
+        extension = PurePosixPath(name).suffix.lower()
+        if extension in EXTENSIONS:
+            names.append(name)
+        elif extension in _UNREADABLE or (not extension and _has_signature(folder / name)):
+            unread.append(name)
+    names = sorted(names, key=_natural_sort_key)
+    masks = _find_mask_names(names)
+    excluded = frozenset(masks)
+    images = [name for name in names if name not in excluded]
+    return _FolderContent(images, masks, unread, undecodable)
 
 
 def _walk_input_files(folder: Path, without: Path | None) -> Iterator[str]:

@@ -30,8 +30,6 @@ from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredIm
 from mpsfm_core.optimize.bundle_kernels import update_points
 from mpsfm_core.optimize.depth_integration import DepthIntegrator
 from mpsfm_core.providers.builtin.mutual_nearest import mutual_nearest
-from mpsfm_core.testing.synthetic.problems import make_mapping_problem
-from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 _FIRST_KERNELS = ("bundles", "depth")
 """Numba kernels that the first and the second process compile first."""
@@ -86,6 +84,10 @@ def compile_kernels(first: str) -> None:
         first: Kernels to compile first, ``bundles`` (bundle adjustment) or ``depth`` (depth
             integration and multi-view stereo).
     """
+    # Runs with compiled kernels do not import the package mpsfm_core.testing.
+    from mpsfm_core.testing.synthetic.problems import make_mapping_problem
+    from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+
     scene, poses = room_scene(), arc_poses(3, 10.0)
     problem = make_mapping_problem(scene, _CAMERA, poses, points_per_view=60, map_width=64)
     views = {

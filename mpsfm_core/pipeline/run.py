@@ -25,7 +25,7 @@ from mpsfm_core.extraction.active_provider import thread_count, worker_count
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
 from mpsfm_core.extraction.runner import Extraction, extend_matches, extract
-from mpsfm_core.inputs.image_search import check_output_folder, find_images
+from mpsfm_core.inputs.image_search import check_images_folder, check_output_folder
 from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.matches import (
@@ -332,8 +332,8 @@ class _Run:
     def _resolve_providers(self) -> None:
         """Choose providers and download their weights before any image is decoded."""
         if isinstance(self._source.images, Path) and self._source.video is None:
-            # A missing image folder raises an error before any weights are downloaded.
-            find_images(self._source.images)
+            # A folder without images raises an error before any weights are downloaded.
+            check_images_folder(self._source.images, self._output)
         with self._stages.stage("providers"):
             for text in self._config.warnings:
                 self._stages.warn(text)

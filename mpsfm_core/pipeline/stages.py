@@ -46,14 +46,15 @@ class StageRecord:
 
 
 class _WarningRecorder(logging.Handler):
-    """Handler that appends the text of logged warnings to a list."""
+    """Handler that appends the text of logged warnings to a list, each text once."""
 
     def __init__(self, warnings: list[str]) -> None:
         super().__init__(logging.WARNING)
         self._warnings = warnings
 
     def emit(self, record: logging.LogRecord) -> None:
-        self._warnings.append(record.getMessage())
+        if (text := record.getMessage()) not in self._warnings:
+            self._warnings.append(text)
 
 
 class Stages:

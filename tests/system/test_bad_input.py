@@ -55,6 +55,7 @@ def test_folder_without_images_is_an_error(
     empty.mkdir()
     ended = mpsfm("reconstruct", empty, "--output", output, "--config", photo_scene.config)
     check(ended, 2, str(empty), "no images")
+    assert "providers" not in ended.err  # no weights are downloaded for an empty folder
     ended = mpsfm("reconstruct", tmp_path / "no", "--output", output, "--config", "demo")
     assert ended.code == 2
 
