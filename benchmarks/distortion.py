@@ -19,9 +19,7 @@ interrupted benchmark continues.
 from __future__ import annotations
 
 import argparse
-import tempfile
 from collections.abc import Sequence
-from contextlib import nullcontext
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
@@ -36,6 +34,7 @@ from benchmarks.real_photos import (
     add_method_arguments,
     format_table,
     list_methods,
+    open_folder,
     pool_rows,
     reconstruct_or_read,
 )
@@ -69,11 +68,9 @@ def main() -> None:
     parser.add_argument("--buckets", nargs="+", help="use the test sets of these buckets")
     parser.add_argument("--max-sets", type=int, help="number of test sets of a bucket")
     add_method_arguments(parser)
-    parser.add_argument("--folder", type=Path, help="folder of the resampled images and rows")
     arguments = parser.parse_args()
-    kept = arguments.folder and nullcontext(str(arguments.folder))
     rows = []
-    with kept or tempfile.TemporaryDirectory(prefix="mpsfm-distortion-") as folder:
+    with open_folder(arguments) as folder:
         for scene in arguments.scenes:
             source = shared_folder() / "data" / scene
             for label, sets in list_photo_sets(source, arguments).items():

@@ -1,4 +1,4 @@
-"""Accuracy of our configurations and COLMAP's on photo collections of many different cameras.
+"""Accuracy of MP-SfM and COLMAP on photo collections in which each photo has another camera.
 
     python -m benchmarks.mixed_cameras [SCENE ...] [--draws 3] [--max-images 12]
         [--config default] [--seeds 1] [--known-cameras] [--without-colmap]
@@ -15,8 +15,6 @@ Draws and table rows are stored in ``--folder``, so that an interrupted benchmar
 from __future__ import annotations
 
 import argparse
-import tempfile
-from contextlib import nullcontext
 from pathlib import Path
 
 import cv2
@@ -30,6 +28,7 @@ from benchmarks.real_photos import (
     add_method_arguments,
     format_table,
     list_methods,
+    open_folder,
     reconstruct_or_read,
 )
 from mpsfm_core.data import Float64, UInt8
@@ -41,12 +40,14 @@ SCENES = ("data/fountain", "data/rendered_kitchen", "photos/lund_door", "photos/
 FOCAL_RATIOS = (0.6, 2.5)
 """Smallest and largest focal length in longer image sides."""
 CORNER_SHIFTS = (-0.05, 0.02)
-"""Smallest and largest radial displacement of the image corners, relative to their radius."""
+"""Range of the displacement of the image corners by radial distortion, as a share of the distance
+from the corner to the image center. Negative displacements are towards the center."""
 ASPECTS = (4 / 3, 3 / 2, 3 / 4, 1.0)
 MAX_MAGNIFICATION = 1.5
 """Largest enlargement of a photo, because an enlarged photo has no fine details."""
 LONGER_SIDES = (600, 900)
 EXIF_KINDS = ("right", "missing", "wrong", "right", "missing")
+"""Focal length in EXIF of five photos, repeated for all photos and shuffled."""
 WRONG_FACTORS = (1.5, 3.0)
 EXIF_IFD, EQUIVALENT_TAG = 0x8769, 0xA405
 FOCAL_STEP = 1.02
@@ -60,11 +61,9 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--max-images", type=int, default=12, help="evenly spaced images")
     add_method_arguments(parser)
-    parser.add_argument("--folder", type=Path, help="folder of the resampled images and rows")
     arguments = parser.parse_args()
-    kept = arguments.folder and nullcontext(str(arguments.folder))
     rows = []
-    with kept or tempfile.TemporaryDirectory(prefix="mpsfm-mixed-") as folder:
+    with open_folder(arguments) as folder:
         for source in [shared_folder() / scene for scene in arguments.scenes]:
             for draw in range(arguments.draws):
                 target = Path(folder) / f"{source.name} draw {draw}"

@@ -22,6 +22,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence, Set
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -60,7 +61,6 @@ def main() -> None:
     parser.add_argument("sets", nargs="*", default=list(SETS), metavar="SET")
     parser.add_argument("--photos", type=Path, default=Path("../shared/photos"))
     add_method_arguments(parser)
-    parser.add_argument("--folder", type=Path, help="folder of the table rows")
     parser.add_argument("--output", type=Path, help="also write the table to this file")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
@@ -88,6 +88,14 @@ def add_method_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--known-cameras", action="store_true", help="add rows with true cameras")
     parser.add_argument("--without-colmap", action="store_true")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides")
+    parser.add_argument("--folder", type=Path, help="folder of table rows and resampled images")
+
+
+def open_folder(arguments: argparse.Namespace) -> AbstractContextManager[str | Path]:
+    """Open the folder of resampled images and table rows, by default a temporary one."""
+    if arguments.folder:
+        return nullcontext(arguments.folder)
+    return tempfile.TemporaryDirectory(prefix="mpsfm-photos-")
 
 
 def list_methods(arguments: argparse.Namespace) -> list[str]:

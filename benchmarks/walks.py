@@ -199,7 +199,11 @@ def write_walk(folder: Path, seed: int) -> tuple[Path, list[Pose]]:
 
 
 def write_room(folder: Path) -> tuple[Path, dict[int, Pose]]:
-    """Write the images of hololens_room as a video; return video and true poses by frame."""
+    """Write the images of hololens_room to a video file.
+
+    Returns:
+        Path of the video file, and true poses ``cam_from_world`` by frame number.
+    """
     scene = shared_folder() / "data" / "hololens_room"
     names = sorted(path.name for path in (scene / "images").iterdir())
     video, size = folder / "hololens_room.mp4", None
@@ -324,7 +328,7 @@ def _evaluate_model(folder: Path, poses: Mapping[int, Pose]) -> Record:
 
 
 def make_table(records: Sequence[Record]) -> str:
-    """Return a table in Markdown with one line a video."""
+    """Return a Markdown table with one row for each video."""
     lines = [
         "| video | frames | keyframes | placed | ATE all | ATE keyframes | WATE-AUC 10 m, full | "
         "COLMAP keyframes | ATE | memory GB | CPU s, COLMAP | CPU min per min |",

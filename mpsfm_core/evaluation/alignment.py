@@ -60,6 +60,19 @@ class TrajectoryErrors:
         """Relative pose error: RMSE of the relative rotations between successive images."""
         return _rms(self.step_turns_deg)
 
+    def summarize(self) -> dict[str, float]:
+        """Compute RMSE, median and maximum of the errors for a report."""
+        return {
+            "ate_rmse": self.ate_rmse,
+            "ate_median": float(np.median(self.centers)),
+            "ate_max": float(self.centers.max()),
+            "rpe_rmse": self.rpe_rmse,
+            "rpe_rmse_deg": self.rpe_rmse_deg,
+            "rotation_median_deg": float(np.median(self.rotations_deg)),
+            "rotation_max_deg": float(self.rotations_deg.max()),
+            "scale": self.truth_from_estimate.scale,
+        }
+
 
 def umeyama(a: Float64, b: Float64) -> SimilarityTransform:
     """Fit the least-squares similarity transform ``b_from_a`` (Umeyama, PAMI 1991).

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from mpsfm_core.data import Pose
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.evaluation.alignment import TrajectoryErrors, trajectory_errors
+from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.pose_auc import (
     CONVENTIONS,
     PoseConvention,
@@ -46,6 +44,7 @@ def evaluate(
     reference = {name: truth[name] for name in names}
     poses = {name: estimated[found] for name, found in match_names(names, estimated).items()}
     errors = pose_errors_deg(poses, reference, convention)
+    trajectory = trajectory_errors(poses, reference)
     areas = pose_auc(errors, convention)
     return {
         "convention": convention.name,
@@ -57,7 +56,7 @@ def evaluate(
         "pairs": len(errors),
         "auc_unit": "percent",
         "auc": {str(threshold): 100 * area for threshold, area in areas.items()},
-        "trajectory": _summarize_trajectory(trajectory_errors(poses, reference)),
+        "trajectory": None if trajectory is None else trajectory.summarize(),
     }
 
 
@@ -70,19 +69,3 @@ def _match_images(images: Sequence[str], truth: Mapping[str, Pose]) -> list[str]
             f"ground truth: no image (or several images) with the name {', '.join(missing)}"
         )
     return list(dict.fromkeys(matched.values()))
-
-
-def _summarize_trajectory(errors: TrajectoryErrors | None) -> dict[str, float] | None:
-    """Compute mean, median and RMSE of trajectory errors for the report."""
-    if errors is None:
-        return None
-    return {
-        "ate_rmse": errors.ate_rmse,
-        "ate_median": float(np.median(errors.centers)),
-        "ate_max": float(errors.centers.max()),
-        "rpe_rmse": errors.rpe_rmse,
-        "rpe_rmse_deg": errors.rpe_rmse_deg,
-        "rotation_median_deg": float(np.median(errors.rotations_deg)),
-        "rotation_max_deg": float(errors.rotations_deg.max()),
-        "scale": errors.truth_from_estimate.scale,
-    }

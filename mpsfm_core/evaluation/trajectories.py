@@ -145,13 +145,7 @@ def evaluate_trajectory(
         "compared": len(rows),
         "missing": num_missing,
         "path_length": float(path[-1]),
-        "scale": errors.truth_from_estimate.scale,
-        "ate_rmse": errors.ate_rmse,
-        "ate_median": float(np.median(errors.centers)),
-        "ate_max": float(errors.centers.max()),
-        "rpe_rmse": errors.rpe_rmse,
-        "rpe_rmse_deg": errors.rpe_rmse_deg,
-        "rotation_median_deg": float(np.median(errors.rotations_deg)),
+        **errors.summarize(),
         "wate_auc": windowed,
         "recall": {
             f"{meters:g} m, {degrees:g} deg": 100

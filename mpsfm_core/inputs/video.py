@@ -18,6 +18,7 @@ import numpy as np
 from mpsfm_core.data import Float32, UInt8
 from mpsfm_core.data.decisions import KeyframeReason, Reason, reason_from_json
 from mpsfm_core.data.errors import InputError
+from mpsfm_core.geometry.optical_flow import track_points
 from mpsfm_core.inputs.options import VideoOptions
 from mpsfm_core.inputs.telemetry import read_telemetry
 from mpsfm_core.providers.weights import file_sha256
@@ -45,8 +46,6 @@ _MAX_POINTS = 300
 """Maximum number of points tracked by Lucas-Kanade optical flow."""
 _SHARPNESS_SIDE = 960
 """Longer side in pixels of the downscaled frames whose sharpness is measured."""
-_MAX_BACKWARD_ERROR_PX = 1.0
-"""Maximum forward-backward error in pixels of a tracked point."""
 _EARLY_RATIO = 0.5
 """Share of the required motion from which an earlier, sharper frame may be selected instead."""
 _MIN_POINTS = 20
@@ -384,10 +383,7 @@ class _Track:
         height, width = gray.shape
         count = len(self._now)
         if count >= _MIN_POINTS:
-            there, ok, _ = cv2.calcOpticalFlowPyrLK(self._last, gray, self._now, None)
-            back, ok_back, _ = cv2.calcOpticalFlowPyrLK(gray, self._last, there, None)
-            tracked = (ok.ravel() > 0) & (ok_back.ravel() > 0)
-            tracked &= np.linalg.norm(back - self._now, axis=2).ravel() < _MAX_BACKWARD_ERROR_PX
+            there, tracked = track_points(self._last, gray, self._now)
             x, y = there[:, 0, 0], there[:, 0, 1]
             tracked &= (x >= 0) & (y >= 0) & (x < width) & (y < height)
             self._start, self._now = self._start[tracked], there[tracked]

@@ -23,6 +23,7 @@ import numpy as np
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, PinholeCamera, Pose, UInt8
 from mpsfm_core.data.decisions import FrameReason, Reason
 from mpsfm_core.geometry import inside, project, rays, sample_nearest, scale_pixels, transform
+from mpsfm_core.geometry.optical_flow import track_points
 from mpsfm_core.optimize.resection import (
     RaySegments,
     linearize_pose,
@@ -38,8 +39,6 @@ MAX_POINTS = 300
 """Maximum number of points of a keyframe that are tracked into each frame. [ours]"""
 _MIN_DISTANCE_RATIO = 0.015
 """Minimum distance between two corners of a keyframe, relative to the image width."""
-_MAX_BACKWARD_ERROR_PX = 1.0
-"""Maximum forward-backward error of a tracked point in pixels."""
 _DEPTH_DEVIATION = 2.0
 """Half length of the ray segment that contains a corner, in standard deviations of log depth.
 [ours]"""
@@ -56,8 +55,6 @@ _MIN_STD_PX = 0.1
 [ours]"""
 _CENTER = np.float32(0.5)
 """Coordinate of the center of the first pixel in COLMAP, which is 0 in OpenCV."""
-_WINDOW = 21, 21
-"""Size in pixels of the patches that optical flow compares. [OpenCV]"""
 PixelMap = Callable[[Float64], Float64]
 """Function that maps pixels (n, 2) to pixels (n, 2)."""
 
@@ -198,15 +195,8 @@ def _track(keyframe: Keyframe, gray: UInt8, predicted: Pose) -> tuple[Float32, F
         return np.zeros((0, 2), np.float32), np.zeros((0, 3)), np.zeros((0, 3))
     start = keyframe.xy[rows, None] - _CENTER
     guess = guess[visible, None].astype(np.float32) - _CENTER
-    flags = cv2.OPTFLOW_USE_INITIAL_FLOW
-    there, ok, _ = cv2.calcOpticalFlowPyrLK(
-        keyframe.gray, gray, start, guess, winSize=_WINDOW, flags=flags
-    )
-    back, ok_back, _ = cv2.calcOpticalFlowPyrLK(
-        gray, keyframe.gray, there, start.copy(), winSize=_WINDOW, flags=flags
-    )
-    good: Bool = (ok.ravel() > 0) & (ok_back.ravel() > 0) & inside(there[:, 0] + _CENTER, size)
-    good &= np.linalg.norm(back - start, axis=2).ravel() < _MAX_BACKWARD_ERROR_PX
+    there, tracked = track_points(keyframe.gray, gray, start, guess)
+    good: Bool = tracked & inside(there[:, 0] + _CENTER, size)
     rows = rows[good]
     return there[good, 0] + _CENTER, keyframe.near[rows], keyframe.far[rows]
 

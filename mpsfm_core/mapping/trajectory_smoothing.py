@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
+from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.geometry import camera_center
@@ -58,7 +58,7 @@ def smooth_trajectory(
     steps = np.diff(seconds)
     increments = np.column_stack(
         [
-            _rotation_vectors(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)),
+            Rotation.from_matrix(rotations[1:] @ rotations[:-1].transpose(0, 2, 1)).as_rotvec(),
             np.diff(centers, axis=0),
         ]
     )
@@ -74,8 +74,8 @@ def smooth_trajectory(
 
 def interpolate_pose(first: Pose, second: Pose, ratio: float) -> Pose:
     """Interpolate two poses ``cam_from_world``; a ratio of 0 gives the first pose."""
-    turn = _rotation_vectors((second[0] @ first[0].T)[None])[0]
-    rotation = _rotation(ratio * turn) @ first[0]
+    turn = Rotation.from_matrix(second[0] @ first[0].T).as_rotvec()
+    rotation = Rotation.from_rotvec(ratio * turn).as_matrix() @ first[0]
     center = (1 - ratio) * camera_center(*first) + ratio * camera_center(*second)
     return rotation, -rotation @ center
 
@@ -190,22 +190,6 @@ def _smooth(
 def _correct_pose(
     rotation: Float64, center: Float64, correction: Float64, covariance: Float64
 ) -> SmoothedPose:
-    cam_from_world = (_rotation(correction[:3]) @ rotation).T
+    cam_from_world = (Rotation.from_rotvec(correction[:3]).as_matrix() @ rotation).T
     symmetric = (covariance + covariance.T) / 2
     return SmoothedPose((cam_from_world, -cam_from_world @ (center + correction[3:])), symmetric)
-
-
-def _rotation_vectors(rotations: Float64) -> Float64:
-    """Return the rotation vectors (n, 3) of rotations (n, 3, 3)."""
-    vectors = []
-    for rotation in rotations:
-        x, y, z, w = pycolmap.Rotation3d(rotation).quat
-        axis, sine = np.array([x, y, z]) * np.sign(w or 1.0), np.linalg.norm([x, y, z])
-        angle = 2 * np.arctan2(sine, abs(w))
-        vectors.append(axis * (angle / sine if sine > 1e-12 else 2.0))
-    return np.array(vectors).reshape(-1, 3)
-
-
-def _rotation(vector: Float64) -> Float64:
-    rotation: Float64 = pycolmap.Rotation3d(np.asarray(vector, dtype=np.float64)).matrix()
-    return rotation

@@ -159,7 +159,7 @@ class _FrameLocalizer:
         return _Neighbors(component, tuple(sorted(same, key=lambda key: key.number)))
 
     def _search(self, rows: range, shot: int) -> SelectedFrame | None:
-        """Return the first registered keyframe of a shot among rows of the keyframes."""
+        """Return the first registered keyframe in the order of ``rows``, within the shot."""
         for row in rows:
             keyframe = self._keyframes[row]
             if keyframe.shot != shot:
@@ -213,7 +213,7 @@ def _frame_camera(source: SourceImage, image: RegisteredImage, gray: UInt8) -> F
 
 
 def _split_at_gaps(placed: Sequence[_LocalizedFrame]) -> Iterator[list[_LocalizedFrame]]:
-    """Split frames where the component or shot changes, and at gaps that are too long."""
+    """Split frames into sequences of one component and one shot, with gaps of at most MAX_GAP_S."""
     run: list[_LocalizedFrame] = []
     pending: deque[_LocalizedFrame] = deque()
     for entry in placed:

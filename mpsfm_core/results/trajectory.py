@@ -48,16 +48,12 @@ def write_trajectory(folder: Path, frames: Sequence[TrajectoryFrame]) -> None:
         folder: Result folder.
         frames: All localized frames, and all frames without a pose, ascending by number.
     """
-    lines = [
-        " ".join(f"{value:.9g}" for value in (*camera_center(*pose), *_quaternion(pose)))
-        for frame in frames
-        if frame.component == 0 and (pose := frame.pose) is not None
-    ]
-    times = [f.time_s for f in frames if f.component == 0 and f.pose is not None]
-    text = "".join(f"{time:.6f} {line}\n" for time, line in zip(times, lines, strict=True))
-    (folder / TRAJECTORY).write_text(
-        "# timestamp tx ty tz qx qy qz qw (camera to world)\n" + text, encoding="utf-8"
-    )
+    lines = ["# timestamp tx ty tz qx qy qz qw (camera to world)"]
+    for frame in frames:
+        if frame.component == 0 and frame.pose is not None:
+            values = *camera_center(*frame.pose), *_quaternion(frame.pose)
+            lines.append(" ".join([f"{frame.time_s:.6f}", *(f"{value:.9g}" for value in values)]))
+    (folder / TRAJECTORY).write_text("\n".join(lines) + "\n", encoding="utf-8")
     rows = [",".join(map(str, _row(frame))) for frame in frames]
     table = "\n".join([_COLUMNS, *rows]) + "\n"
     (folder / FRAME_TABLE).write_text(table, encoding="utf-8")

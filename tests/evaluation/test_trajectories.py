@@ -27,7 +27,7 @@ TIMES = 5.0 + np.arange(120) / 10
 
 
 def make_poses(noise: float, seed: int = 0) -> list[Pose]:
-    """Return poses along a curve of 24 m, with noise of the position in meters."""
+    """Return poses on a curve of 24 m; ``noise`` is the std of the camera centers in meters."""
     rng = np.random.default_rng(seed)
     poses = []
     for time in TIMES - TIMES[0]:

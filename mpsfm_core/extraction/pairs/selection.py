@@ -185,11 +185,11 @@ class PairSelection:
             return PairSimilarity(cached[:, :2].astype(np.int64), cached[:, 2])
         strongest = [pair_similarity.strongest_descriptors(table[index]) for index in range(count)]
         pairs = pair_similarity.candidate_pairs(strongest)
-        ends = np.searchsorted(pairs[:, 0], np.arange(count), side="right").tolist()
+        partners = np.split(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(1, count)))
 
         def compare(first: int) -> list[float]:
-            others = pairs[ends[first - 1] if first else 0 : ends[first], 1].tolist()
-            return [pair_similarity.match_score(strongest[first], strongest[b]) for b in others]
+            a = strongest[first]
+            return [pair_similarity.match_score(a, strongest[b]) for b in partners[first]]
 
         rows = context.each("similarity", range(count), compare)
         scores = np.array([score for row in rows for score in row], dtype=np.float64)

@@ -1,8 +1,8 @@
 """Perspective images with known cameras, cut from panoramas on the training device.
 
-The images are cut from upright equirectangular panoramas and from rendered images. The principal
-point is the image center. The sharpness of an image does not depend on its focal length, because a
-network would otherwise measure the resolution of the panoramas.
+Each image is a part of an upright equirectangular panorama or of a rendered image. The principal
+point is the center of the image. The images are blurred so that their sharpness does not depend on
+the focal length; a network could otherwise estimate the focal length from the sharpness.
 """
 
 from __future__ import annotations
@@ -296,7 +296,10 @@ def _draw_cameras(
 
 
 def _rotations(heading: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
-    """Compute rotations world_from_camera (n, 3, 3) from angles in rad, with z up."""
+    """Convert heading, pitch and roll (n,) in rad to rotations (n, 3, 3) world_from_camera.
+
+    The z axis of the world points up.
+    """
     zero = torch.zeros_like(heading)
     c, s = pitch.cos(), pitch.sin()
     forward = torch.stack([heading.cos() * c, heading.sin() * c, s], 1)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -28,15 +29,9 @@ excludes images of bare walls."""
 
 def draw_samples(seed: Sequence[int], photos: Sequence[Path] = ()) -> Iterator[Sample]:
     """Yield rendered training samples of random scenes, endlessly."""
-    rng = np.random.default_rng(seed)
-    bank = make_textures(rng, _TEXTURES, photos)
-    worlds, shares = zip(*WORLDS, strict=True)
-    while True:
-        build = Builder(rng, _TEXTURES)
-        shoot = worlds[rng.choice(len(worlds), p=shares)](build)
-        scene, shows, sky = build.arrays(bank)
+    for rng, shoot, arrays in _draw_scenes(seed, photos):
         for _ in range(_VIEWS):
-            sample = _view(rng, scene, shows, sky, shoot())
+            sample = _view(rng, *arrays, shoot())
             if sample is not None:
                 yield sample
 
@@ -49,13 +44,7 @@ def draw_cameras(
     The sequence is endless. The focal lengths have a wide range, and a third of the images are
     rolled by up to 45 degrees.
     """
-    rng = np.random.default_rng(seed)
-    bank = make_textures(rng, _TEXTURES, photos)
-    worlds, shares = zip(*WORLDS, strict=True)
-    while True:
-        build = Builder(rng, _TEXTURES)
-        shoot = worlds[rng.choice(len(worlds), p=shares)](build)
-        scene, shows, sky = build.arrays(bank)
+    for rng, shoot, arrays in _draw_scenes(seed, photos):
         for _ in range(_VIEWS):
             shot = shoot()
             roll = rng.normal(0, 0.06) if rng.random() < 0.7 else rng.uniform(-0.8, 0.8)
@@ -64,9 +53,22 @@ def draw_cameras(
             usual = rng.random() < 0.5
             log_focal = rng.normal(-0.3, 0.35) if usual else rng.uniform(np.log(0.33), np.log(2.4))
             focal = float(np.exp(log_focal)) * WIDTH / float(np.hypot(WIDTH, HEIGHT))
-            sample = _view(rng, scene, shows, sky, replace(shot, rotation=rotation, focal=focal))
+            sample = _view(rng, *arrays, replace(shot, rotation=rotation, focal=focal))
             if sample is not None:
                 yield sample.image, float(sample.camera[0]), rotation
+
+
+def _draw_scenes(
+    seed: Sequence[int], photos: Sequence[Path]
+) -> Iterator[tuple[np.random.Generator, Callable[[], Shot], tuple[Any, Any, Any]]]:
+    """Yield random generator, function that draws a camera, and geometry of random scenes."""
+    rng = np.random.default_rng(seed)
+    bank = make_textures(rng, _TEXTURES, photos)
+    worlds, shares = zip(*WORLDS, strict=True)
+    while True:
+        build = Builder(rng, _TEXTURES)
+        shoot = worlds[rng.choice(len(worlds), p=shares)](build)
+        yield rng, shoot, build.arrays(bank)
 
 
 def _view(rng: np.random.Generator, scene, shows, sky, shot: Shot) -> Sample | None:
