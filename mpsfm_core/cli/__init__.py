@@ -1,44 +1,52 @@
 """Command line ``mpsfm``: commands that call the public API.
 
-Each command or command group has a module, and :func:`build_app` adds all of them to the command
-line. A command imports its dependencies inside its function, so that every command starts fast.
-The class :class:`~mpsfm_core.cli.errors.CommandGroup` turns exceptions into one line on stderr and
-an exit code.
+Each command or command group has a module, which is imported when the command is used or listed. A
+command imports its dependencies inside its function, so that every command starts fast. The class
+:class:`~mpsfm_core.cli.errors.CommandGroup` turns exceptions into one line on stderr and an exit
+code.
 """
 
 from __future__ import annotations
 
+import importlib
 import io
 import logging
 import os
 import sys
-from typing import Annotated
+from collections import UserDict
+from typing import Annotated, Any
 
 import typer
+import typer.main
 
-from mpsfm_core.cli import (
-    benchmark,
-    cache,
-    calibrate,
-    config,
-    demo,
-    dense,
-    doctor,
-    env,
-    evaluate,
-    export,
-    import_capture,
-    localize,
-    mesh,
-    models,
-    plugins,
-    reconstruct,
-    report,
-    testsets,
-    view,
-    work_folder,
-)
 from mpsfm_core.cli.errors import CommandGroup
+
+_COMMANDS = {
+    "reconstruct": "reconstruct:reconstruct",
+    "extract": "work_folder:extract",
+    "match": "work_folder:match",
+    "map": "work_folder:map_images",
+    "localize": "localize:localize",
+    "demo": "demo:demo",
+    "import": "import_capture:import_capture",
+    "dense": "dense:dense",
+    "mesh": "mesh:mesh",
+    "export": "export:export",
+    "report": "report:report",
+    "view": "view:view",
+    "doctor": "doctor:doctor",
+    "evaluate": "evaluate:evaluate",
+    "benchmark": "benchmark:benchmark",
+    "calibrate": "calibrate:calibrate",
+    "plugins": "plugins:app",
+    "config": "config:app",
+    "env": "env:app",
+    "models": "models:app",
+    "cache": "cache:app",
+    "testsets": "testsets:app",
+}
+"""Module of :mod:`mpsfm_core.cli` with the function or command group of each command, in the order
+of the help text."""
 
 
 def main() -> None:
@@ -55,41 +63,45 @@ def _escape_unprintable_characters() -> None:
 
 
 def build_app() -> typer.Typer:
-    """Build the command line with all commands."""
-    app = typer.Typer(
-        cls=CommandGroup,
-        callback=_configure_logging,
-        no_args_is_help=True,
+    """Build the command line, which imports each command on first use."""
+    return _new_app(cls=_RootGroup, callback=_configure_logging, no_args_is_help=True)
+
+
+def _new_app(**settings: Any) -> typer.Typer:
+    return typer.Typer(
         add_completion=False,
         # Rich takes a third of the time of `mpsfm --help` to import.
         rich_markup_mode=None,
         context_settings={"max_content_width": 110},
         # Tracebacks omit local variables, because these may be whole images.
         pretty_exceptions_show_locals=False,
+        **settings,
     )
-    app.command("reconstruct")(reconstruct.reconstruct)
-    app.command("extract")(work_folder.extract)
-    app.command("match")(work_folder.match)
-    app.command("map")(work_folder.map_images)
-    app.command("localize")(localize.localize)
-    app.command("demo")(demo.demo)
-    app.command("import")(import_capture.import_capture)
-    app.command("dense")(dense.dense)
-    app.command("mesh")(mesh.mesh)
-    app.command("export")(export.export)
-    app.command("report")(report.report)
-    app.command("view")(view.view)
-    app.command("doctor")(doctor.doctor)
-    app.command("evaluate")(evaluate.evaluate)
-    app.command("benchmark")(benchmark.benchmark)
-    app.command("calibrate")(calibrate.calibrate)
-    app.add_typer(plugins.app, name="plugins")
-    app.add_typer(config.app, name="config")
-    app.add_typer(env.app, name="env")
-    app.add_typer(models.app, name="models")
-    app.add_typer(cache.app, name="cache")
-    app.add_typer(testsets.app, name="testsets")
-    return app
+
+
+class _RootGroup(CommandGroup):
+    """Root command, whose commands are imported on first use."""
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(**settings)
+        self.commands = _LazyCommands({**_COMMANDS, **self.commands})
+
+
+class _LazyCommands(UserDict[str, Any]):
+    """Commands by name, each stored as ``"module:name"`` until the command is used."""
+
+    def __getitem__(self, name: str) -> Any:
+        command = super().__getitem__(name)
+        if isinstance(command, str):
+            module, _, attribute = command.partition(":")
+            target = getattr(importlib.import_module(f"{__name__}.{module}"), attribute)
+            app = _new_app()
+            if isinstance(target, typer.Typer):
+                app.add_typer(target, name=name)
+            else:
+                app.command(name)(target)
+            command = self[name] = typer.main.get_group(app).commands[name]
+        return command
 
 
 def _print_version(requested: bool) -> None:
