@@ -12,7 +12,8 @@ from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, Pose, UInt8
 from mpsfm_core.geometry import transform
-from mpsfm_core.support.jit import helper, kernel
+from mpsfm_core.geometry.rasterization import covered_range, rasterize
+from mpsfm_core.support.jit import kernel
 
 _NUM_NEIGHBORS = 4
 """Number of nearest neighbors of a point whose distance gives the radius of its splat."""
@@ -77,78 +78,15 @@ def render(
             :func:`splat_radii`. Meshes ignore the radii.
     """
     local = transform(*pose, geometry.points)
+    if len(geometry.triangles):
+        colors = geometry.colors.astype(np.float32)
+        depth, colors = rasterize(local, colors, geometry.triangles, camera.params, camera.size)
+        return Rendering(colors, depth)
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
     colors = np.zeros((camera.height, camera.width, 3), np.float32)
-    if len(geometry.triangles):
-        triangles = np.ascontiguousarray(geometry.triangles, np.int64)
-        _fill_triangles(local, geometry.colors, triangles, camera.params, depth, colors)
-    else:
-        radii = splat_radii(geometry.points) if radii is None else radii
-        _splat_points(local, geometry.colors, radii, camera.params, depth, colors)
+    radii = splat_radii(geometry.points) if radii is None else radii
+    _splat_points(local, geometry.colors, radii, camera.params, depth, colors)
     return Rendering(colors, depth)
-
-
-@helper()
-def _covered_range(low: float, high: float, size: int) -> tuple[int, int]:
-    """Return the first and the end of the pixels whose centers are in an interval."""
-    first = math.ceil(min(max(low - 0.5, 0.0), float(size)))
-    end = math.floor(max(min(high - 0.5, size - 1.0), -1.0)) + 1
-    return first, end
-
-
-@kernel()
-def _fill_triangles(
-    points: Float64,
-    vertex_colors: UInt8,
-    triangles: Int64,
-    camera: Float64,
-    depth: Float32,
-    colors: Float32,
-) -> None:
-    """Fill triangles in front of the camera into a z-buffer; skip triangles that cross z = 0.
-
-    Args:
-        points: (n, 3) vertices, camera frame.
-        vertex_colors: (n, 3) RGB.
-        triangles: (m, 3) vertex indices.
-        camera: (4,) intrinsics fx, fy, cx, cy in pixels.
-        depth: (h, w) z-buffer, updated in place.
-        colors: (h, w, 3) colors of the nearest triangles, updated in place.
-    """
-    height, width = depth.shape
-    fx, fy, cx, cy = camera
-    for m in range(len(triangles)):
-        a, b, c = triangles[m]
-        za, zb, zc = points[a, 2], points[b, 2], points[c, 2]
-        if za <= 0 or zb <= 0 or zc <= 0:
-            continue
-        xa, ya = fx * points[a, 0] / za + cx, fy * points[a, 1] / za + cy
-        xb, yb = fx * points[b, 0] / zb + cx, fy * points[b, 1] / zb + cy
-        xc, yc = fx * points[c, 0] / zc + cx, fy * points[c, 1] / zc + cy
-        area = (xb - xa) * (yc - ya) - (xc - xa) * (yb - ya)
-        if area == 0:
-            continue
-        left, right = _covered_range(min(xa, xb, xc), max(xa, xb, xc), width)
-        top, bottom = _covered_range(min(ya, yb, yc), max(ya, yb, yc), height)
-        for i in range(top, bottom):
-            y = i + 0.5
-            for j in range(left, right):
-                x = j + 0.5
-                wa = ((xb - x) * (yc - y) - (xc - x) * (yb - y)) / area
-                wb = ((xc - x) * (ya - y) - (xa - x) * (yc - y)) / area
-                wc = 1 - wa - wb
-                if wa < 0 or wb < 0 or wc < 0:
-                    continue
-                z = 1 / (wa / za + wb / zb + wc / zc)
-                if z >= depth[i, j]:
-                    continue
-                depth[i, j] = z
-                for k in range(3):
-                    colors[i, j, k] = z * (
-                        wa * vertex_colors[a, k] / za
-                        + wb * vertex_colors[b, k] / zb
-                        + wc * vertex_colors[c, k] / zc
-                    )
 
 
 @kernel()
@@ -182,8 +120,8 @@ def _splat_points(
             x, y = fx * points[n, 0] / z + cx, fy * points[n, 1] / z + cy
             # A square covers at least the pixel that contains the point.
             rx, ry = max(0.5, fx * radii[n] / z), max(0.5, fy * radii[n] / z)
-            left, right = _covered_range(x - rx, x + rx, width)
-            top, bottom = _covered_range(y - ry, y + ry, height)
+            left, right = covered_range(x - rx, x + rx, width)
+            top, bottom = covered_range(y - ry, y + ry, height)
             for i in range(top, bottom):
                 for j in range(left, right):
                     if not blends:
