@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         match_images,
         predict_priors,
         run_mapper,
+        texture_mesh,
         to_colmap,
         undistort_views,
     )
@@ -67,6 +68,7 @@ _LAZY_MODULES = {
         "match_images",
         "predict_priors",
         "run_mapper",
+        "texture_mesh",
         "to_colmap",
         "undistort_views",
     ),
@@ -151,6 +153,7 @@ __all__ = [
     "predict_priors",
     "reconstruct",
     "run_mapper",
+    "texture_mesh",
     "to_colmap",
     "undistort_views",
 ]

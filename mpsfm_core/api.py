@@ -39,6 +39,7 @@ from mpsfm_core.dense.densify import densify as densify_reconstruction
 from mpsfm_core.dense.fusion import FusedPointCloud, fuse_depth_maps
 from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
 from mpsfm_core.dense.options import DenseOptions, MeshOptions
+from mpsfm_core.dense.texture import TexturedMesh, build_texture
 from mpsfm_core.evaluation import CONVENTIONS
 from mpsfm_core.evaluation import evaluate as evaluate_poses
 from mpsfm_core.extraction import runner
@@ -472,6 +473,28 @@ def build_mesh(
     if isinstance(options, Mapping):
         options = parse_settings(MeshOptions, options, ())
     return mesh_depth_maps(reconstruction, _ViewsByName(images), options or MeshOptions())
+
+
+def texture_mesh(
+    mesh: TriangleMesh,
+    reconstruction: Reconstruction,
+    images: ImageSet,
+    *,
+    max_size: int = 4096,
+) -> TexturedMesh:
+    """Texture a mesh with the photos of its reconstruction.
+
+    Args:
+        mesh: Mesh of :func:`build_mesh`.
+        reconstruction: Reconstruction from which the mesh was built.
+        images: Images of the reconstruction.
+        max_size: Maximum side of the texture in pixels. Photos are reduced if necessary.
+
+    Examples:
+        >>> mpsfm.texture_mesh(mesh, dense, images).texture.shape
+        (3120, 4021, 3)
+    """
+    return build_texture(mesh, reconstruction, _ViewsByName(images), max_size)
 
 
 def evaluate(

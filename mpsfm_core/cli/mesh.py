@@ -21,11 +21,13 @@ def mesh(
     ] = None,
     overrides: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Change voxel_px or max_triangles."),
+        typer.Option(
+            "--set", metavar="KEY=VALUE", help="Set voxel_px, max_triangles, max_texture_size."
+        ),
     ] = None,
     quiet: Quiet = False,
 ) -> None:
-    """Build a colored mesh from depth maps and write DIR/mesh.ply and DIR/mesh.glb.
+    """Build a textured mesh from depth maps; write DIR/mesh.glb, mesh.obj and mesh.ply.
 
     The command needs the libraries of pip install 'mpsfm-core[mesh]'.
     """
@@ -36,4 +38,4 @@ def mesh(
     handle_sigterm()
     surface = mesh_model(folder, images, parse_settings(MeshOptions, parse_overrides(overrides)))
     if not quiet:
-        typer.echo(f"{len(surface.triangles)} triangles; written to {folder}/mesh.ply and mesh.glb")
+        typer.echo(f"{len(surface.triangles)} triangles; written to {folder}/mesh.*")

@@ -23,8 +23,9 @@ DENSE = "dense.ply"
 """Fused depth maps."""
 DEPTH = "depth"
 """Refined depth maps of the images, ``NAME.npz``."""
-MESH = ("mesh.ply", "mesh.glb")
-"""Surface mesh, which ``mpsfm mesh`` extracts from the depth maps."""
+MESH = ("mesh.ply", "mesh.glb", "mesh.obj", "mesh.mtl", "mesh.jpg")
+"""Surface mesh, which ``mpsfm mesh`` extracts from the depth maps: vertex colors as PLY, and a
+texture as GLB and as OBJ with material and image."""
 TRANSFORMS = "transforms.json"
 """Cameras and poses in the format of nerfstudio."""
 TRAJECTORY = "trajectory.txt"

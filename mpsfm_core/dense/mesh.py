@@ -30,6 +30,7 @@ from mpsfm_core.geometry import (
     transform,
     unproject,
 )
+from mpsfm_core.geometry.statistics import unique_rows
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.support.jit import kernel
 
@@ -202,9 +203,10 @@ def _find_surface_blocks(maps: Sequence[_WeightedDepth], voxel: float) -> Int64:
         # either side.
         points = map_.points / (voxel * _BLOCK_SIZE)
         shifted = [np.floor(points + (corner - 0.5) / _BLOCK_SIZE) for corner in _CORNERS]
-        blocks_per_map.append(np.unique(np.concatenate(shifted).astype(np.int64), axis=0))
-    blocks: Int64 = np.unique(np.concatenate(blocks_per_map), axis=0)
-    return blocks
+        blocks = np.concatenate(shifted).astype(np.int64)
+        blocks_per_map.append(blocks[unique_rows(blocks)[0]])
+    blocks = np.concatenate(blocks_per_map)
+    return blocks[unique_rows(blocks)[0]]
 
 
 def _extract_block_surface(
@@ -305,8 +307,8 @@ def _merge_surfaces(
     vertices = np.concatenate([vertices for vertices, _ in surfaces])
     triangles = np.concatenate([t + s for (_, t), s in zip(surfaces, starts, strict=True)])
     cells = np.round(vertices / (voxel * _MERGE_DISTANCE)).astype(np.int64)
-    _, first, vertex_ids = np.unique(cells, axis=0, return_index=True, return_inverse=True)
-    triangles = vertex_ids.ravel()[triangles]
+    first, vertex_ids = unique_rows(cells)
+    triangles = vertex_ids[triangles]
     degenerate = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
     return vertices[first], triangles[~degenerate]
 

@@ -33,3 +33,5 @@ class MeshOptions(Options):
     Smaller voxels reproduce noise of the depth maps and need more memory."""
     max_triangles: int = Field(500_000, ge=4)
     """Maximum number of triangles (about 20 bytes each on disk); a larger mesh is simplified."""
+    max_texture_size: int = Field(4096, ge=0, le=16384)
+    """Maximum side of the texture image in pixels; with 0 the mesh only has vertex colors."""

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Float64, Int64
 from mpsfm_core.data.errors import InputError
+from mpsfm_core.geometry.statistics import unique_rows
 
 TOLERANCES = (0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
 """Default distance thresholds in meters [ETH3D]."""
@@ -76,11 +77,7 @@ def _distances(points: Float64, others: Float64, limit: float) -> tuple[Float64,
 def thin_points(points: Float64, size: float) -> Float64:
     """Subsample a cloud to the first point in each cube of a grid."""
     cells: Int64 = np.floor(points / size).astype(np.int64)
-    order = np.lexsort(cells.T)
-    ordered = cells[order]
-    first = np.ones(len(points), np.bool_)
-    first[1:] = (ordered[1:] != ordered[:-1]).any(axis=1)
-    return points[np.sort(order[first])]
+    return points[np.sort(unique_rows(cells)[0])]
 
 
 def _harmonic(a: float, b: float) -> float:

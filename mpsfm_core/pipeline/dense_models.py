@@ -16,6 +16,7 @@ from mpsfm_core.dense.depth_range import depth_prior_from_points
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
 from mpsfm_core.dense.options import DenseOptions, MeshOptions
+from mpsfm_core.dense.texture import build_texture
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.geometry import transform
 from mpsfm_core.inputs.image_search import find_images
@@ -142,10 +143,11 @@ def mesh_model(
     photos: PathLike | None = None,
     options: MeshOptions | None = None,
 ) -> TriangleMesh:
-    """Mesh the depth maps of a result folder; write ``mesh.ply`` and ``mesh.glb``.
+    """Mesh the depth maps of a result folder, texture the mesh with the photos, and write both.
 
-    The vertices of the PLY file are in the world frame of the COLMAP model. The GLB file is rotated
-    so that gravity points down.
+    The function writes ``mesh.ply`` with vertex colors, ``mesh.glb`` with a texture, and
+    ``mesh.obj`` with ``mesh.mtl`` and ``mesh.jpg``. The vertices of the PLY and OBJ files are in
+    the world frame of the COLMAP model. The GLB file is rotated so that gravity points down.
 
     Args:
         folder: Result folder with depth maps.
@@ -174,7 +176,12 @@ def mesh_model(
             raise InputError(
                 f"{folder}: the result folder has no depth maps: run mpsfm dense first"
             )
-        mesh = mesh_depth_maps(posed, _view_of(source.images), options or MeshOptions())
+        options = options or MeshOptions()
+        view_of = _view_of(source.images)
+        mesh = mesh_depth_maps(posed, view_of, options)
+        textured = None
+        if options.max_texture_size:
+            textured = build_texture(mesh, posed, view_of, options.max_texture_size)
         with replace_entries(source.folder, MESH) as written:
-            write_mesh(written, mesh, source)
+            write_mesh(written, mesh, textured, source)
     return mesh

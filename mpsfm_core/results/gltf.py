@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import struct
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core.data import Float64, Int64, UInt8
+from mpsfm_core.data import Float32, Float64, Int64, UInt8
 
 POINTS, LINES, TRIANGLES = 0, 1, 4
 """Topology codes (``mode``) of glTF primitives."""
@@ -18,6 +18,16 @@ FLIP = np.diag([1.0, -1.0, -1.0])
 """Matrix between OpenCV axes (y down, z forward) and glTF axes (y up, z backward)."""
 _FLOAT, _BYTE, _UINT = 5126, 5121, 5125
 _LISTS = ("nodes", "meshes", "cameras", "accessors", "bufferViews")
+_MATERIALS = ("materials", "textures", "images")
+
+
+class Texture(NamedTuple):
+    """Texture of a mesh."""
+
+    uv: Float32
+    """(n, 2) texture coordinates of the vertices in [0, 1], from the upper left corner."""
+    jpeg: bytes
+    """Texture image as JPEG file."""
 
 
 class GltfScene:
@@ -29,7 +39,7 @@ class GltfScene:
             "asset": {"version": "2.0", "generator": "mpsfm"},
             "scene": 0,
             "scenes": [{"nodes": []}],
-            **{name: [] for name in (*_LISTS, "materials", "extensionsUsed")},
+            **{name: [] for name in (*_LISTS, *_MATERIALS, "extensionsUsed")},
         }
 
     def add(self, node: dict[str, Any], root: bool = True) -> int:
@@ -47,6 +57,7 @@ class GltfScene:
         points: Float64,
         colors: UInt8 | None,
         triangles: Int64 | None = None,
+        texture: Texture | None = None,
     ) -> int:
         """Add a mesh to the scene; return the mesh number.
 
@@ -56,6 +67,7 @@ class GltfScene:
             points: (n, 3) vertices; a line has two vertices.
             colors: (n, 3) RGB colors of the vertices, or None.
             triangles: (m, 3) vertex indices of the triangles.
+            texture: texture of the triangles, or None.
         """
         positions = points.astype("<f4")
         bounds = {"min": positions.min(axis=0).tolist(), "max": positions.max(axis=0).tolist()}
@@ -68,17 +80,26 @@ class GltfScene:
         if triangles is not None:
             indices = triangles.astype("<u4").ravel()
             primitive["indices"] = self._accessor(indices, "SCALAR", _UINT, {})
-            primitive["material"] = self._unlit_material()
+            primitive["material"] = self._unlit_material(texture)
+        if texture is not None:
+            uv = texture.uv.astype("<f4")
+            attributes["TEXCOORD_0"] = self._accessor(uv, "VEC2", _FLOAT, {})
         self._json["meshes"].append({"name": name, "primitives": [primitive]})
         return len(self._json["meshes"]) - 1
 
-    def _unlit_material(self) -> int:
-        """Return the number of the unlit, double-sided material; add the material once."""
-        if not self._json["materials"]:
-            unlit = "KHR_materials_unlit"
-            self._json["extensionsUsed"].append(unlit)
-            self._json["materials"].append({"doubleSided": True, "extensions": {unlit: {}}})
-        return 0
+    def _unlit_material(self, texture: Texture | None) -> int:
+        """Add an unlit, double-sided material; return the material number."""
+        unlit = "KHR_materials_unlit"
+        self._json["extensionsUsed"] = [unlit]
+        material: dict[str, Any] = {"doubleSided": True, "extensions": {unlit: {}}}
+        if texture is not None:
+            view = self._buffer_view(texture.jpeg)
+            self._json["images"].append({"bufferView": view, "mimeType": "image/jpeg"})
+            self._json["textures"].append({"source": len(self._json["images"]) - 1})
+            color = {"index": len(self._json["textures"]) - 1}
+            material["pbrMetallicRoughness"] = {"baseColorTexture": color, "metallicFactor": 0}
+        self._json["materials"].append(material)
+        return len(self._json["materials"]) - 1
 
     def camera(self, name: str, half: Float64) -> int:
         """Add a camera with half image size ``half`` at z = -1; return the camera number."""
@@ -104,10 +125,14 @@ class GltfScene:
     def _accessor(
         self, values: NDArray[Any], kind: str, component: int, further: dict[str, Any]
     ) -> int:
-        view = {"buffer": 0, "byteOffset": len(self._data), "byteLength": values.nbytes}
-        self._data += values.tobytes() + bytes(-values.nbytes % 4)
-        self._json["bufferViews"].append(view)
-        number = len(self._json["bufferViews"]) - 1
+        number = self._buffer_view(values.tobytes())
         described = {"componentType": component, "count": len(values), "type": kind}
         self._json["accessors"].append({"bufferView": number, **described, **further})
         return len(self._json["accessors"]) - 1
+
+    def _buffer_view(self, data: bytes) -> int:
+        """Append data to the buffer; return the number of the buffer view."""
+        view = {"buffer": 0, "byteOffset": len(self._data), "byteLength": len(data)}
+        self._data += data + bytes(-len(data) % 4)
+        self._json["bufferViews"].append(view)
+        return len(self._json["bufferViews"]) - 1

@@ -7,6 +7,7 @@ import struct
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -147,19 +148,40 @@ def result(room: Room, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_mesh_command_writes_ply_and_glb(result: Path) -> None:
+def read_gltf(path: Path) -> dict[str, Any]:
+    data = path.read_bytes()
+    described: dict[str, Any] = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
+    return described
+
+
+def test_mesh_command_writes_ply_glb_and_obj(result: Path) -> None:
     done = CliRunner().invoke(build_app(), ["mesh", str(result), "--set", "max_triangles=2000"])
     assert done.exit_code == 0, done.output
     ply = trimesh.load(result / "mesh.ply", process=False)
     glb = trimesh.load(result / "mesh.glb", process=False)
+    obj = trimesh.load(result / "mesh.obj", process=False, maintain_order=True)
     [surface] = glb.geometry.values()
     assert 1000 < len(ply.faces) <= 2002 and len(surface.faces) == len(ply.faces)
     assert ply.area == pytest.approx(surface.area, rel=1e-4)
+    assert obj.area == pytest.approx(ply.area, rel=1e-4)
+    assert np.allclose(obj.bounds, ply.bounds, atol=1e-4)
     assert len(np.unique(ply.visual.vertex_colors, axis=0)) > 100
-    data = (result / "mesh.glb").read_bytes()
-    described = json.loads(data[20 : 20 + struct.unpack("<I", data[12:16])[0]])
-    [primitive] = described["meshes"][0]["primitives"]
-    assert primitive["mode"] == 4 and {"POSITION", "COLOR_0"} == set(primitive["attributes"])
+    texture = np.asarray(obj.visual.material.image)
+    assert np.array_equal(texture, np.asarray(surface.visual.material.baseColorTexture))
+    [primitive] = read_gltf(result / "mesh.glb")["meshes"][0]["primitives"]
+    assert primitive["mode"] == 4 and {"POSITION", "TEXCOORD_0"} == set(primitive["attributes"])
+    # trimesh flips v, so the texture coordinates of both files start at the lower left corner.
+    assert np.allclose(surface.visual.uv[surface.faces], obj.visual.uv[obj.faces], atol=1e-5)
+
+
+def test_mesh_command_without_texture(result: Path) -> None:
+    options = ["--set", "max_triangles=2000", "--set", "max_texture_size=0"]
+    (result / "mesh.obj").write_text("old")
+    done = CliRunner().invoke(build_app(), ["mesh", str(result), *options])
+    assert done.exit_code == 0, done.output
+    assert not (result / "mesh.obj").exists()
+    [primitive] = read_gltf(result / "mesh.glb")["meshes"][0]["primitives"]
+    assert {"POSITION", "COLOR_0"} == set(primitive["attributes"])
 
 
 def test_mesh_command_without_depth_maps_fails(result: Path) -> None:

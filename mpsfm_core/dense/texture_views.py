@@ -1,0 +1,215 @@
+"""Selection of the photo that textures each triangle of a mesh.
+
+The data term is the projected area of a triangle in pixels, and the smoothness term counts
+neighboring triangles with another photo [Waechter, Moehrle and Goesele, Let There Be Color, ECCV
+2014, whose data term also weights the image gradient]. The labels are optimized by iterated
+conditional modes, while the weight of the smoothness term increases. The data term is averaged over
+the neighborhood of a triangle first, so that the labels start with large connected regions.
+"""
+
+# mypy: allow-untyped-decorators
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from mpsfm_core.data import Bool, Float32, Float64, Int64
+from mpsfm_core.geometry import inside, project, sample_nearest, transform
+from mpsfm_core.geometry.rasterization import rasterize
+from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
+from mpsfm_core.support.jit import kernel
+
+NO_VIEW = -1
+"""Label of triangles that no photo observes."""
+_OCCLUSION_TOLERANCE_EDGES = 2.0
+"""Depth tolerance of the occlusion test, in median edge lengths of the mesh."""
+_MIN_COSINE = 0.1
+"""Minimum cosine of the angle between the normal of a triangle and the direction to the camera, as
+photos stretch steeper surfaces."""
+_SMOOTHNESS_STEPS = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 1.0, 1.0, 1.0)
+"""Weight of the smoothness term in each pass of the label optimization."""
+
+
+_NUM_DIFFUSIONS = 10
+"""Number of averages of the data term with the neighboring triangles."""
+
+
+class _Candidates(NamedTuple):
+    """Photos that observe each triangle, grouped by triangle."""
+
+    starts: Int64
+    """(m + 1,) index of the first candidate of each triangle."""
+    views: Int64
+    """(k,) index of the photo of each candidate."""
+    costs: Float32
+    """(k,) data term in [0, 1]: 0 for the photo with the largest projection of a triangle."""
+
+
+def select_texture_views(
+    vertices: Float64, triangles: Int64, images: Sequence[RegisteredImage]
+) -> Int64:
+    """Select the photo that textures each triangle, with few seams between photos.
+
+    Args:
+        vertices: (n, 3) positions, world frame.
+        triangles: (m, 3) vertex indices, counterclockwise as seen by the cameras.
+        images: Posed images with depth maps, whose sizes are those of the occlusion test.
+
+    Returns:
+        Index (m,) of the image of each triangle, or :data:`NO_VIEW` if no image observes it.
+    """
+    neighbors = find_neighbors(triangles)
+    starts, views, costs = _find_candidates(vertices, triangles, images)
+    for _ in range(_NUM_DIFFUSIONS):
+        costs = _diffuse_costs(starts, views, costs, neighbors)
+    labels = np.full(len(triangles), NO_VIEW, np.int64)
+    for smoothness in _SMOOTHNESS_STEPS:
+        if (
+            _update_labels(starts, views, costs, neighbors, smoothness, labels) == 0
+            and smoothness == 1.0
+        ):
+            break
+    return labels
+
+
+def find_neighbors(triangles: Int64) -> Int64:
+    """Find the triangles that share an edge.
+
+    If more than two triangles share an edge, an arbitrary pair of them are neighbors.
+
+    Args:
+        triangles: (m, 3) vertex indices.
+
+    Returns:
+        Triangle index (m, 3) of the neighbor at each edge, -1 at the border of the mesh. Edge k
+        connects vertices k and k + 1 of a triangle.
+    """
+    edges = np.sort(np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2), axis=2)
+    flat = edges.reshape(-1, 2)
+    order = np.lexsort(flat.T)
+    same = (flat[order[1:]] == flat[order[:-1]]).all(axis=1)
+    # An edge of three triangles makes two consecutive pairs, of which the second is left out.
+    same[1:] &= ~same[:-1]
+    first, second = order[:-1][same], order[1:][same]
+    neighbors = np.full(len(flat), -1, np.int64)
+    neighbors[first], neighbors[second] = second // 3, first // 3
+    return neighbors.reshape(-1, 3)
+
+
+def _find_candidates(
+    vertices: Float64, triangles: Int64, images: Sequence[RegisteredImage]
+) -> _Candidates:
+    edges = vertices[triangles] - vertices[np.roll(triangles, 1, axis=1)]
+    length = float(np.median(np.linalg.norm(edges, axis=2)))
+    world_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
+    faces, views, areas = [], [], []
+    for index, image in enumerate(images):
+        projected = _projected_areas(image, vertices, triangles, world_area, length)
+        seen = np.flatnonzero(projected > 0)
+        faces.append(seen)
+        views.append(np.full(len(seen), index))
+        areas.append(projected[seen])
+    face, view, area = (np.concatenate(parts) for parts in (faces, views, areas))
+    order = np.argsort(face, kind="stable")
+    face, view, area = face[order], view[order], area[order]
+    largest = np.zeros(len(triangles))
+    np.maximum.at(largest, face, area)
+    starts = np.concatenate([[0], np.cumsum(np.bincount(face, minlength=len(triangles)))])
+    return _Candidates(starts, view, (1 - area / largest[face]).astype(np.float32))
+
+
+def _projected_areas(
+    image: RegisteredImage,
+    vertices: Float64,
+    triangles: Int64,
+    world_area: Float64,
+    edge_length: float,
+) -> Float64:
+    """Compute the area (m,) of each triangle in pixels of an image, 0 if it is not visible."""
+    local = transform(image.rotation, image.translation, vertices)
+    xy = project(image.camera, local)
+    visible = _find_visible(image, local, triangles, xy, edge_length)
+    a, b, c = (xy[triangles[:, k]] for k in range(3))
+    # In images, whose y axis points down, triangles that face the camera are clockwise.
+    area = ((c - a)[:, 0] * (b - a)[:, 1] - (c - a)[:, 1] * (b - a)[:, 0]) / 2
+    depth = local[triangles, 2].mean(axis=1)
+    frontal = world_area * image.camera.fx * image.camera.fy / np.maximum(depth, 1e-12) ** 2
+    usable = visible[triangles].all(axis=1) & (area > _MIN_COSINE * frontal)
+    projected: Float64 = np.where(usable, area, 0.0)
+    return projected
+
+
+def _find_visible(
+    image: RegisteredImage, local: Float64, triangles: Int64, xy: Float64, edge_length: float
+) -> Bool:
+    """Return the mask (n,) of the vertices that no triangle occludes and the image contains."""
+    height, width = image.depth.shape
+    camera = image.camera.resized(width, height)
+    no_attributes = np.zeros((len(local), 0), np.float32)
+    nearest, _ = rasterize(local, no_attributes, triangles, camera.params, camera.size)
+    visible: Bool = inside(xy, image.camera.size) & (local[:, 2] > 0)
+    rows = np.flatnonzero(visible)
+    scaled = xy[rows] * (width / image.camera.width, height / image.camera.height)
+    tolerance = _OCCLUSION_TOLERANCE_EDGES * edge_length
+    visible[rows] = local[rows, 2] <= sample_nearest(nearest, scaled) + tolerance
+    return visible
+
+
+@kernel()
+def _diffuse_costs(starts: Int64, views: Int64, costs: Float32, neighbors: Int64) -> Float32:
+    """Average the cost of each candidate with the costs of its photo in neighboring triangles."""
+    averages = np.empty_like(costs)
+    for face in range(len(neighbors)):
+        for k in range(starts[face], starts[face + 1]):
+            total, count = costs[k], 1
+            for edge in range(3):
+                other = neighbors[face, edge]
+                if other < 0 or starts[other] == starts[other + 1]:
+                    continue
+                count += 1
+                cost = np.float32(1.0)  # The cost of a photo that does not observe the neighbor.
+                for other_k in range(starts[other], starts[other + 1]):
+                    if views[other_k] == views[k]:
+                        cost = costs[other_k]
+                total += cost
+            averages[k] = total / count
+    return averages
+
+
+@kernel()
+def _update_labels(
+    starts: Int64,
+    views: Int64,
+    costs: Float32,
+    neighbors: Int64,
+    smoothness: float,
+    labels: Int64,
+) -> int:
+    """Set each label to the candidate of least cost given the neighbors; count the changes.
+
+    A triangle without candidates between two triangles of one photo gets the label of that photo,
+    which contains all its vertices.
+    """
+    changes = 0
+    for face in range(len(labels)):
+        best, best_cost = labels[face], np.inf
+        if starts[face] == starts[face + 1]:
+            for edge in range(3):
+                one, other = neighbors[face, edge], neighbors[face, edge - 1]
+                if one >= 0 and other >= 0 and labels[one] == labels[other]:
+                    best = labels[one]
+        for k in range(starts[face], starts[face + 1]):
+            cost = float(costs[k])
+            for edge in range(3):
+                other = neighbors[face, edge]
+                if other >= 0 and labels[other] >= 0 and labels[other] != views[k]:
+                    cost += smoothness
+            if cost < best_cost:
+                best, best_cost = views[k], cost
+        if best != labels[face]:
+            labels[face] = best
+            changes += 1
+    return changes
