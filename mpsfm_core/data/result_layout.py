@@ -23,9 +23,15 @@ DENSE = "dense.ply"
 """Fused depth maps."""
 DEPTH = "depth"
 """Refined depth maps of the images, ``NAME.npz``."""
-MESH = ("mesh.ply", "mesh.glb", "mesh.obj", "mesh.mtl", "mesh.jpg")
-"""Surface mesh, which ``mpsfm mesh`` extracts from the depth maps: vertex colors as PLY, and a
-texture as GLB and as OBJ with material and image."""
+MESH_PLY = "mesh.ply"
+"""Surface mesh with vertex colors, which ``mpsfm mesh`` extracts from the depth maps."""
+MESH_GLB = "mesh.glb"
+"""The same mesh with a texture in the upright frame, y up."""
+MESH_OBJ = "mesh.obj"
+"""The same mesh with a texture in the world frame; the texture is in ``mesh.mtl`` and
+``mesh.jpg``."""
+MESH = (MESH_PLY, MESH_GLB, MESH_OBJ, "mesh.mtl", "mesh.jpg")
+"""All files of a mesh."""
 TRANSFORMS = "transforms.json"
 """Cameras and poses in the format of nerfstudio."""
 TRAJECTORY = "trajectory.txt"

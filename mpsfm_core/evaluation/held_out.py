@@ -14,12 +14,13 @@ import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, Pose, View
 from mpsfm_core.data.errors import InputError, did_you_mean
-from mpsfm_core.data.result_layout import DENSE, DEPTH, MESH
+from mpsfm_core.data.result_layout import DENSE, DEPTH, MESH_OBJ, MESH_PLY
 from mpsfm_core.evaluation.rendering import Geometry, Rendering, render, splat_radii
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.exports.source import ExportSource
+from mpsfm_core.results.obj import read_obj
 from mpsfm_core.results.ply import read_mesh
 
 _MAX_SIZE = 640
@@ -43,8 +44,8 @@ def evaluate_held_out(
         photos: Folder of the photos; default: the folder that the run recorded.
         names: Names of the photos to render; default: the held-out images of the run
             (``dense.hold_out_every``), else all images.
-        geometry: PLY file of a cloud or mesh in the frame of the model; default: ``dense.ply`` and
-            ``mesh.ply`` of the result folder.
+        geometry: PLY file of a cloud or mesh, or OBJ file of a textured mesh, in the frame of the
+            model; default: ``dense.ply``, ``mesh.ply`` and ``mesh.obj`` of the result folder.
 
     Returns:
         Plain data for JSON. ``independent`` is True if no rendered photo contributed to the
@@ -61,10 +62,12 @@ def evaluate_held_out(
     source = ExportSource.read(model, photos)
     recorded = source.held_out
     names = _select_names(source, recorded, names)
-    files = [geometry] if geometry else [model / DENSE, model / MESH[0]]
+    files = [geometry] if geometry else [model / name for name in (DENSE, MESH_PLY, MESH_OBJ)]
     files = [path for path in files if path == geometry or path.is_file()]
     if not files:
-        raise InputError(f"{model}: no dense.ply or mesh.ply; name a PLY file with --geometry")
+        raise InputError(
+            f"{model}: no dense.ply or mesh.ply; name a PLY or OBJ file with --geometry"
+        )
     independent = set(names) <= set(recorded) if recorded and geometry is None else None
     poses = reconstruction_poses(source.model)
     views = dict(zip(names, map(_resized, _views(source, names)), strict=True))
@@ -80,12 +83,17 @@ def evaluate_held_out(
 
 
 def read_geometry(path: Path) -> Geometry:
-    """Read a point cloud or mesh with colors from a PLY file.
+    """Read a colored point cloud or mesh (PLY), or a textured mesh (OBJ).
 
     Raises:
-        InputError: The file is not a PLY file, is damaged or has no points.
+        InputError: The file is not a PLY or OBJ file, is damaged or has no points.
     """
-    geometry = Geometry(*read_mesh(path))
+    if path.suffix.lower() == ".obj":
+        mesh = read_obj(path)
+        gray = np.full((len(mesh.vertices), 3), 128, np.uint8)
+        geometry = Geometry(mesh.vertices, gray, mesh.triangles, mesh.uv, mesh.texture)
+    else:
+        geometry = Geometry(*read_mesh(path))
     if not len(geometry.points):
         raise InputError(f"{path}: the file has no points to render")
     return geometry

@@ -7,6 +7,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -30,6 +31,10 @@ class Geometry(NamedTuple):
     """(n, 3) uint8 RGB colors of the vertices or points."""
     triangles: Int64
     """(m, 3) int64 vertex indices of the triangles; (0, 3) for a point cloud."""
+    uv: Float32 | None = None
+    """(n, 2) float32 texture coordinates of a mesh in [0, 1] from the upper left corner."""
+    texture: UInt8 | None = None
+    """(h, w, 3) uint8 RGB texture of a mesh, which is rendered instead of the vertex colors."""
 
 
 class Rendering(NamedTuple):
@@ -67,8 +72,9 @@ def render(
 ) -> Rendering:
     """Render a mesh or point cloud with a z-buffer.
 
-    Triangles are filled with perspective-correct interpolation of the vertex colors. A point is a
-    square parallel to the image, and overlapping squares of one surface are blended.
+    Triangles are filled with perspective-correct interpolation of the texture coordinates or vertex
+    colors. A point is a square parallel to the image, and overlapping squares of one surface are
+    blended.
 
     Args:
         geometry: Triangle mesh, or point cloud if there are no triangles.
@@ -79,14 +85,37 @@ def render(
     """
     local = transform(*pose, geometry.points)
     if len(geometry.triangles):
-        colors = geometry.colors.astype(np.float32)
-        depth, colors = rasterize(local, colors, geometry.triangles, camera.params, camera.size)
-        return Rendering(colors, depth)
+        values = geometry.colors.astype(np.float32) if geometry.uv is None else geometry.uv
+        depth, values = rasterize(local, values, geometry.triangles, camera.params, camera.size)
+        if geometry.uv is not None:
+            values = _sample_texture(geometry.texture, values, np.isfinite(depth))
+        return Rendering(values, depth)
     depth = np.full((camera.height, camera.width), np.inf, np.float32)
     colors = np.zeros((camera.height, camera.width, 3), np.float32)
     radii = splat_radii(geometry.points) if radii is None else radii
     _splat_points(local, geometry.colors, radii, camera.params, depth, colors)
     return Rendering(colors, depth)
+
+
+def _sample_texture(texture: UInt8 | None, uv: Float32, covered: Bool) -> Float32:
+    """Sample a texture at the texture coordinates (h, w, 2) of the covered pixels, else 0.
+
+    The texture is reduced to the resolution of the rendered image first, like a mipmap.
+    """
+    assert texture is not None
+    height, width = texture.shape[:2]
+    steps = [
+        np.abs(np.diff(uv[..., axis], axis=1))[covered[:, 1:] & covered[:, :-1]] for axis in (0, 1)
+    ]
+    step = np.median(np.hypot(steps[0] * width, steps[1] * height)) if steps[0].size else 1.0
+    factor = 1 / max(1.0, float(step))
+    small = cv2.resize(texture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    xy = uv * np.array(small.shape[1::-1], np.float32) - np.float32(0.5)
+    colors = cv2.remap(
+        small, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    sampled: Float32 = np.where(covered[..., None], colors, 0).astype(np.float32)
+    return sampled
 
 
 @kernel()

@@ -69,6 +69,20 @@ def test_vertex_colors_are_interpolated_with_perspective() -> None:
     np.testing.assert_allclose(rendering.colors[50, covered, 0], expected, atol=1e-2)
 
 
+def test_texture_is_sampled_with_perspective() -> None:
+    points = np.array([(-1.0, -1, 2), (1, -1, 6), (1, 1, 6), (-1, 1, 2)])
+    uv = np.array([(0, 0), (1, 0), (1, 1), (0, 1)], np.float32)
+    ramp = np.repeat(np.arange(200, dtype=np.uint8)[None, :, None], 3, axis=2).repeat(50, axis=0)
+    camera = PinholeCamera(101, 101, 100.0, 100.0, 50.5, 50.5)
+    gray = np.zeros((4, 3), np.uint8)
+    square = Geometry(points, gray, np.array([(0, 1, 2), (0, 2, 3)]), uv, ramp)
+    rendering = render(square, camera, IDENTITY)
+    covered = rendering.covered[50]
+    pixels = pixel_centers(101, 101)[50, covered]
+    x = unproject(camera, pixels, rendering.depth[50, covered])[:, 0]
+    np.testing.assert_allclose(rendering.colors[50, covered, 0], 100 * (x + 1) - 0.5, atol=2.5)
+
+
 def test_nearest_point_covers_a_square() -> None:
     points = np.array([(0.0, 0, 2), (0, 0, 4)])
     colors = np.array([(9, 8, 7), (1, 2, 3)], np.uint8)

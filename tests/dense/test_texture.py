@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from mpsfm_core.dense.texture_views import NO_VIEW, find_neighbors, select_textu
 from mpsfm_core.geometry import sample_nearest, transform
 from mpsfm_core.geometry.rasterization import rasterize
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.results.obj import read_obj, write_obj
 
 from .conftest import CAMERA, Room
 
@@ -145,3 +147,44 @@ def test_texture_that_is_too_small_is_an_error(
 ) -> None:
     with pytest.raises(InputError, match="max_texture_size"):
         build_texture(mesh, exact, room.views.__getitem__, 16)
+
+
+def test_obj_is_read_as_written(tmp_path: Path) -> None:
+    vertices = np.concatenate([_square(2, 0.5), _square(3, 0.5)])
+    triangles = np.array([[0, 1, 2], [4, 5, 6]])
+    uv = np.random.default_rng(0).uniform(size=(8, 2)).astype(np.float32)
+    picture = np.full((20, 30, 3), (200, 100, 50), np.uint8)
+    write_obj(tmp_path / "a.obj", TexturedMesh(vertices, triangles, uv, picture))
+    mesh = read_obj(tmp_path / "a.obj")
+    assert np.allclose(mesh.vertices[mesh.triangles], vertices[triangles])
+    assert np.allclose(mesh.uv[mesh.triangles], uv[triangles], atol=1e-6)
+    assert np.abs(mesh.texture.astype(int) - picture).max() < 4
+
+
+def test_obj_with_quads_and_negative_indices_is_read(tmp_path: Path) -> None:
+    cv2.imwrite(str(tmp_path / "t.png"), np.zeros((4, 4, 3), np.uint8))
+    (tmp_path / "m.mtl").write_text("newmtl a\nmap_Kd t.png\n")
+    text = "mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nvt 0 0\nvt 1 0\n"
+    (tmp_path / "a.obj").write_text(f"{text}usemtl a\nf 1/1/1 2/2/1 3/-1/1 -1/1/1\n")
+    mesh = read_obj(tmp_path / "a.obj")
+    corners = mesh.vertices[mesh.triangles]
+    assert corners.tolist() == [
+        [[0, 0, 0], [1, 0, 0], [1, 1, 0]],
+        [[0, 0, 0], [1, 1, 0], [0, 1, 0]],
+    ]
+    assert mesh.uv[mesh.triangles][0].tolist() == [[0, 1], [1, 1], [1, 1]]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("v 0 0 0\n", "has no faces"),
+        ("v 0 0 0\nf 1 1 1\n", "not an OBJ file with texture coordinates"),
+        ("v 0 0 0\nvt 0 0\nf 1/1 2/1 1/1\n", "without vertex"),
+        ("mtllib no.mtl\nv 0 0 0\nvt 0 0\nf 1/1 1/1 1/1\n", "no.mtl: No such file"),
+    ],
+)
+def test_wrong_obj_is_an_error(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "a.obj").write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_obj(tmp_path / "a.obj")
