@@ -188,14 +188,18 @@ def _providers(summary: Mapping[str, Any]) -> Iterator[Finding]:
             )
 
 
-def describe_scale(summary: Mapping[str, Any]) -> tuple[str, str]:
-    """Describe the unit of the first reconstruction, and where its scale comes from.
+def describe_scale(summary: Mapping[str, Any], component: int = 0) -> tuple[str, str]:
+    """Describe the unit of a reconstruction, and where its scale comes from.
 
     Depth maps of a network that agree with each other do not prove the metric scale, because the
     network may not know the kind of scene. The description of the scale therefore names the source,
     such as a network or GPS.
+
+    Args:
+        summary: Content of ``summary.json``.
+        component: Index of the reconstruction, 0 for the largest.
     """
-    metric = summary["reconstructions"][0]["metric_scale"]
+    metric = summary["reconstructions"][component]["metric_scale"]
     if metric is None:
         return "unknown", "no depth is metric"
     source = f"{metric['num_images']} {metric['by']}, spread {metric['spread']:.0%}"

@@ -121,7 +121,7 @@ def _payload(result: ResultFolder) -> dict[str, Any]:
         },
         "up": _estimate_up(refined_maps),
         "reconstructions": summary["reconstructions"],
-        "scale": describe_scale(summary) if summary["reconstructions"] else None,
+        "scales": [describe_scale(summary, i) for i in range(len(summary["reconstructions"]))],
         "providers": summary["providers"],
         "stages": {name: stage["seconds"] for name, stage in summary["stages"].items()},
         "steps": {name: step["seconds"] for name, step in summary["mapping_steps"].items()},

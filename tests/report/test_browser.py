@@ -88,7 +88,7 @@ def test_report_renders_without_network_requests(opened: Open, finished: Path) -
 def test_first_screen_shows_unregistered_photos_and_remedies(opened: Open, finished: Path) -> None:
     browser = opened(finished)
     assert wait_for(browser, "document.getElementById('badge').innerText").lower() == "partial"
-    assert "1 photo missing: nothing in common with another photo" in browser.execute_script(
+    assert "1 photo missing: no verified matches" in browser.execute_script(
         "return document.querySelector('.finding.warning h3').innerText"
     )
     assert browser.execute_script(f"return {LOWEST_ADVICE}") < SCREEN

@@ -54,7 +54,7 @@
         ["Points", number(best.points), `seen by ${number(best.mean_track_length, 1)} photos each`],
         ["Reprojection error", best.mean_reprojection_error_px === null ? "–" : `${number(best.mean_reprojection_error_px, 2)} px`, "mean"],
         ["Refined depth std", percent(best.median_relative_depth_std, 1), "median, relative to depth"],
-        ["Scale", ...data.scale],
+        ["Scale", ...data.scales[0]],
       );
     }
     tiles.push(["Time", time(total), data.memory_mb ? `${number(data.memory_mb / 1024, 1)} GB memory at most` : null]);
@@ -406,9 +406,8 @@
     const lines = [...focals].slice(0, 12).map(([text, count]) => `Focal length ${text} (${plural(count, "photo")})`);
     if (focals.size > 12) lines.push(`and ${focals.size - 12} further focal lengths`);
     data.reconstructions.forEach((best, index) => {
-      const metric = best.metric_scale;
-      const unit = metric === null ? "the unit is unknown: no depth is metric" : metric.trusted ? `in metres, ${scaleDetail(metric)}` : `one unit is about ${number(metric.metres_per_unit, 3)} m, ${scaleDetail(metric)}; not trusted`;
-      lines.push(`${index ? `Reconstruction components/${index}` : "Reconstruction"}: ${plural(best.images, "photo")}, ${plural(best.points, "point")}, ${unit}`);
+      const [unit, source] = data.scales[index];
+      lines.push(`${index ? `Reconstruction components/${index}` : "Reconstruction"}: ${plural(best.images, "photo")}, ${plural(best.points, "point")}, scale: ${unit} (${source})`);
     });
     byId("cameras").append(...lines.map((text) => el("li", {}, text)));
     byId("config").textContent = data.config;
@@ -572,13 +571,24 @@
       draw();
     };
 
+    // An overview: from the side of the cameras and above, at the distance at which 95 % of the points
+    // and all cameras are visible. Far points do not count.
     function reset() {
       const mean = centers.reduce((sum, p) => sum.add(p), new THREE.Vector3()).divideScalar(centers.length);
       const back = mean.clone().sub(target);
-      if (back.length() < 1e-3 * radius) back.copy(new THREE.Vector3(1, 0.3, 0.2)).multiplyScalar(radius);
-      back.normalize().addScaledVector(up, 0.5).normalize();
-      const far = centers.map((p) => p.distanceTo(target)).sort((x, y) => x - y)[Math.floor(0.9 * (centers.length - 1))];
-      camera.position.copy(target).addScaledVector(back, Math.max(2 * radius, 1.9 * far));
+      back.addScaledVector(up, -back.dot(up));
+      if (back.length() < 1e-3 * radius) back.copy(new THREE.Vector3(1, 0.3, 0.2)).addScaledVector(up, -up.dot(new THREE.Vector3(1, 0.3, 0.2)));
+      back.normalize().addScaledVector(up, 0.8).normalize();
+      const right = new THREE.Vector3().crossVectors(up, back).normalize();
+      const above = new THREE.Vector3().crossVectors(back, right);
+      const vertical = Math.tan((camera.fov * Math.PI) / 360);
+      const distance = (p) => {
+        const local = p.clone().sub(target);
+        return local.dot(back) + Math.max(Math.abs(local.dot(above)) / vertical, Math.abs(local.dot(right)) / (vertical * camera.aspect));
+      };
+      const far = all.map(distance).sort((x, y) => x - y)[Math.floor(0.95 * (all.length - 1))];
+      const needed = Math.max(far, ...centers.map((p) => distance(p) + 2 * frustum));
+      camera.position.copy(target).addScaledVector(back, 1.05 * needed);
       controls.target.copy(target);
       controls.update();
       draw();
@@ -655,8 +665,8 @@
     new ResizeObserver(fit).observe(canvas.parentElement);
     themes.push(background);
     background();
-    reset();
     fit();
+    reset();
     // For tests and for the curious: where the base of a camera's frustum is on the screen.
     window.report = {
       screenOf: (row) => {
