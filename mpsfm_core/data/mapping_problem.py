@@ -57,6 +57,9 @@ class MappingImage:
     were removed from the undistorted view.
 
     Bundle adjustment refines the distortion together with a guessed focal length."""
+    initial_distortion: Distortion | None = None
+    """Distortion coefficients of a guessed camera with which the mapper starts (None means
+    :attr:`distortion`). The keypoints are not undistorted with them."""
     known_pose: Pose | None = None
     """Known camera pose ``cam_from_world`` that the user provides, or None."""
     depth_group: int | None = None
@@ -98,16 +101,30 @@ class MappingImage:
         if self.camera_model.is_fisheye:
             return self
         ratio = camera.fx / self.camera.fx
-        k1, k2, p1, p2 = self.distortion
-        distortion = k1 * ratio**2, k2 * ratio**4, p1 * ratio, p2 * ratio
+        initial = self.initial_distortion
         return replace(
-            self, camera=camera, focal_guess_px=self.focal_prior_px, distortion=distortion
+            self,
+            camera=camera,
+            focal_guess_px=self.focal_prior_px,
+            distortion=_scale_distortion(self.distortion, ratio),
+            initial_distortion=initial and _scale_distortion(initial, ratio),
         )
 
     @property
     def focal_prior_px(self) -> float:
         """Prior mean of ``fx`` in pixels of the undistorted view."""
         return self.camera.fx if self.focal_guess_px is None else self.focal_guess_px
+
+
+def _scale_distortion(distortion: Distortion, ratio: float) -> Distortion:
+    """Return the OPENCV coefficients of the same distortion in pixels at another focal length.
+
+    Args:
+        distortion: Coefficients k1, k2, p1, p2.
+        ratio: Ratio of new to old focal length.
+    """
+    k1, k2, p1, p2 = distortion
+    return k1 * ratio**2, k2 * ratio**4, p1 * ratio, p2 * ratio
 
 
 @dataclass(frozen=True, eq=False)

@@ -74,7 +74,7 @@ def reconstruct(
 ) -> MappingResult:
     """Reconstruct poses, points and refined depth of all images that can be verified.
 
-    Guessed focal lengths that the relative poses of image pairs contradict are replaced first. If
+    Guessed focal lengths and distortion that image pairs contradict are replaced first. If
     many matches observe no common 3D point, the mapper runs again with other random seeds. If
     guessed focal lengths were far off, the mapper runs again with the refined focal lengths. The
     run with the most matches that observe common 3D points is kept. The same problem, options and
@@ -95,8 +95,7 @@ def reconstruct(
     is_complete = bool(runs) and interrupted is None
     pair_weights = None
     distinct = remove_duplicates(problem, options)
-    refine_focal = options.refinement.refine_focal
-    initial_problem = calibrate_view_graph(distinct, options.seed) if refine_focal else distinct
+    initial_problem = _calibrate_view_graph(distinct, options)
     for run in runs:  # completed mapper runs, oldest first
         initial_problem = _apply_refined_focals(initial_problem, run, options) or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):
@@ -129,6 +128,16 @@ def reconstruct(
         models = [register_duplicates(model, problem, max_error_px) for model in models]
         report = replace(report, image_reasons=report_duplicates(report, models, problem))
     return MappingResult(tuple(models), report)
+
+
+def _calibrate_view_graph(problem: MappingProblem, options: MapperOptions) -> MappingProblem:
+    """Return the problem with guessed cameras that are estimated from image pairs."""
+    refinement = options.refinement
+    if not refinement.refine_focal:
+        return problem
+    return calibrate_view_graph(
+        problem, options.seed, refine_distortion=refinement.refine_distortion
+    )
 
 
 def _apply_refined_focals(

@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Bool, MappingImage, MappingProblem, VerifiedPair
-from mpsfm_core.data.camera_models import IntrinsicParameter
+from mpsfm_core.data import Bool, Float64, Int64, MappingImage, MappingProblem, VerifiedPair
+from mpsfm_core.data.camera_models import IntrinsicParameter, to_distortion
+from mpsfm_core.geometry.distortion import change_distortion
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.mapping.initialization.camera_splitting import (
     find_deviating_focals,
@@ -61,20 +62,28 @@ def apply_refined_focal_lengths(
 def _apply_shared_focals(
     problem: MappingProblem, model: Reconstruction
 ) -> tuple[MappingImage, ...]:
-    """Return the images with focal lengths that refinement changed by ``MIN_FOCAL_CHANGE``."""
-    cameras = {
-        problem.images[image.index].shared_camera: image.camera
+    """Return the images with focal lengths that refinement changed by ``MIN_FOCAL_CHANGE``.
+
+    An image with a changed focal length also takes the refined distortion of its camera.
+    """
+    refined = {
+        problem.images[image.index].shared_camera: image
         for image in model.images
         if image.calibration[IntrinsicParameter.FOCAL_LENGTH].is_refined
         and abs(np.log(image.camera.fx / problem.images[image.index].camera.fx))
         >= np.log(MIN_FOCAL_CHANGE)
     }
-    return tuple(
-        image
-        if image.focal_known or image.shared_camera not in cameras
-        else image.with_camera(cameras[image.shared_camera])
-        for image in problem.images
-    )
+    images = []
+    for image in problem.images:
+        source = refined.get(image.shared_camera)
+        if image.focal_known or source is None:
+            images.append(image)
+            continue
+        changed = image.with_camera(source.camera)
+        if not image.camera_model.is_fisheye:
+            changed = replace(changed, initial_distortion=to_distortion(source.distortion))
+        images.append(changed)
+    return tuple(images)
 
 
 def estimate_relative_poses(problem: MappingProblem, changed: Bool, seed: int) -> MappingProblem:
@@ -98,8 +107,8 @@ def _estimate_relative_pose(problem: MappingProblem, pair: VerifiedPair, seed: i
     """Return a pair with a new relative pose if RANSAC finds an essential matrix."""
     image_a, image_b = problem.images[pair.image_a], problem.images[pair.image_b]
     result = pycolmap.estimate_essential_matrix(
-        image_a.keypoints[pair.matches[:, 0]],
-        image_b.keypoints[pair.matches[:, 1]],
+        _undistort_keypoints(image_a, pair.matches[:, 0]),
+        _undistort_keypoints(image_b, pair.matches[:, 1]),
         colmap_from_pinhole(image_a.camera),
         colmap_from_pinhole(image_b.camera),
         pycolmap.RANSACOptions(
@@ -113,3 +122,12 @@ def _estimate_relative_pose(problem: MappingProblem, pair: VerifiedPair, seed: i
     pose = result["cam2_from_cam1"]
     rotation = np.array(pose.rotation.matrix(), order="C")
     return replace(pair, rotation=rotation, translation=np.array(pose.translation))
+
+
+def _undistort_keypoints(image: MappingImage, rows: Int64) -> Float64:
+    """Return the keypoints (m, 2) of some rows without the initial distortion of the image."""
+    xy = image.keypoints[rows]
+    if image.initial_distortion is None:
+        return xy
+    old = image.camera, image.distortion
+    return change_distortion(xy, old, (image.camera, image.initial_distortion))

@@ -1,4 +1,4 @@
-"""Estimation of guessed focal lengths from the verified matches of all image pairs.
+"""Estimation of guessed focal lengths and radial distortion from matches of image pairs.
 
 The relative pose of two images with one known camera has five parameters, but their fundamental
 matrix has seven. Therefore the matches of an image pair constrain a focal length that both images
@@ -8,13 +8,15 @@ are refined to the smallest robust Sampson errors. The sum over the pairs is the
 of the focal length. The lens of each pair has a shift of the principal point and a radial
 distortion with zero-mean priors, because both would bias the focal length. In contrast to focal
 lengths from fundamental matrices, the likelihood is flat for critical motions, and needs no
-selection of pairs.
+selection of pairs. The profile likelihood of a radial distortion that all pairs share follows in
+the same way. Without distortion, relative poses of pairs with small overlap would be wrong by many
+degrees, because such pairs match at the image borders.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -27,7 +29,7 @@ from mpsfm_core.mapping.initialization.refined_focal_lengths import (
     estimate_relative_poses,
 )
 from mpsfm_core.mapping.refinement.self_calibration import PRINCIPAL_POINT_PRIOR_STD
-from mpsfm_core.mapping.registration.pose_hypotheses import FOCAL_STEP, sample_focal_lengths
+from mpsfm_core.mapping.registration.pose_hypotheses import sample_focal_lengths
 
 MAX_PAIRS, MAX_MATCHES = 20, 100
 """Number of image pairs with most matches, and approximate number of matches of each pair, that
@@ -48,6 +50,11 @@ MIN_NOISE_PX = 0.5
 DIVISION_PRIOR_STD = 0.1
 """Standard deviation of the zero-mean prior on the coefficient of the division model, for radii in
 half image diagonals. [ours]"""
+DIVISIONS = np.linspace(-0.3, 0.3, 21)
+"""Coefficients of the division model to try. [ours]"""
+CONVERSION_RADIUS = 0.8
+"""Radius in half image diagonals at which the division model is converted to SIMPLE_RADIAL. [ours]
+"""
 MIN_DIVISOR = 0.3
 """Smallest divisor of the division model, which prevents infinite offsets. [ours]"""
 NUM_PARAMETERS = 6
@@ -60,16 +67,28 @@ MIN_DECREASE = 1e-3
 """Relative decrease of the cost of a pair below which its relative pose has converged."""
 
 
-def calibrate_view_graph(problem: MappingProblem, seed: int) -> MappingProblem:
-    """Return the problem with guessed focal lengths that are estimated from image pairs.
+class LensEstimate(NamedTuple):
+    """Focal length and radial distortion that the images of a camera share."""
 
-    A camera takes the estimate if the focal length changes by a factor of ``MIN_FOCAL_CHANGE`` or
-    more. The priors on focal lengths stay the same, because bundle adjustment uses the same
-    matches. Fisheye cameras keep their guess.
+    focal_px: float
+    """Focal length ``fx`` in pixels."""
+    k1: float
+    """Coefficient of SIMPLE_RADIAL."""
+
+
+def calibrate_view_graph(
+    problem: MappingProblem, seed: int, *, refine_distortion: bool = True
+) -> MappingProblem:
+    """Return the problem with guessed cameras that are estimated from image pairs.
+
+    A camera takes the estimated focal length if the focal length changes by a factor of
+    ``MIN_FOCAL_CHANGE`` or more. The priors on focal length and distortion stay the same, because
+    bundle adjustment uses the same matches. Fisheye cameras keep their guess.
 
     Args:
-        problem: Mapping problem with guessed focal lengths.
-        seed: Seed of RANSAC for the relative poses of images with a changed focal length.
+        problem: Mapping problem with guessed cameras.
+        seed: Seed of RANSAC for the relative poses of images with a changed camera.
+        refine_distortion: Estimate the distortion of cameras whose model has distortion.
     """
     pairs_of_camera = defaultdict(list)
     for pair in problem.pairs:
@@ -77,60 +96,148 @@ def calibrate_view_graph(problem: MappingProblem, seed: int) -> MappingProblem:
         is_guessed = not (image_a.focal_known or image_a.camera_model.is_fisheye)
         if is_guessed and image_a.shared_camera == image_b.shared_camera:
             pairs_of_camera[image_a.shared_camera].append(pair)
-    cameras = {}
-    for shared_camera, pairs in pairs_of_camera.items():
-        camera = shared_camera[1]
-        ratio = estimate_shared_focal(problem, pairs) / camera.fx
-        if abs(np.log(ratio)) >= np.log(MIN_FOCAL_CHANGE):
-            cameras[shared_camera] = replace(camera, fx=camera.fx * ratio, fy=camera.fy * ratio)
-    if not cameras:
-        return problem
-    is_changed = np.array(
-        [not i.focal_known and i.shared_camera in cameras for i in problem.images]
-    )
+    lenses = {
+        shared_camera: estimate_shared_lens(problem, pairs, refine_distortion=refine_distortion)
+        for shared_camera, pairs in pairs_of_camera.items()
+    }
     images = tuple(
-        image.with_camera(cameras[image.shared_camera]) if changed else image
-        for image, changed in zip(problem.images, is_changed, strict=True)
+        image if image.focal_known else _apply_lens(image, lenses.get(image.shared_camera))
+        for image in problem.images
     )
-    return estimate_relative_poses(replace(problem, images=images), is_changed, seed)
+    is_changed = [new is not old for new, old in zip(images, problem.images, strict=True)]
+    if not any(is_changed):
+        return problem
+    return estimate_relative_poses(replace(problem, images=images), np.array(is_changed), seed)
 
 
-def estimate_shared_focal(problem: MappingProblem, pairs: Sequence[VerifiedPair]) -> float:
-    """Estimate the guessed focal length that the images of all given pairs share.
+def _apply_lens(image: MappingImage, lens: LensEstimate | None) -> MappingImage:
+    """Return the image with an estimated focal length and distortion that differ from the guess."""
+    if lens is None:
+        return image
+    camera = image.camera
+    ratio = lens.focal_px / camera.fx
+    if abs(np.log(ratio)) >= np.log(MIN_FOCAL_CHANGE):
+        image = image.with_camera(replace(camera, fx=camera.fx * ratio, fy=camera.fy * ratio))
+    k1 = lens.k1 * (image.camera.fx / lens.focal_px) ** 2
+    return replace(image, initial_distortion=(k1, 0.0, 0.0, 0.0)) if k1 else image
+
+
+def estimate_shared_lens(
+    problem: MappingProblem, pairs: Sequence[VerifiedPair], *, refine_distortion: bool = True
+) -> LensEstimate:
+    """Estimate the guessed focal length and distortion that the images of all pairs share.
 
     Args:
         problem: Mapping problem with verified relative poses.
         pairs: Image pairs of one camera; the ``MAX_PAIRS`` pairs with most matches are used.
+        refine_distortion: Estimate the distortion if the camera model has distortion.
 
     Returns:
-        Maximum of the posterior of the focal length, as ``fx`` in pixels, or the guessed focal
-        length if the evidence against the guess is below ``MIN_EVIDENCE``.
+        Maxima of the posteriors of focal length and distortion. A guess whose log-posterior is
+        smaller by less than ``MIN_EVIDENCE`` is kept.
     """
     pairs = sorted(pairs, key=lambda pair: -len(pair.matches))[:MAX_PAIRS]
     image = problem.images[pairs[0].image_a]
     matches = _collect_matches(problem, pairs)
-    poses = _RelativePoses.of(pairs)
-    coarse = sample_focal_lengths(image)
-    start = int(np.argmin(np.abs(np.log(coarse / image.camera.fx))))
-    costs = np.full((len(coarse), len(pairs)), np.inf)
-    solutions = [poses] * len(coarse)
-    # A pose follows the focal length to the next one. Both directions avoid local minima.
-    for order in (range(start, -1, -1), range(len(coarse)), range(len(coarse) - 1, -1, -1)):
+    log_focals = np.log(sample_focal_lengths(image))
+    log_guess = float(np.log(image.camera.fx))
+    log_focal, poses = _maximize_posterior(
+        _Profile(log_focals, float(np.log(image.focal_prior_px)), image.focal_log_std),
+        int(np.argmin(np.abs(log_focals - log_guess))),
+        _RelativePoses.of(pairs),
+        matches,
+        lambda poses, value: _refine_poses(poses, matches, float(np.exp(value))),
+        retrace=True,
+    )
+    focal_px = image.camera.fx if log_focal is None else float(np.exp(log_focal))
+    if not (refine_distortion and image.camera_model.num_distortion) or any(image.distortion):
+        return LensEstimate(focal_px, 0.0)
+    division, _ = _maximize_posterior(
+        _Profile(DIVISIONS, 0.0, DIVISION_PRIOR_STD),
+        len(DIVISIONS) // 2,
+        poses,
+        matches,
+        lambda poses, value: _refine_poses(poses, matches, focal_px, division=value),
+        retrace=False,
+    )
+    return LensEstimate(focal_px, _convert_division(division or 0.0, focal_px / matches.radius))
+
+
+def _convert_division(division: float, focal_ratio: float) -> float:
+    """Convert a coefficient of the division model to k1 of SIMPLE_RADIAL.
+
+    With the distorted radius d and the undistorted radius ``u = d / (1 + c d^2)``, both models
+    agree at d if ``1 + k1 u^2 = d / u``.
+
+    Args:
+        division: Coefficient c of the division model, for radii in half image diagonals.
+        focal_ratio: Focal length in half image diagonals.
+    """
+    return division * (1 + division * CONVERSION_RADIUS**2) ** 2 * focal_ratio**2
+
+
+class _Profile(NamedTuple):
+    """Grid of values of a parameter that all pairs share, with a normal prior."""
+
+    grid: Float64
+    """(k,) ascending values with constant step."""
+    mean: float
+    """Mean of the prior."""
+    std: float
+    """Standard deviation of the prior."""
+
+    def log_prior(self, values: Float64) -> Float64:
+        """Return the log-prior (m,) of values, up to a constant."""
+        return -0.5 * ((values - self.mean) / self.std) ** 2
+
+
+def _maximize_posterior(
+    profile: _Profile,
+    start: int,
+    poses: _RelativePoses,
+    matches: _Matches,
+    refine: Callable[[_RelativePoses, float], tuple[_RelativePoses, Float64]],
+    *,
+    retrace: bool,
+) -> tuple[float | None, _RelativePoses]:
+    """Maximize the posterior of a parameter, with refined relative poses for each value.
+
+    Args:
+        profile: Grid and prior of the parameter.
+        start: Row of the guess in the grid.
+        poses: Initial relative poses for the guess.
+        matches: Matches of the pairs.
+        refine: Function that refines relative poses for a value of the parameter, and returns them
+            with the cost (p,) of each pair.
+        retrace: Sweep the whole grid in both directions after the sweeps from the guess, which
+            avoids local minima of relative poses with a wrong focal length.
+
+    Returns:
+        Value of the parameter, or None if the evidence against the guess is below ``MIN_EVIDENCE``,
+        and relative poses for the best value of the grid or for the guess.
+    """
+    grid = profile.grid
+    costs = np.full((len(grid), len(matches.std_px)), np.inf)
+    solutions = [poses] * len(grid)
+    # A pose follows the parameter to the next value.
+    upward, downward = range(len(grid)), range(len(grid) - 1, -1, -1)
+    outward = range(start, -1, -1), range(start, len(grid))
+    for order in (outward[0], upward, downward) if retrace else outward:
         poses = solutions[order[0]]
         for row in order:
-            poses, cost = _refine_poses(poses, matches, coarse[row])
+            poses, cost = refine(poses, float(grid[row]))
             is_better = cost < costs[row]
             solutions[row] = poses = poses.where(is_better, solutions[row])
             costs[row] = np.minimum(cost, costs[row])
-    posterior = _log_posterior(image, coarse, costs, costs, matches)
+    posterior = _log_likelihood(costs, costs, matches) + profile.log_prior(grid)
     best = int(np.argmax(posterior))
     if posterior[best] - posterior[start] < MIN_EVIDENCE:
-        return image.camera.fx
-    low_px, high_px = coarse[best] / FOCAL_STEP, coarse[best] * FOCAL_STEP
-    fine = np.geomspace(low_px, high_px, NUM_FINE_STEPS + 1)
-    fine_costs = np.array([_refine_poses(solutions[best], matches, focal)[1] for focal in fine])
-    posterior = _log_posterior(image, fine, fine_costs, costs, matches)
-    return float(fine[np.argmax(posterior)])
+        return None, solutions[start]
+    step = (grid[-1] - grid[0]) / (len(grid) - 1)
+    fine = grid[best] + np.linspace(-step, step, NUM_FINE_STEPS + 1)
+    fine_costs = np.array([refine(solutions[best], float(value))[1] for value in fine])
+    posterior = _log_likelihood(fine_costs, costs, matches) + profile.log_prior(fine)
+    return float(fine[np.argmax(posterior)]), solutions[best]
 
 
 class _Matches(NamedTuple):
@@ -184,6 +291,12 @@ class _RelativePoses(NamedTuple):
             np.where(mask[:, None], self.lenses, other.lenses),
         )
 
+    def with_division(self, division: float) -> _RelativePoses:
+        """Return the poses with the same coefficient of the division model for all pairs."""
+        lenses = self.lenses.copy()
+        lenses[:, 2] = division
+        return self._replace(lenses=lenses)
+
     def tangents(self) -> Float64:
         """Return two unit vectors (p, 2, 3) that are orthogonal to each translation."""
         axis = np.eye(3)[np.abs(self.translations).argmin(axis=1)]
@@ -221,17 +334,28 @@ def _collect_matches(problem: MappingProblem, pairs: Sequence[VerifiedPair]) -> 
 
 
 def _refine_poses(
-    poses: _RelativePoses, matches: _Matches, focal_px: float
+    poses: _RelativePoses, matches: _Matches, focal_px: float, division: float | None = None
 ) -> tuple[_RelativePoses, Float64]:
     """Minimize the Cauchy loss of the Sampson errors by Levenberg-Marquardt.
+
+    Args:
+        poses: Initial relative poses.
+        matches: Matches of the pairs.
+        focal_px: Focal length in pixels.
+        division: Coefficient of the division model for all pairs, or None to estimate a coefficient
+            of each pair with a prior.
 
     Returns:
         The refined relative poses, and the cost (p,) of each pair.
     """
     damping = np.full(len(matches.std_px), 1e-3)
-    prior = matches.lens_stds**-2
+    prior, is_free = matches.lens_stds**-2, np.ones((8, 1))
+    if division is not None:
+        poses = poses.with_division(division)
+        prior[-1], is_free[-1] = 0.0, 0.0
     diagonal_prior = np.diag([0.0] * 5 + prior.tolist())
     errors, jacobian = _linearize(poses, matches, focal_px)
+    jacobian *= is_free
     cost = np.log1p(errors**2).sum(axis=1) + poses.lenses**2 @ prior
     for _ in range(NUM_ITERATIONS):
         weighted = jacobian / (1.0 + errors**2)[:, None]
@@ -242,6 +366,7 @@ def _refine_poses(
         hessian += (damping[:, None] * diagonal)[:, :, None] * np.eye(8)
         moved = poses.moved(-np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0])
         moved_errors, moved_jacobian = _linearize(moved, matches, focal_px)
+        moved_jacobian *= is_free
         moved_cost = np.log1p(moved_errors**2).sum(axis=1) + moved.lenses**2 @ prior
         decrease = cost - moved_cost
         is_better = decrease > 0
@@ -327,23 +452,15 @@ def _cross_matrices(vectors: Float64) -> Float64:
     return matrices
 
 
-def _log_posterior(
-    image: MappingImage,
-    focals: Float64,
-    costs: Float64,
-    all_costs: Float64,
-    matches: _Matches,
-) -> Float64:
-    """Return the log-posterior (k,) of focal lengths.
+def _log_likelihood(costs: Float64, all_costs: Float64, matches: _Matches) -> Float64:
+    """Return the profile log-likelihood (k,) of the values of a shared parameter.
 
     The noise variance of each pair is unknown, so that its profile likelihood is a power of its
     cost. Each pair is an outlier with the log-odds ``-MAX_EVIDENCE``, and all pairs of each image
     are outliers with the log-odds ``-MAX_IMAGE_EVIDENCE``.
 
     Args:
-        image: Image with the prior of the focal length.
-        focals: (k,) focal lengths in pixels.
-        costs: (k, p) costs of the pairs at the focal lengths.
+        costs: (k, p) costs of the pairs at the values.
         all_costs: (g, p) costs of the pairs at the whole grid, whose minimum is the reference.
         matches: Matches of the pairs.
     """
@@ -353,7 +470,4 @@ def _log_posterior(
     freedom = np.maximum(counts - NUM_PARAMETERS, 0.0)
     evidence = 0.5 * freedom * np.log((costs + floor) / (smallest + floor))
     by_pair = np.logaddexp(-evidence, -MAX_EVIDENCE)
-    log_likelihood = np.array([_exclude_images(row, matches.images) for row in by_pair])
-    deviations = np.log(focals / image.focal_prior_px) / image.focal_log_std
-    posterior: Float64 = log_likelihood - 0.5 * deviations**2
-    return posterior
+    return np.array([_exclude_images(row, matches.images) for row in by_pair])

@@ -159,7 +159,7 @@ def _reset_intrinsics(
         intrinsics[row, 2:] = np.where(refused[row, CENTER], center, current)
     distortion = np.where(
         refused[:, IntrinsicParameter.RADIAL_DISTORTION :],
-        [image.distortion for image in images],
+        [image.initial_distortion or image.distortion for image in images],
         scene.distortion[representatives],
     )
     return replace(problem, intrinsics=intrinsics, distortion=distortion)

@@ -97,6 +97,10 @@ class Scene:
         self.registered: Bool = np.zeros(count, dtype=np.bool_)
         self.estimated_intrinsics = EstimatedIntrinsics(count)
         self._distort_keypoints()
+        for index, image in enumerate(problem.images):
+            if image.initial_distortion is not None:
+                distortion = np.array(image.initial_distortion)
+                self.set_intrinsics(index, self.intrinsics[index].copy(), distortion)
         self.tracks = Tracks(len(self.keypoints))
 
     @property

@@ -1,4 +1,4 @@
-"""Tests that relative poses of image pairs determine a guessed focal length."""
+"""Tests that relative poses of image pairs determine guessed focal length and distortion."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.camera_models import CameraModel
 from mpsfm_core.mapping.initialization.view_graph_calibration import (
     calibrate_view_graph,
-    estimate_shared_focal,
+    estimate_shared_lens,
 )
+from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import room_scene
 from tests.mapping.focal_scenes import CAMERA, POSES, distort, scale_focal
@@ -43,22 +44,24 @@ def room() -> MappingProblem:
 
 
 @pytest.mark.parametrize(("ratio", "k1"), [(1.6, 0.0), (0.6, 0.0), (1.6, -0.15)])
-def test_estimate_shared_focal_finds_the_focal_length_of_distorted_images(
+def test_estimate_shared_lens_finds_the_focal_length_of_distorted_images(
     room: MappingProblem, ratio: float, k1: float
 ) -> None:
     problem = guess_focal(distort(room, k1), ratio)
-    focal_px = estimate_shared_focal(problem, problem.pairs)
-    assert focal_px == pytest.approx(CAMERA.fx, rel=0.04)
+    lens = estimate_shared_lens(problem, problem.pairs)
+    assert lens.focal_px == pytest.approx(CAMERA.fx, rel=0.04)
+    assert lens.k1 == pytest.approx(k1, abs=0.03)
 
 
-def test_estimate_shared_focal_excludes_zoomed_images(room: MappingProblem) -> None:
+def test_estimate_shared_lens_excludes_zoomed_images(room: MappingProblem) -> None:
     center = np.array([CAMERA.cx, CAMERA.cy])
     images = list(guess_focal(room, 1.6).images)
     for row, zoom in ((1, 1.5), (3, 0.9)):
         xy = zoom * (images[row].keypoints - center) + center
         images[row] = replace(images[row], keypoints=xy)
     problem = replace(room, images=tuple(images))
-    assert estimate_shared_focal(problem, problem.pairs) == pytest.approx(CAMERA.fx, rel=0.1)
+    lens = estimate_shared_lens(problem, problem.pairs, refine_distortion=False)
+    assert lens == (pytest.approx(CAMERA.fx, rel=0.1), 0.0)
 
 
 def test_calibrate_view_graph_keeps_the_prior_and_updates_relative_poses(
@@ -71,6 +74,24 @@ def test_calibrate_view_graph_keeps_the_prior_and_updates_relative_poses(
         assert image.focal_prior_px == pytest.approx(1.6 * CAMERA.fx)
     for true, pair in zip(room.pairs, calibrated.pairs, strict=True):
         np.testing.assert_allclose(pair.rotation, true.rotation, atol=0.02)
+
+
+def test_calibrate_view_graph_undistorts_keypoints_before_relative_poses(
+    room: MappingProblem,
+) -> None:
+    problem = guess_focal(distort(room, -0.15), 1.0)
+    calibrated = calibrate_view_graph(problem, seed=0)
+    for image, given in zip(calibrated.images, problem.images, strict=True):
+        assert image.camera == CAMERA
+        assert image.initial_distortion == (pytest.approx(-0.15, abs=0.03), 0.0, 0.0, 0.0)
+        np.testing.assert_array_equal(image.keypoints, given.keypoints)
+    for true, pair in zip(room.pairs, calibrated.pairs, strict=True):
+        np.testing.assert_allclose(pair.rotation, true.rotation, atol=0.02)
+    scene = Scene(calibrated)
+    undistorted = np.concatenate([image.keypoints for image in room.images])
+    assert np.linalg.norm(scene.keypoints - undistorted, axis=1).max() < 5
+    distorted = np.concatenate([image.keypoints for image in problem.images])
+    np.testing.assert_array_equal(scene.distorted_keypoints, distorted)
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1.05])
@@ -92,10 +113,10 @@ def test_calibrate_view_graph_keeps_cameras_without_pairs_of_their_own(
 
 
 @pytest.mark.parametrize("shift", [(0, 0), (10, -6)])
-def test_estimate_shared_focal_of_an_orbit_at_constant_distance_keeps_the_guess(
+def test_estimate_shared_lens_of_an_orbit_at_constant_distance_keeps_the_guess(
     shift: tuple[int, int],
 ) -> None:
     problem = guess_focal(make_problem([0.0] * 5), 1.6)
     images = tuple(replace(i, keypoints=i.keypoints + shift) for i in problem.images)
     problem = replace(problem, images=images)
-    assert estimate_shared_focal(problem, problem.pairs) == 1.6 * CAMERA.fx
+    assert estimate_shared_lens(problem, problem.pairs).focal_px == 1.6 * CAMERA.fx
