@@ -31,6 +31,7 @@ from mpsfm_core.data.priors import (
     NormalPrior,
     PairDepth,
 )
+from mpsfm_core.data.rigs import Rig
 
 __all__ = [
     "UNIT_NORMAL_TOLERANCE",
@@ -50,6 +51,7 @@ __all__ = [
     "PinholeCamera",
     "Pose",
     "PosedImage",
+    "Rig",
     "SceneState",
     "SparseMatches",
     "UInt8",

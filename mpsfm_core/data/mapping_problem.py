@@ -19,6 +19,7 @@ from mpsfm_core.data.camera_models import NO_DISTORTION, CameraModel, Distortion
 from mpsfm_core.data.cameras import PinholeCamera
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.data.priors import DepthPrior, NormalPrior
+from mpsfm_core.data.rigs import Rig
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,8 +201,14 @@ class MappingProblem:
     """Images with keypoints and priors."""
     pairs: tuple[VerifiedPair, ...] = field(default=())
     """Verified pairs of images."""
+    rigs: tuple[Rig, ...] = ()
+    """Rigs, whose frames register as a unit. Names of images that are not part of the mapping
+    problem are ignored."""
 
     def __post_init__(self) -> None:
+        names = [name for rig in self.rigs for name in rig.image_names]
+        if len(set(names)) < len(names):
+            raise DataError("rigs", "an image must belong to one frame of one rig")
         for pair in self.pairs:
             if pair.image_b >= len(self.images):
                 raise DataError("pairs", f"a pair has image {pair.image_b}, which does not exist")
@@ -223,7 +230,7 @@ class MappingProblem:
             for pair in self.pairs
             if pair.image_a in position and pair.image_b in position
         )
-        return MappingProblem(tuple(self.images[i] for i in indices), pairs)
+        return MappingProblem(tuple(self.images[i] for i in indices), pairs, self.rigs)
 
     def with_poses(self, poses: Mapping[str, Pose]) -> MappingProblem:
         """Return the mapping problem with the given ``cam_from_world`` poses, by image name."""

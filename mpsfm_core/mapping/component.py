@@ -101,10 +101,11 @@ class Component:
         if len(known) < 2:
             return False
         scene, options = self.scene, self._options
+        self._set_rig_scale(np.array(list(known)), np.array([t for _, t in known.values()]))
         for image, pose in known.items():
             scene.register(image, *pose)
         is_fixed = options.known_poses == "fixed"
-        self.refiner.fixed[list(known)] = is_fixed
+        self.refiner.fixed[scene.rigs.complete(list(known))] = is_fixed
         complete_and_merge_tracks(scene, options.triangulation, create=True)
         self.refiner.estimate_scales(list(known))
         if not len(scene.tracks):
@@ -112,7 +113,7 @@ class Component:
         self.maintenance.refine_globally()
         if self.size < 2:
             return False
-        for image in map(int, scene.registered_images()):
+        for image in self._first_images():
             self.maintenance.confirm(image)
         return True
 
@@ -143,7 +144,7 @@ class Component:
         if self._explained_ratio(poses.images) < self._options.enough_explained:
             self.maintenance.clear(before)
             return False
-        for image in map(int, self.scene.registered_images()):
+        for image in self._first_images():
             self.maintenance.confirm(image)
         return True
 
@@ -151,16 +152,31 @@ class Component:
         """Register images with globally averaged poses, triangulate tracks and refine once."""
         scene, options = self.scene, self._options
         images = [int(image) for image in poses.images]
+        self._set_rig_scale(poses.images, poses.translations)
         for image, rotation, translation, scale in zip(
             images, poses.rotations, poses.translations, poses.scales, strict=True
         ):
             scene.register(image, rotation, translation)
             scene.maps[image].set_scale(float(scale))
+        images = scene.rigs.complete(images)
         for image in images:
             triangulate_image(scene, image, options.triangulation)
+        for image in images[len(poses.images) :]:
+            self.refiner.estimate_scale(image, [])
         loss_factor = options.refinement.first_reprojection_scale
         self.refiner.adjust(images, reprojection_scale=loss_factor)
         filter_points(scene, options.triangulation)
+
+    def _first_images(self) -> list[int]:
+        """Return one registered image of each frame."""
+        frames = self.scene.rigs.frame_of[self.scene.registered_images()]
+        return [int(image) for image in np.unique(frames)]
+
+    def _set_rig_scale(self, images: Int64, translations: Float64) -> None:
+        """Set the scale of rigs to fit the poses of images, if a frame has a baseline."""
+        scale = self.scene.rigs.measure_scale(images, translations)
+        if scale is not None and scale > 0:
+            self.scene.set_rig_scale(scale)
 
     def _explained_ratio(self, images: Int64) -> float:
         """Return the share of summed match scores whose two keypoints observe the same 3D point."""
@@ -212,16 +228,19 @@ class Component:
         register_first_image(self.scene, a)
         pose = initial_pair.pose
         self.scene.register(b, pose.rotation, pose.translation, pose.focal_px)
-        triangulate_image(self.scene, b, self._options.triangulation)
-        self.refiner.estimate_scale(b, [])
-        self.refiner.adjust([a, b])
+        images = self.scene.rigs.complete([a, b])
+        for image in images[1:]:
+            triangulate_image(self.scene, image, self._options.triangulation)
+        for image in images[1:]:
+            self.refiner.estimate_scale(image, [])
+        self.refiner.adjust(images)
         filter_points(self.scene, self._options.triangulation)
         if find_lost_images(self.scene):
             return ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()
-        self.refiner.estimate_scale(a, [])
-        self.refiner.estimate_scale(b, [])
-        self.refiner.integrate([a, b])
-        self.refiner.adjust([a, b])
+        for image in images:
+            self.refiner.estimate_scale(image, [])
+        self.refiner.integrate(images)
+        self.refiner.adjust(images)
         filter_points(self.scene, self._options.triangulation)
         if find_lost_images(self.scene):
             return ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()

@@ -203,7 +203,8 @@ class IncrementalRegistration:
                 self._history.reject_pose(image, pose, reason)
                 scene.restore(snapshot)
                 self._refiner.noise = noise
-                self._refiner.discard_integrator(image)
+                for member in scene.rigs.images_of(image):
+                    self._refiner.discard_integrator(member)
         return reason
 
     def _extend_model(
@@ -223,17 +224,22 @@ class IncrementalRegistration:
         scene, options = self._scene, self._options
         with self._event_log.timed("local refinement"):
             scene.register(image, pose.rotation, pose.translation, pose.focal_px)
-            triangulate_image(scene, image, options.triangulation)
+            members = scene.rigs.images_of(image)
+            for member in members:
+                triangulate_image(scene, member, options.triangulation)
             num_neighbors = options.refinement.local_images - 1
             _, *neighbors = find_local_bundle(scene, image, num_neighbors, self._scores)
-            self._refiner.estimate_scale(image, neighbors)
+            neighbors = [neighbor for neighbor in neighbors if neighbor not in members[1:]]
+            for member in members:
+                self._refiner.estimate_scale(member, neighbors)
             loss_factor = options.refinement.first_reprojection_scale
             self._refiner.adjust([image], local=True, reprojection_scale=loss_factor)
-            filter_points(scene, options.triangulation, [image])
+            filter_points(scene, options.triangulation, members)
             if image in find_lost_images(scene):
                 return ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()
-            self._refiner.estimate_scale(image, neighbors)
-            self._refiner.integrate([image])
+            for member in members:
+                self._refiner.estimate_scale(member, neighbors)
+            self._refiner.integrate(members)
         if refine_globally:
             with self._event_log.timed("global refinement"):
                 self._refiner.refine_locally(image)

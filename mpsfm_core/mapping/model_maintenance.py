@@ -152,6 +152,7 @@ class ModelMaintenance:
         images = self.scene.registered & ~self._checked
         self._checked |= images
         conflicting = self._find_conflicts(np.flatnonzero(images), max_violations)
+        conflicting = self._select_conflicting_frames(conflicting)
         for image, violation_ratio in conflicting:
             ratio = round(float(violation_ratio), 4)
             reason = ImageReason.CONTRADICTS_DEPTH.because(violation_ratio=ratio, step=step)
@@ -159,6 +160,16 @@ class ModelMaintenance:
         if conflicting:
             reason = ImageReason.CONNECTED_BY_DROPPED_IMAGE.because(step=step)
             self.deregister(find_disconnected_images(self.scene), reason)
+
+    def _select_conflicting_frames(
+        self, conflicting: list[tuple[int, float]]
+    ) -> list[tuple[int, float]]:
+        """Select the conflicting images of frames in which most images have conflicting depth."""
+        frames = self.scene.rigs.frame_of
+        images = np.array([image for image, _ in conflicting], dtype=np.int64)
+        num_conflicting = np.bincount(frames[images], minlength=len(frames))
+        is_majority = 2 * num_conflicting > np.bincount(frames, minlength=len(frames))
+        return [(image, ratio) for image, ratio in conflicting if is_majority[frames[image]]]
 
     def deregister_disconnected(self, reason: Reason) -> None:
         """Deregister images that no chain of points connects to the largest part of the model.
@@ -207,12 +218,13 @@ class ModelMaintenance:
     def confirm(self, image: int) -> None:
         """Notify the event receiver of a verified registration, and allow rejected poses again."""
         self.history.clear_pose_rejections()
-        self.event_log.registered(image, self.size)
+        for member in self.scene.rigs.images_of(image):
+            self.event_log.registered(member, self.size)
         self.event_log.scene_changed(self.scene)
 
     def deregister(self, images: list[int], reason: Reason) -> None:
-        """Deregister images, except those with a fixed pose."""
-        for image in images:
+        """Deregister images with all images of their frames, except those with a fixed pose."""
+        for image in self.scene.rigs.complete(images):
             if self.refiner.fixed[image]:
                 continue
             self._checked[image] = False

@@ -35,6 +35,7 @@ from mpsfm_core.optimize.bundle_problem import (
     range_executor,
 )
 from mpsfm_core.optimize.options import BundleOptions
+from mpsfm_core.optimize.rig_basis import measure_rig_scale
 
 __all__ = ["BundleProblem", "BundleResult", "adjust_bundle"]
 
@@ -80,12 +81,20 @@ class BundleResult:
     cost."""
     message: str
     """Reason why the Levenberg-Marquardt solver stopped."""
+    std_rig_scale: float = np.inf
+    """Posterior standard deviation of the scale of the rig in world units per meter, infinite if
+    the scale is constant or undetermined, or if conjugate gradients solve the reduced system."""
 
 
 def start_at(problem: BundleProblem, result: BundleResult) -> BundleProblem:
     """Return the bundle adjustment problem with the parameters of a result as initial values."""
+    rig = problem.rig
+    if rig is not None and rig.variable_scale:
+        scale = measure_rig_scale(rig, result.translations)
+        rig = rig if scale is None else replace(rig, scale=scale)
     return replace(
         problem,
+        rig=rig,
         rotations=result.rotations,
         translations=result.translations,
         log_scales=result.log_scales,
@@ -158,8 +167,10 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
         if damping > MAX_DAMPING:
             message = "no step lowers the cost"
             break
-    stds = normal.compute_intrinsic_stds(state)
-    return BundleResult(*state, stds, initial_cost, cost, iteration, converged, message)
+    stds, std_rig_scale = normal.compute_intrinsic_stds(state), normal.compute_rig_scale_std(state)
+    return BundleResult(
+        *state, stds, initial_cost, cost, iteration, converged, message, std_rig_scale
+    )
 
 
 class SchurComplementSolver:
@@ -268,6 +279,18 @@ class SchurComplementSolver:
         stds[variable] = np.where(determined, np.sqrt(np.where(determined, variances, 1)), np.inf)
         return stds
 
+    def compute_rig_scale_std(self, state: kernels.BundleParameters) -> float:
+        """Compute the posterior standard deviation of the scale of the rig, or infinity."""
+        basis = self.p.rig_basis
+        if basis is None or basis.scale_column is None or not self.dense:
+            return np.inf
+        self.linearize(state, MIN_DAMPING)
+        diagonal = self.total.diagonal
+        boost = np.where(diagonal > 0, MIN_DAMPING * diagonal, 1.0)
+        matrix = np.zeros((len(boost), len(boost)))
+        kernels.assemble_reduced_matrix(self.total, boost, self.p.bundle.layout.pair, matrix)
+        return float(np.sqrt(basis.compute_scale_variance(matrix)))
+
     def _fix_constants(self) -> None:
         """Remove constant parameters of images from the reduced camera system."""
         held, pairs, blocks = self.p.held, self.p.pairs, self.total.blocks
@@ -339,6 +362,8 @@ class SchurComplementSolver:
             return boost
         matrix = np.zeros((len(boost), len(boost)))
         kernels.assemble_reduced_matrix(self.total, boost, self.p.bundle.layout.pair, matrix)
+        if self.p.rig_basis is not None:
+            return self.p.rig_basis.solve_dense(matrix, rhs)
         # LAPACK does not copy the transposed matrix, because the transpose has Fortran's memory
         # order.
         _, solution, info = lapack.dposv(matrix.T, rhs, lower=0, overwrite_a=1)
@@ -352,13 +377,26 @@ class SchurComplementSolver:
         diagonal += np.triu(diagonal, 1).transpose(0, 2, 1)
         size = diagonal.shape[-1]
         diagonal[:, range(size), range(size)] += boost[:poses].reshape(-1, size)
-        inverse = np.linalg.inv(diagonal)
         corner = np.diagonal(total.corner) + boost[poses:]
 
         def multiply(x: Float64) -> Float64:
             out = np.empty_like(x)
             kernels.multiply_reduced_matrix(total, boost, self.p.pairs, x, out)
             return out
+
+        basis = self.p.rig_basis
+        if basis is not None:
+            blocks = total.blocks.copy()
+            blocks[self.p.pairs[:, 0] == self.p.pairs[:, 1]] = diagonal
+            entries = np.concatenate([np.einsum("nii->ni", diagonal).ravel(), corner])
+            solution = _conjugate_gradients(
+                lambda x: basis.matrix.T @ multiply(basis.matrix @ x),
+                basis.create_preconditioner(blocks, self.p.pairs, entries),
+                basis.matrix.T @ rhs,
+            )
+            steps: Float64 = basis.matrix @ solution
+            return steps
+        inverse = np.linalg.inv(diagonal)
 
         def precondition(x: Float64) -> Float64:
             first = np.einsum("nab,nb->na", inverse, x[:poses].reshape(-1, size))

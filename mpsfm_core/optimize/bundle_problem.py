@@ -21,6 +21,7 @@ from mpsfm_core.data.camera_models import (
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.options import BundleOptions
+from mpsfm_core.optimize.rig_basis import RigBasis, RigConstraint
 from mpsfm_core.support.threads import thread_limit
 
 RANGE_SIZE = 8000
@@ -101,6 +102,10 @@ class BundleProblem:
     """Image with a variable pose, one translation coordinate of which is kept constant to fix the
     scale. The constant translation coordinate is the one most sensitive to a change of scale about
     the first constant pose."""
+    rig: RigConstraint | None = None
+    """Constant relative poses of the images of each frame of a rig, or None if all poses are
+    independent. With a rig, ``rig.variable_frame`` replaces ``variable_pose``, and ``scale_anchor``
+    keeps a coordinate of the frame of the image constant."""
 
 
 class ScalePrior(NamedTuple):
@@ -161,6 +166,8 @@ class PreparedBundle(NamedTuple):
     ranges: list[PointRange]
     longest: int
     """Number of observations of the longest track."""
+    rig_basis: RigBasis | None
+    """Map from steps of frames to steps of images, or None if all poses are independent."""
 
 
 class RangeExecutor(Protocol):
@@ -181,6 +188,10 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
     images, points, cameras = (len(a) for a in (state.rotations, state.points, state.intrinsics))
     obs = _observations(problem, images, points)
     variable_pose = _mask(problem.variable_pose, "variable_pose", images, True)
+    rig, anchor = problem.rig, problem.scale_anchor
+    if rig is not None:
+        rig.check(state.rotations, state.translations)
+        variable_pose = rig.variable_images()
     variable_point = _mask(problem.variable_point, "variable_point", points, True)
     variable = _variable_intrinsics(problem.variable_intrinsics, cameras)
     variable_scale = _mask(problem.variable_scale, "variable_scale", images, False)
@@ -203,8 +214,14 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
     pairs = np.argwhere(layout.pair >= 0)
     held = np.repeat(~variable_pose[:, None], kernels.NUM_IMAGE_PARAMS, axis=1)
     held[:, kernels.LOG_SCALE_IDX] = ~variable_scale
-    if problem.scale_anchor is not None:
-        held[_scale_gauge(problem.scale_anchor, variable_pose, state)] = True
+    rig_basis = None
+    if rig is not None:
+        rig_gauge = None
+        if anchor is not None:
+            rig_gauge = rig.find_gauge(anchor, state.rotations, state.translations)
+        rig_basis = RigBasis.build(rig, layout, rig_gauge)
+    elif anchor is not None:
+        held[_scale_gauge(anchor, variable_pose, state)] = True
     robust = kernels.RobustLosses(
         int(options.reprojection_loss),
         options.reprojection_scale,
@@ -220,6 +237,7 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
         held[moving],
         _ranges(obs.start, len(pairs)),
         int(np.diff(obs.start).max(initial=0)),
+        rig_basis,
     )
 
 

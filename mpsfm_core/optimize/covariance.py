@@ -50,7 +50,9 @@ def compute_point_covariances(
     """
     options = options or BundleOptions()
     no_pose = np.zeros(len(problem.rotations), dtype=np.bool_)
-    fixed = replace(problem, variable_pose=no_pose, variable_scale=None, scale_anchor=None)
+    fixed = replace(
+        problem, variable_pose=no_pose, variable_scale=None, scale_anchor=None, rig=None
+    )
     p = prepare_bundle(fixed, options)
     covariances = np.empty((len(p.state.points), 3, 3))
     scratch = [kernels.allocate_buffers(0) for _ in p.ranges]

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera, UInt8, View
+from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera, Rig, UInt8, View
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.depth_range import depth_prior_from_points
-from mpsfm_core.geometry import sample_nearest, transform
+from mpsfm_core.geometry import compose, invert, sample_nearest, transform
 from mpsfm_core.geometry.pycolmap_conversion import (
     camera_key,
     colmap_from_pinhole,
@@ -54,11 +54,29 @@ def build_model(
     """
     model = pycolmap.Reconstruction()
     ids: dict[str, int] = {}
+    sensor_of = {
+        name: (number, sensor)
+        for number, rig in enumerate(reconstruction.rigs)
+        for frame in rig.frames
+        for sensor, name in enumerate(frame)
+        if name is not None
+    }
+    rig_images: dict[str, tuple[RegisteredImage, pycolmap.Image]] = {}
     for image, camera, xy in zip(reconstruction.images, cameras, keypoints, strict=True):
-        key = camera_key(camera)
+        sensor = sensor_of.get(image.name)
+        key = camera_key(camera) if sensor is None else f"{sensor}"
         if key not in ids:
             ids[key] = len(ids) + 1
-            model.add_camera_with_trivial_rig(_with_id(camera, ids[key]))
+            if sensor is None:
+                model.add_camera_with_trivial_rig(_with_id(camera, ids[key]))
+            else:
+                model.add_camera(_with_id(camera, ids[key]))
+        if sensor is not None:
+            colmap_image = pycolmap.Image(
+                name=image.name, keypoints=xy, camera_id=ids[key], image_id=image.index + 1
+            )
+            rig_images[image.name] = image, colmap_image
+            continue
         pose = np.column_stack([image.rotation, image.translation])
         model.add_image_with_trivial_frame(
             pycolmap.Image(
@@ -66,12 +84,56 @@ def build_model(
             ),
             pycolmap.Rigid3d(pose),
         )
+    for rig in reconstruction.rigs:
+        _add_rig(model, rig, rig_images)
     for row, track in enumerate(_tracks(reconstruction)):
         if len(track) >= MIN_TRACK_LENGTH:
             elements = [pycolmap.TrackElement(image, keypoint) for image, keypoint in track]
             model.add_point3D(reconstruction.points[row], pycolmap.Track(elements), colors[row])
     model.update_point_3d_errors()
     return model
+
+
+def _add_rig(
+    model: pycolmap.Reconstruction,
+    rig: Rig,
+    images: Mapping[str, tuple[RegisteredImage, pycolmap.Image]],
+) -> None:
+    """Add a rig to a COLMAP model, with its frames and images.
+
+    The first sensor with an image is COLMAP's reference sensor, so its pose is the pose of a frame.
+    """
+    frames = [
+        {s: images[name] for s, name in enumerate(frame) if name is not None and name in images}
+        for frame in rig.frames
+    ]
+    cameras = {s: image.camera_id for members in frames for s, (_, image) in members.items()}
+    if not cameras:
+        return
+    reference = min(cameras)
+    colmap_rig = pycolmap.Rig(rig_id=max([0, *model.rigs]) + 1)
+    colmap_rig.add_ref_sensor(model.cameras[cameras[reference]].sensor_id)
+    rig_from_reference = invert(*rig.sensor_from_rig[reference])
+    from_reference = {
+        sensor: compose(rig.sensor_from_rig[sensor], rig_from_reference) for sensor in cameras
+    }
+    for sensor in sorted(cameras.keys() - {reference}):
+        pose = pycolmap.Rigid3d(np.column_stack(from_reference[sensor]))
+        colmap_rig.add_sensor(model.cameras[cameras[sensor]].sensor_id, pose)
+    model.add_rig(colmap_rig)
+    for members in filter(None, frames):
+        frame_id = max([0, *model.frames]) + 1
+        frame = pycolmap.Frame(frame_id=frame_id, rig_id=colmap_rig.rig_id)
+        for _, image in members.values():
+            frame.add_data_id(image.data_id)
+            image.frame_id = frame_id
+        sensor, (first, _) = next(iter(members.items()))
+        pose = compose(invert(*from_reference[sensor]), (first.rotation, first.translation))
+        frame.rig_from_world = pycolmap.Rigid3d(np.column_stack(pose))
+        model.add_frame(frame)
+        for _, image in members.values():
+            model.add_image(image)
+        model.register_frame(frame_id)
 
 
 def build_pinhole_model(

@@ -22,6 +22,7 @@ from mpsfm_core.mapping.registration.correspondences import (
 )
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
+from mpsfm_core.mapping.registration.rig_scale import estimate_rig_scale
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.mapping.triangulation import triangulate_midpoints
@@ -124,11 +125,15 @@ def register_first_image(scene: Scene, image: int) -> None:
     """Register an image at the world origin, so that its depth prior defines the unit."""
     scene.register(image, np.eye(3), np.zeros(3))
     scene.maps[image].set_scale(1.0)
+    if scene.rigs.exist:
+        scene.set_rig_scale(estimate_rig_scale(scene, image) or 1.0)
 
 
 def rank_initial_pairs(scene: Scene) -> list[VerifiedPair]:
-    """Rank verified pairs by calibrated two-view geometry, then by number of matches."""
-    return sorted(scene.problem.pairs, key=lambda pair: (not pair.calibrated, -len(pair)))
+    """Rank verified pairs of different frames by two-view geometry, then by number of matches."""
+    frames = scene.rigs.frame_of
+    pairs = [pair for pair in scene.problem.pairs if frames[pair.image_a] != frames[pair.image_b]]
+    return sorted(pairs, key=lambda pair: (not pair.calibrated, -len(pair)))
 
 
 def estimate_initial_pairs(

@@ -57,9 +57,10 @@ def _find_points(scene: Scene, images: list[int] | None) -> Int64:
 
 
 def find_lost_images(scene: Scene) -> list[int]:
-    """Return the registered images that observe fewer than ``MIN_IMAGE_POINTS`` points."""
+    """Return the registered images whose frames observe fewer than ``MIN_IMAGE_POINTS`` points."""
     observed = np.flatnonzero(scene.tracks.point_of >= 0)
-    counts = np.bincount(scene.graph.image_of[observed], minlength=scene.num_images)
+    frames = scene.rigs.frame_of
+    counts = np.bincount(frames[scene.graph.image_of[observed]], minlength=scene.num_images)[frames]
     return [int(i) for i in scene.registered_images() if counts[i] < MIN_IMAGE_POINTS]
 
 
@@ -67,11 +68,11 @@ def find_disconnected_images(scene: Scene) -> list[int]:
     """Return the registered images that no chain of shared points connects to the largest part."""
     observations = scene.tracks.observations()
     points = scene.tracks.point_of[observations]
-    images = scene.graph.image_of[observations]
+    images = scene.rigs.frame_of[scene.graph.image_of[observations]]
     num_nodes = scene.num_images + len(scene.tracks.xyz)
     edges = coo_matrix(
         (np.ones(len(points)), (images, scene.num_images + points)), shape=(num_nodes, num_nodes)
     )
-    component = connected_components(edges, directed=False)[1][: scene.num_images]
+    component = connected_components(edges, directed=False)[1][scene.rigs.frame_of]
     sizes = np.bincount(component[scene.registered])
     return [int(i) for i in scene.registered_images() if component[i] != sizes.argmax()]

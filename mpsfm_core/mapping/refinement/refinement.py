@@ -32,7 +32,7 @@ from mpsfm_core.mapping.scene.local_bundle import find_local_bundle
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, lift_low_parallax
-from mpsfm_core.optimize.bundle_adjustment import BundleProblem, adjust_bundle
+from mpsfm_core.optimize.bundle_adjustment import BundleProblem, BundleResult, adjust_bundle
 from mpsfm_core.optimize.calibration_errors import predict_calibration_errors
 from mpsfm_core.optimize.covariance import (
     CalibrationStd,
@@ -42,6 +42,7 @@ from mpsfm_core.optimize.covariance import (
 )
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
 from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, BundleOptions, Loss
+from mpsfm_core.optimize.rig_basis import measure_rig_scale
 from mpsfm_core.optimize.subsampling import (
     compute_subsampling_step,
     subsample_camera,
@@ -251,6 +252,7 @@ class Refiner:
                 option.
         """
         scene = self.scene
+        variable = scene.rigs.complete(variable)
         bundle = self._collect_bundle(
             variable, local=local, refined_depth=self._alternates and not focal
         )
@@ -274,9 +276,23 @@ class Refiner:
         scene.rotations[images] = result.rotations
         scene.translations[images] = result.translations
         scene.tracks.xyz[bundle.points] = result.points
+        if bundle.problem.rig is not None:
+            self._update_rigs(bundle, result)
         for row in np.flatnonzero(result.log_scales):
             depth_map = scene.maps[images[row]]
             depth_map.set_scale(depth_map.scale * float(np.exp(result.log_scales[row])))
+
+    def _update_rigs(self, bundle: _Bundle, result: BundleResult) -> None:
+        """Update the scale of rigs, and the poses of images that observe no points."""
+        scene, rig = self.scene, bundle.problem.rig
+        assert rig is not None
+        if rig.variable_scale:
+            scale = measure_rig_scale(rig, result.translations)
+            if scale is not None and scale > 0:
+                scene.set_rig_scale(scale, result.std_rig_scale)
+        _, first = np.unique(rig.frame_of_image, return_index=True)
+        for image in map(int, bundle.images[first]):
+            scene.register(image, scene.rotations[image].copy(), scene.translations[image].copy())
 
     def predict_calibration_errors(self) -> PredictedErrors:
         """Predict the errors of poses and guessed intrinsics of the registered images."""
@@ -287,7 +303,9 @@ class Refiner:
             return predicted
         cameras = [scene.problem.images[image] for image in bundle.representatives]
         means, stds = compute_intrinsic_priors(cameras)
-        problem = replace(bundle.problem, prior_intrinsics=means, prior_std_intrinsics=stds)
+        problem = replace(
+            bundle.problem, prior_intrinsics=means, prior_std_intrinsics=stds, rig=None
+        )
         errors = predict_calibration_errors(
             problem,
             self._scale_losses(),
@@ -312,7 +330,7 @@ class Refiner:
         bundle = self._collect_bundle([image])
         if bundle is None:
             return np.full((6, 6), np.inf)
-        problem, options = bundle.problem, self._scale_losses()
+        problem, options = replace(bundle.problem, rig=None), self._scale_losses()
         own = problem.obs_image == int(np.flatnonzero(bundle.images == image)[0])
         observations: dict[str, Any] = {
             name: values[~own]
@@ -406,11 +424,15 @@ class Refiner:
         points, point_rows = np.unique(tracks.point_of[observations], return_inverse=True)
         moving = (scene.mask(variable) & ~self.fixed)[images]
         if moving.all():
-            moving[0] = False
+            moving[scene.rigs.frame_of[images] == scene.rigs.frame_of[images[0]]] = False
+        refines_all = not local and len(variable) == np.count_nonzero(scene.registered)
+        rig = scene.rigs.constrain(images, moving, refine_scale=refines_all)
         long_track = np.bincount(point_rows) >= MAX_LOCAL_TRACK_LENGTH
         log_depth, log_std = self._depth_observations(observations, refined_depth)
         regularized = self.options.depth_regularization and bool(np.isfinite(log_depth).any())
-        free_scale = not regularized and moving.any() and np.count_nonzero(~moving) == 1
+        num_constant = len(np.unique(scene.rigs.frame_of[images[~moving]]))
+        free_scale = not regularized and moving.any() and num_constant == 1
+        free_scale &= rig is None or rig.variable_scale or not rig.translations.any()
         weight = scene.graph.keypoint_weight[observations]
         expected, std = self._expected_log_scales(images)
         _, first, camera_rows = np.unique(
@@ -436,6 +458,7 @@ class Refiner:
             variable_scale=self._has_free_scale(variable)[images],
             variable_point=~long_track if local else None,
             scale_anchor=int(np.argmax(moving)) if free_scale else None,
+            rig=rig,
         )
         return _Bundle(problem, images, points, images[first])
 

@@ -33,7 +33,7 @@ def remove_duplicates(problem: MappingProblem, options: MapperOptions) -> Mappin
     )
     if not pairs or (is_posed and options.known_poses != "guess"):
         return problem
-    return MappingProblem(originals, pairs)
+    return MappingProblem(originals, pairs, problem.rigs)
 
 
 def register_duplicates(

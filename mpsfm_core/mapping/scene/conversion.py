@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from mpsfm_core.data import DepthPrior, PosedImage, SceneState
@@ -32,7 +34,7 @@ MIN_METRIC_IMAGES = 3
 
 
 def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | None:
-    """Estimate meters per world unit from the scales of metric depth priors.
+    """Estimate meters per world unit from the baselines of rigs, or else from metric depth priors.
 
     Args:
         scene: The scene.
@@ -41,9 +43,12 @@ def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | No
 
     Returns:
         Estimated metric scale, ``trusted`` if the scale is to be applied, or None without metric
-        depth priors.
+        depth priors and known baselines.
     """
     images = [int(i) for i in scene.registered_images()]
+    by_rigs = _measure_rig_metric(scene, len(images))
+    if by_rigs is not None:
+        return replace(by_rigs, trusted=not keep_units)
     maps = [scene.maps[i] for i in images if scene.maps[i].active and scene.maps[i].prior.metric]
     log_scales = [np.log(depth_map.scale) for depth_map in maps]
     if not log_scales:
@@ -53,6 +58,14 @@ def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | No
     trusted = len(log_scales) >= MIN_METRIC_IMAGES and spread <= MAX_METRIC_SPREAD
     trusted = trusted and not keep_units
     return MetricScale(float(np.exp(-center)), spread, len(log_scales), trusted)
+
+
+def _measure_rig_metric(scene: Scene, num_images: int) -> MetricScale | None:
+    """Return the metric scale of rigs, or None if no baseline determines the scale."""
+    spread = scene.rigs.scale_std / scene.rigs.scale
+    if not spread <= MAX_METRIC_SPREAD:
+        return None
+    return MetricScale(1 / scene.rigs.scale, spread, num_images, True, by="rig baselines")
 
 
 def convert_scene(
@@ -79,7 +92,9 @@ def convert_scene(
     images = tuple(
         convert_image(scene, int(i), factor, in_metres, errors) for i in scene.registered_images()
     )
-    return Reconstruction(images, tracks.xyz * factor, mean_errors, metric)
+    names = {image.name for image in images}
+    rigs = tuple(rig.subset(names).scaled(scene.rigs.scale * factor) for rig in scene.problem.rigs)
+    return Reconstruction(images, tracks.xyz * factor, mean_errors, metric, rigs)
 
 
 def capture_scene_state(scene: Scene) -> SceneState:

@@ -15,6 +15,7 @@ from mpsfm_core.data import (
     MappingProblem,
     PinholeCamera,
     Pose,
+    Rig,
     VerifiedPair,
 )
 from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel, IntrinsicParameter
@@ -170,6 +171,8 @@ class Reconstruction:
     """(p,) float64 mean reprojection error of each point, in pixels."""
     metric: MetricScale | None = None
     """Estimate of meters per world unit, or None without metric depth priors."""
+    rigs: tuple[Rig, ...] = ()
+    """Rigs of the registered images, with translations in world units."""
 
     @property
     def poses(self) -> dict[str, Pose]:
@@ -198,14 +201,23 @@ class Reconstruction:
     def state_dict(self) -> StateDict:
         """Return the reconstruction for a checkpoint."""
         images = [image.state_dict() for image in self.images]
-        return {**vars(self), "images": images, "metric": self.metric and {**vars(self.metric)}}
+        return {
+            **vars(self),
+            "images": images,
+            "metric": self.metric and {**vars(self.metric)},
+            "rigs": [{**vars(rig)} for rig in self.rigs],
+        }
 
     @classmethod
     def from_state_dict(cls, state: StateDict) -> Reconstruction:
         """Restore a reconstruction from a checkpoint."""
         images = tuple(RegisteredImage.from_state_dict(image) for image in state["images"])
         metric = state["metric"] and MetricScale(**state["metric"])
-        return cls(**{**state, "images": images, "metric": metric})
+        rigs = tuple(
+            Rig(tuple(map(tuple, rig["sensor_from_rig"])), tuple(map(tuple, rig["frames"])))
+            for rig in state["rigs"]
+        )
+        return cls(**{**state, "images": images, "metric": metric, "rigs": rigs})
 
 
 @dataclass(frozen=True)
@@ -315,4 +327,5 @@ def transform_reconstruction(
             )
         )
     points = scale * reconstruction.points @ rotation.T + translation
-    return replace(reconstruction, images=tuple(images), points=points, metric=metric)
+    rigs = tuple(rig.scaled(scale) for rig in reconstruction.rigs)
+    return replace(reconstruction, images=tuple(images), points=points, metric=metric, rigs=rigs)

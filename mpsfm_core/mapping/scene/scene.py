@@ -16,6 +16,7 @@ from mpsfm_core.mapping.scene.estimated_intrinsics import EstimatedIntrinsics
 from mpsfm_core.mapping.scene.graph import CorrespondenceGraph
 from mpsfm_core.mapping.scene.kernels import compute_max_triangulation_angles
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+from mpsfm_core.mapping.scene.rig_frames import RigFrames
 from mpsfm_core.mapping.scene.tracks import Tracks
 from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.optimize.depth_integration import RefinedDepth
@@ -33,6 +34,8 @@ class Snapshot(NamedTuple):
     maps: Sequence[tuple[float, bool, RefinedDepth | None]]
     distortion: Float64
     estimated_intrinsics: StateDict
+    rig_scale: tuple[float, float]
+    """World units per meter of the rigs, and the standard deviation."""
 
 
 class Scene:
@@ -45,6 +48,7 @@ class Scene:
     Attributes:
         graph: Correspondence graph, whose global keypoint numbers index all keypoint arrays.
         tracks: 3D points and the keypoints that observe them.
+        rigs: Frames of the rigs. All images of a frame are registered together.
         rotations: (n, 3, 3) float64 rotation of ``cam_from_world`` of each image.
         translations: (n, 3) float64 translation of ``cam_from_world`` of each image.
         registered: (n,) bool mask of the registered images.
@@ -82,6 +86,7 @@ class Scene:
         self.fisheye: Bool = np.array([i.camera_model.is_fisheye for i in problem.images], np.bool_)
         self.camera_of: Int64 = _shared_cameras(problem)
         self.depth_group_of: Int64 = _depth_groups(problem)
+        self.rigs = RigFrames(problem)
         self.maps = [DepthMap(image) for image in problem.images]
         self.keypoint_log_std: Float64 = np.concatenate(
             [np.zeros(0), *(depth_map.keypoint_log_std for depth_map in self.maps)]
@@ -125,7 +130,7 @@ class Scene:
         translation: Float64,
         focal_px: float | None = None,
     ) -> None:
-        """Register an image with a pose ``cam_from_world``.
+        """Register an image, and the other images of its frame, with a pose ``cam_from_world``.
 
         Args:
             image: The image.
@@ -139,13 +144,32 @@ class Scene:
             self.set_shared_intrinsics(image, intrinsics, self.distortion[image])
         self.rotations[image], self.translations[image] = rotation, translation
         self.registered[image] = True
+        for other in self.rigs.images_of(image)[1:]:
+            pose = self.rigs.derive_pose(image, (rotation, translation), other)
+            self.rotations[other], self.translations[other] = pose
+            self.registered[other] = True
 
     def deregister(self, image: int) -> None:
-        """Deregister an image, and remove its observations and points that lose their track."""
-        self.registered[image] = False
-        self.maps[image].reset()
-        keypoints = self.graph.keypoints_of(image)
-        self.tracks.remove_observations(np.arange(keypoints.start, keypoints.stop))
+        """Deregister the images of a frame, with their observations and points without a track."""
+        for member in self.rigs.images_of(image):
+            self.registered[member] = False
+            self.maps[member].reset()
+            keypoints = self.graph.keypoints_of(member)
+            self.tracks.remove_observations(np.arange(keypoints.start, keypoints.stop))
+
+    def set_rig_scale(self, scale: float, std: float = np.inf) -> None:
+        """Set the world units per meter of rigs, and move registered images to fit the rigs.
+
+        The first image of a frame keeps its pose.
+
+        Args:
+            scale: World units per meter.
+            std: Standard deviation of the scale.
+        """
+        self.rigs.scale, self.rigs.scale_std = scale, std
+        is_first = self.rigs.frame_of == np.arange(self.num_images)
+        for image in map(int, np.flatnonzero(self.registered & is_first)):
+            self.register(image, self.rotations[image].copy(), self.translations[image].copy())
 
     def camera(self, image: int) -> PinholeCamera:
         """Return the current intrinsics of an image."""
@@ -311,6 +335,9 @@ class Scene:
     def resume(self, reconstruction: Reconstruction) -> None:
         """Load poses, focal lengths, scales and points of a reconstruction."""
         self.tracks.xyz = reconstruction.points.copy()
+        rows = np.array([image.index for image in reconstruction.images], dtype=np.int64)
+        translations = np.array([image.translation for image in reconstruction.images])
+        self.rigs.scale = self.rigs.measure_scale(rows, translations) or 1.0
         for image in reconstruction.images:
             self.register(image.index, image.rotation, image.translation)
             self.maps[image.index].set_scale(image.scale)
@@ -345,6 +372,7 @@ class Scene:
             maps,
             self.distortion.copy(),
             self.estimated_intrinsics.state_dict(),
+            (self.rigs.scale, self.rigs.scale_std),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -352,6 +380,7 @@ class Scene:
         self.rotations = snapshot.rotations.copy()
         self.translations = snapshot.translations.copy()
         self.registered = snapshot.registered.copy()
+        self.rigs.scale, self.rigs.scale_std = snapshot.rig_scale
         changed = (self.intrinsics != snapshot.intrinsics).any(axis=1)
         changed |= (self.distortion != snapshot.distortion).any(axis=1)
         for image in np.flatnonzero(changed):

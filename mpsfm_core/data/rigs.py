@@ -1,0 +1,73 @@
+"""Rigs: cameras that move as one (COLMAP's rigs and frames)."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from mpsfm_core.data.arrays import Float64, Pose
+from mpsfm_core.data.errors import DataError
+
+MAX_ROTATION_DEVIATION = 1e-6
+"""Largest entry of ``R @ R.T - I`` of a rotation matrix of a rig."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Cameras with constant relative poses, and their images (COLMAP's ``Rig`` and ``Frame``).
+
+    Examples:
+        >>> left = np.eye(3), np.zeros(3)
+        >>> right = np.eye(3), np.array([-0.1, 0.0, 0.0])
+        >>> rig = Rig((left, right), (("left/1.jpg", "right/1.jpg"), ("left/2.jpg", None)))
+        >>> rig.has_baseline
+        True
+    """
+
+    sensor_from_rig: tuple[Pose, ...]
+    """Pose of each sensor, as rotation (3, 3) and translation (3,) in meters."""
+    frames: tuple[tuple[str | None, ...], ...]
+    """Name of the image of each sensor for each frame, None if the sensor has no image. A frame is
+    the set of images that the rig takes at one moment."""
+
+    def __post_init__(self) -> None:
+        for rotation, translation in self.sensor_from_rig:
+            if np.shape(rotation) != (3, 3) or np.shape(translation) != (3,):
+                raise DataError(
+                    "sensor_from_rig", "pose must be a rotation (3, 3), translation (3)"
+                )
+            deviation = np.abs(rotation @ rotation.T - np.eye(3)).max()
+            is_rotation = deviation <= MAX_ROTATION_DEVIATION and np.linalg.det(rotation) > 0
+            if not is_rotation or not np.isfinite(translation).all():
+                raise DataError("sensor_from_rig", "pose must be a finite rigid transform")
+        if any(len(frame) != len(self.sensor_from_rig) for frame in self.frames):
+            raise DataError("frames", "a frame must have one image name, or None, for each sensor")
+
+    @property
+    def image_names(self) -> list[str]:
+        """Names of the images of all frames."""
+        return [name for frame in self.frames for name in frame if name is not None]
+
+    @property
+    def has_baseline(self) -> bool:
+        """True if the centers of two sensors differ."""
+        return bool(np.ptp(self.sensor_centers(), axis=0).max() > 0)
+
+    def sensor_centers(self) -> Float64:
+        """Return the camera centers (s, 3) of the sensors in the frame of the rig, in meters."""
+        return np.array(
+            [-rotation.T @ translation for rotation, translation in self.sensor_from_rig]
+        )
+
+    def subset(self, names: Collection[str]) -> Rig:
+        """Return the rig restricted to the named images, without frames that have no image."""
+        chosen = set(names)
+        frames = (tuple(n if n in chosen else None for n in frame) for frame in self.frames)
+        return replace(self, frames=tuple(frame for frame in frames if any(frame)))
+
+    def scaled(self, factor: float) -> Rig:
+        """Return the rig with all translations multiplied by a factor."""
+        sensors = tuple((rotation, factor * shift) for rotation, shift in self.sensor_from_rig)
+        return replace(self, sensor_from_rig=sensors)

@@ -1,0 +1,302 @@
+"""Bundle adjustment with one pose per frame of a rig.
+
+The images of a frame have the poses ``image_from_world = sensor_from_rig * frame_from_world``, with
+``sensor_from_rig = (S, k s)``. ``k`` is the scale of the rig, in world units per meter. A step
+``(w, u)`` of the frame, ``R' = exp(w) R`` and ``t' = t + u``, is the step ``(S w, S u)`` of the
+image. A step ``c`` of the scale ``k`` moves the image by ``c s``. Steps of images are therefore
+linear in steps of frames::
+
+    delta_images = B @ delta_frames
+
+The reduced camera system ``H`` of the images gives the system ``B.T @ H @ B`` of the frames. ``B``
+is constant, and the images of a frame keep their relative poses exactly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.linalg import lapack
+from scipy.sparse import csr_matrix
+
+from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.data.errors import DataError
+from mpsfm_core.optimize import bundle_kernels as kernels
+
+_POSE = 6
+"""Number of parameters of a pose."""
+_MAX_DEVIATION = 1e-6
+"""Largest deviation of initial poses from the relative poses of the rig, relative to the largest
+translation."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigConstraint:
+    """Constant relative poses of the n images of a bundle adjustment problem with f frames."""
+
+    frame_of_image: Int64
+    """(n,) index of the frame of each image."""
+    rotations: Float64
+    """(n, 3, 3) rotation of ``sensor_from_rig`` of each image."""
+    translations: Float64
+    """(n, 3) translation of ``sensor_from_rig`` of each image, in meters."""
+    scale: float = 1.0
+    """Scale of the rig, in world units per meter."""
+    variable_scale: bool = False
+    """Whether bundle adjustment estimates the scale of the rig."""
+    variable_frame: Bool | None = None
+    """(f,) bool, True for frames with a variable pose (None makes all frames variable)."""
+
+    def frame_poses(self, rotations: Float64, translations: Float64) -> tuple[Float64, Float64]:
+        """Return the rotations (n, 3, 3) and translations (n, 3) of ``frame_from_world``.
+
+        Args:
+            rotations: (n, 3, 3) rotation of ``cam_from_world`` of each image.
+            translations: (n, 3) translation of ``cam_from_world`` of each image.
+        """
+        inverse = self.rotations.transpose(0, 2, 1)
+        shifts = translations - self.scale * self.translations
+        return inverse @ rotations, np.einsum("nij,nj->ni", inverse, shifts)
+
+    def variable_frames(self) -> Bool:
+        """Return a bool mask (f,) of the frames with a variable pose."""
+        count = int(self.frame_of_image.max(initial=-1)) + 1
+        if self.variable_frame is None:
+            return np.ones(count, dtype=np.bool_)
+        return self.variable_frame
+
+    def variable_images(self) -> Bool:
+        """Return a bool mask (n,) of the images with a variable pose."""
+        variable: Bool = self.variable_frames()[self.frame_of_image]
+        if self.variable_scale:
+            variable = variable | (self.translations != 0).any(axis=1)
+        return variable
+
+    def check(self, rotations: Float64, translations: Float64) -> None:
+        """Check the shapes of the constraint, and that poses of images fulfill the constraint.
+
+        Raises:
+            DataError: An array has a wrong shape, or poses differ from the rig.
+        """
+        count = len(rotations)
+        shapes = self.frame_of_image.shape, self.rotations.shape, self.translations.shape
+        if shapes != ((count,), (count, 3, 3), (count, 3)):
+            raise DataError("rig", "arrays must have one row for each image")
+        if not self.scale > 0:
+            raise DataError("rig", "scale must be positive")
+        _, first, rows = np.unique(self.frame_of_image, return_index=True, return_inverse=True)
+        if len(first) != len(self.variable_frames()):
+            raise DataError("rig", "every frame must have an image")
+        of_frame = self.frame_poses(rotations, translations)
+        limit = _MAX_DEVIATION * max(1.0, float(np.abs(translations).max(initial=0.0)))
+        for poses in of_frame:
+            if np.abs(poses - poses[first[rows]]).max(initial=0.0) > limit:
+                raise DataError("rig", "initial poses differ from the relative poses of the rig")
+
+    def find_gauge(self, anchor: int, rotations: Float64, translations: Float64) -> tuple[int, int]:
+        """Return the frame and pose parameter to keep constant, which fixes the scale gauge.
+
+        Args:
+            anchor: Image of the frame with the constant translation coordinate.
+            rotations: (n, 3, 3) rotation of ``cam_from_world`` of each image.
+            translations: (n, 3) translation of ``cam_from_world`` of each image.
+
+        Raises:
+            DataError: The frame of the anchor is constant, or all frames are variable.
+        """
+        variable = self.variable_frames()[self.frame_of_image]
+        if not (0 <= anchor < len(variable) and variable[anchor]) or variable.all():
+            raise DataError(
+                "scale_anchor",
+                "scale anchor must be an image of a variable frame, and a frame must be constant",
+            )
+        turns, shifts = self.frame_poses(rotations, translations)
+        first = int(np.argmin(variable))
+        center = -turns[first].T @ shifts[first]
+        offset = turns[anchor] @ center + shifts[anchor]
+        return int(self.frame_of_image[anchor]), 3 + int(np.argmax(np.abs(offset)))
+
+
+def measure_rig_scale(rig: RigConstraint, translations: Float64) -> float | None:
+    """Measure the scale of a rig from poses of images, by linear least squares over all frames.
+
+    Args:
+        rig: Relative poses and frames of the images.
+        translations: (n, 3) translation of ``cam_from_world`` of each image.
+
+    Returns:
+        World units per meter, or None if no frame has images with different camera centers.
+    """
+    in_rig = np.einsum("nji,nj->ni", rig.rotations, translations)
+    offsets = np.einsum("nji,nj->ni", rig.rotations, rig.translations)
+    offsets = _subtract_frame_means(offsets, rig.frame_of_image)
+    energy = float((offsets**2).sum())
+    if energy <= 0:
+        return None
+    return float((offsets * _subtract_frame_means(in_rig, rig.frame_of_image)).sum()) / energy
+
+
+def _subtract_frame_means(values: Float64, frames: Int64) -> Float64:
+    """Subtract from each row (n, 3) the mean of its frame."""
+    counts = np.bincount(frames)
+    sums = np.stack([np.bincount(frames, column) for column in values.T], axis=1)
+    residuals: Float64 = values - (sums / np.maximum(counts, 1)[:, None])[frames]
+    residuals[np.abs(residuals) < 1e-12 * max(1.0, float(np.abs(values).max(initial=0)))] = 0.0
+    return residuals
+
+
+class RigBasis(NamedTuple):
+    """Linear map from steps of frames to steps of images."""
+
+    matrix: csr_matrix
+    """(d, e) sparse matrix from the e variable parameters with frames to the d parameters of the
+    reduced camera system. The first ``6 * num_frames`` columns are the poses of frames."""
+    frame_of_slot: Int64
+    """(s,) position of the variable frame of each pose slot among the variable frames, or -1."""
+    num_frames: int
+    """Number of variable frames."""
+    scale_column: int | None
+    """Column of the scale of the rig, or None if the scale is constant."""
+
+    @classmethod
+    def build(
+        cls,
+        rig: RigConstraint,
+        layout: kernels.ParameterLayout,
+        gauge: tuple[int, int] | None,
+    ) -> RigBasis:
+        """Build the linear map for the parameters of a bundle adjustment.
+
+        Args:
+            rig: Relative poses and frames of the images.
+            layout: Layout of the parameters of the reduced camera system.
+            gauge: Frame and pose parameter that is constant, or None.
+        """
+        size, num_slots = int(kernels.NUM_IMAGE_PARAMS), len(layout.pair)
+        variable = rig.variable_frames()
+        position = np.where(variable, np.cumsum(variable) - 1, -1)
+        images = np.flatnonzero(layout.pose_slot >= 0)
+        slots = layout.pose_slot[images].astype(np.int64)
+        frame_of_slot = np.full(num_slots, -1, dtype=np.int64)
+        frame_of_slot[slots] = position[rig.frame_of_image[images]]
+        num_frames = int(variable.sum())
+        rows, columns, values = [], [], []
+        moving = images[position[rig.frame_of_image[images]] >= 0]
+        starts = size * layout.pose_slot[moving].astype(np.int64)
+        frames = _POSE * position[rig.frame_of_image[moving]]
+        for first in (0, 3):
+            for i in range(3):
+                for j in range(3):
+                    rows.append(starts + first + i)
+                    columns.append(frames + first + j)
+                    values.append(rig.rotations[moving, i, j])
+        next_column = _POSE * num_frames
+        scaled = np.flatnonzero(layout.variable_scale)
+        num_intrinsics = int(layout.intrinsic_slot.max(initial=-1)) + 1
+        free = np.concatenate(
+            [
+                size * layout.pose_slot[scaled].astype(np.int64) + int(kernels.LOG_SCALE_IDX),
+                size * num_slots + np.arange(num_intrinsics),
+            ]
+        )
+        rows.append(free)
+        columns.append(next_column + np.arange(len(free)))
+        values.append(np.ones(len(free)))
+        next_column += len(free)
+        scale_column = None
+        if rig.variable_scale:
+            scale_column = next_column
+            next_column += 1
+            for i in range(3):
+                rows.append(size * slots + 3 + i)
+                columns.append(np.full(len(slots), scale_column))
+                values.append(rig.translations[images, i])
+        row, column, value = (np.concatenate(parts) for parts in (rows, columns, values))
+        if gauge is not None:
+            value = np.where(column == _POSE * position[gauge[0]] + gauge[1], 0.0, value)
+        shape = (size * num_slots + num_intrinsics, next_column)
+        matrix = csr_matrix((value, (row, column)), shape=shape)
+        matrix.eliminate_zeros()
+        return cls(matrix, frame_of_slot, num_frames, scale_column)
+
+    def solve_dense(self, matrix: Float64, rhs: Float64) -> Float64:
+        """Solve the reduced camera system for steps that keep the relative poses of the rig.
+
+        Args:
+            matrix: (d, d) reduced camera matrix with damping, of which the lower triangle is used.
+            rhs: (d,) or (d, r) right side.
+
+        Returns:
+            Steps of the shape of ``rhs``, NaN if the matrix is not positive definite.
+        """
+        _, solution, info = lapack.dposv(self._project(matrix), self.matrix.T @ rhs, lower=1)
+        if info != 0:
+            return np.full_like(rhs, np.nan)
+        steps: Float64 = self.matrix @ solution
+        return steps
+
+    def compute_scale_variance(self, matrix: Float64) -> float:
+        """Compute the posterior variance of the scale of the rig, infinite if undetermined.
+
+        Args:
+            matrix: (d, d) reduced camera matrix, of which the lower triangle is used.
+        """
+        if self.scale_column is None:
+            return np.inf
+        unit = np.zeros(self.matrix.shape[1])
+        unit[self.scale_column] = 1.0
+        _, solution, info = lapack.dposv(self._project(matrix), unit, lower=1)
+        return float(solution[self.scale_column]) if info == 0 else np.inf
+
+    def _project(self, matrix: Float64) -> Float64:
+        """Return ``B.T @ H @ B`` with ones on the diagonal of constant parameters."""
+        full = np.tril(matrix) + np.tril(matrix, -1).T
+        projected: Float64 = self.matrix.T @ (self.matrix.T @ full).T
+        constant = np.flatnonzero(np.diagonal(projected) == 0)
+        projected[constant, constant] = 1.0
+        return projected
+
+    def create_preconditioner(
+        self, blocks: Float64, pairs: Int64, diagonal: Float64
+    ) -> Callable[[Float64], Float64]:
+        """Return the block-Jacobi preconditioner of the reduced system of the frames.
+
+        Args:
+            blocks: (b, 7, 7) blocks of the reduced camera matrix with damping. Blocks on the
+                diagonal are symmetric.
+            pairs: (b, 2) pose slots of each block.
+            diagonal: (d,) diagonal of the reduced camera matrix with damping.
+        """
+        frame = self.frame_of_slot[pairs]
+        same = np.flatnonzero((frame[:, 0] == frame[:, 1]) & (frame[:, 0] >= 0))
+        first, second = pairs[same].T
+        maps = self._slot_maps(blocks.shape[1])
+        products = maps[first].transpose(0, 2, 1) @ blocks[same] @ maps[second]
+        between = first != second
+        products[between] += products[between].transpose(0, 2, 1)
+        sums = np.zeros((self.num_frames, _POSE, _POSE))
+        np.add.at(sums, frame[same, 0], products)
+        frames, constant = np.nonzero(np.einsum("nii->ni", sums) <= 0)
+        sums[frames, constant, constant] = 1.0
+        inverse = np.linalg.inv(sums)
+        num_pose = _POSE * self.num_frames
+        scalar = (self.matrix.multiply(self.matrix).T @ diagonal)[num_pose:]
+        scalar = np.where(scalar > 0, scalar, 1.0)
+
+        def precondition(x: Float64) -> Float64:
+            poses = np.einsum("nab,nb->na", inverse, x[:num_pose].reshape(-1, _POSE))
+            return np.concatenate([poses.ravel(), x[num_pose:] / scalar])
+
+        return precondition
+
+    def _slot_maps(self, size: int) -> Float64:
+        """Return the blocks (s, 7, 6) of the matrix from a frame to each of its images."""
+        maps = np.zeros((len(self.frame_of_slot), size, _POSE))
+        for slot in np.flatnonzero(self.frame_of_slot >= 0):
+            column = _POSE * int(self.frame_of_slot[slot])
+            rows = self.matrix[size * slot : size * slot + _POSE, column : column + _POSE]
+            maps[slot, :_POSE] = rows.toarray()
+        return maps
