@@ -62,6 +62,13 @@ def reconstruct(
             "--set mapping.known_poses=fixed keeps the poses.",
         ),
     ] = None,
+    rigs: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Cameras that move as one: COLMAP's rig_config.json, model or database.",
+        ),
+    ] = None,
     overrides: Overrides = None,
     database: Annotated[
         Path | None,
@@ -104,6 +111,7 @@ def reconstruct(
         intrinsics=intrinsics,
         image_list=image_list,
         poses=poses,
+        rigs=rigs,
         database=database,
         hloc=hloc,
         overrides=settings,

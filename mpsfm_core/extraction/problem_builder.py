@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from mpsfm_core.data import (
     MappingProblem,
     NormalPrior,
     PinholeCamera,
+    Rig,
     SparseMatches,
     VerifiedPair,
 )
@@ -54,6 +55,7 @@ def build_problem(
     normals: Normals | None = None,
     masks: Mapping[str, Bool] | None = None,
     poses: Poses | None = None,
+    rigs: Sequence[Rig] = (),
     verification: VerificationOptions | None = None,
     seed: int = 0,
 ) -> MappingProblem:
@@ -80,6 +82,7 @@ def build_problem(
         masks: Mask (H, W) bool by image name, False where keypoints and depth are not used.
         poses: Known pose ``cam_from_world`` by image name, as ``pycolmap.Rigid3d``, a (3, 4) or (4,
             4) matrix, or a tuple of rotation (3, 3) and translation (3,).
+        rigs: Cameras that move as one, with the image names of their frames.
         verification: Options of the geometric verification of matches.
         seed: Random seed of the geometric verification of matches.
 
@@ -98,6 +101,7 @@ def build_problem(
         builder.check_names(what, values or {})
     builder.check_names("poses", poses or {})
     builder.check_names("masks", masks or {})
+    builder.check_names("rigs", {name: rig for rig in rigs for name in rig.image_names})
     if isinstance(matches, MatchGraph):
         builder.set_keypoints(matches.keypoints, matches.keypoint_std_px)
         factors = dict(zip(matches.names, matches.assembled.std_factor, strict=True))
@@ -111,7 +115,7 @@ def build_problem(
         builder.image(name, depth or {}, normals or {}, poses or {}, factors)
         for name in builder.names
     )
-    return MappingProblem(images, pairs)
+    return MappingProblem(images, pairs, tuple(rigs))
 
 
 class _Builder:

@@ -90,6 +90,8 @@ def reconstruct(
         Connected components, sorted by decreasing number of images, and the report.
     """
     options, events = options or MapperOptions(), events or NullMappingEvents()
+    if options.known_poses == "fixed" and any(i.known_pose is not None for i in problem.images):
+        problem = replace(problem, rigs=())  # fixed poses are not estimated, so rigs are not needed
     checkpointer = Checkpointer(checkpoints)
     runs, interrupted = checkpointer.load()
     is_complete = bool(runs) and interrupted is None

@@ -15,7 +15,7 @@ import pycolmap
 
 from mpsfm_core.config import Config
 from mpsfm_core.config.provider_arguments import Provider, configure
-from mpsfm_core.data import MappingProblem, Pose
+from mpsfm_core.data import MappingProblem, Pose, Rig
 from mpsfm_core.data.decisions import Reason
 from mpsfm_core.data.errors import ConfigError, InputError, ReconstructionError
 from mpsfm_core.data.events import EventCallback
@@ -34,6 +34,7 @@ from mpsfm_core.inputs.matches import (
     matches_from_hloc,
 )
 from mpsfm_core.inputs.models import Poses, describe_name_difference, match_names, read_poses
+from mpsfm_core.inputs.rigs import read_rigs
 from mpsfm_core.inputs.video import VideoSelection, extract_frames, is_video, read_selection
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
@@ -110,6 +111,7 @@ def reconstruct(
     intrinsics: PathLike | None = None,
     image_list: PathLike | None = None,
     poses: PathLike | Poses | None = None,
+    rigs: PathLike | Sequence[Rig] | None = None,
     features: Provider | None = None,
     matcher: Provider | None = None,
     retrieval: Provider | None = None,
@@ -147,6 +149,10 @@ def reconstruct(
             ``pycolmap.Reconstruction``, or poses ``cam_from_world`` by image name in the forms that
             :func:`build_problem` accepts. The option ``mapping.known_poses`` chooses whether known
             poses are fixed or refined.
+        rigs: Cameras that move as one, as path of COLMAP's ``rig_config.json``, of a COLMAP model
+            or of a COLMAP database, or :class:`~mpsfm_core.Rig` objects. All images of a frame get
+            one pose. Without ``rigs``, the rigs of ``database``, ``intrinsics`` or ``poses`` are
+            used.
         features: Provider of features that replaces the configured provider. Each provider argument
             is a name, a configuration block, or an object with the method that its provider kind
             requires. Results of a provider object are not cached for later runs.
@@ -211,6 +217,7 @@ def reconstruct(
         _path(image_list),
         Path(poses) if isinstance(poses, str) else poses,
         tuple(Path(file) for file in matches),
+        Path(rigs) if isinstance(rigs, str) else rigs,
     )
     run = _Run(source, config, registry, _path(output), fresh, on_event)
     with run.environment():
@@ -228,6 +235,7 @@ class _Source:
     poses: Path | Poses | None
     matches: tuple[Path, ...]
     """COLMAP database, or features and matches files of hloc; empty to run the matchers."""
+    rigs: Path | Sequence[Rig] | None = None
 
     @property
     def camera_model(self) -> Path | pycolmap.Reconstruction | None:
@@ -269,6 +277,7 @@ class _Run:
         self._image_folder = source.folder
         self._imported: ImportedMatches | None = None
         self._known_poses: dict[str, Pose] = {}
+        self._rigs: tuple[Rig, ...] = ()
         self._georeference_report: dict[str, object] | None = None
         self._dense_reports: list[dict[str, Any]] | None = None
         self._doubts: tuple[Reason, ...] = ()
@@ -387,8 +396,40 @@ class _Run:
             self._check_resources(images)
             if source.poses is not None:
                 self._known_poses = _read_known_poses(source.poses, images, self._image_folder)
+            self._rigs = self._read_rigs(images)
             self._imported = _read_matches(source.matches, images)
         return images
+
+    def _read_rigs(self, images: ImageSet) -> tuple[Rig, ...]:
+        """Return the rigs of the images, by default those of other COLMAP input files."""
+        source, rigs = self._source, self._source.rigs
+        if isinstance(rigs, Path):
+            rigs = read_rigs(rigs, images.names, self._image_folder)
+        elif rigs is None:
+            rigs = self._find_rigs(images)
+        in_rig = {name for rig in rigs for name in rig.image_names}
+        turned = [image for image in images if image.name in in_rig and image.orientation != 1]
+        if turned and source.rigs is not None:
+            raise InputError(
+                f"rigs: image {turned[0].name} has EXIF orientation {turned[0].orientation}, but "
+                "the relative poses of a rig need images without EXIF orientation; rotate the "
+                "pixels and remove the EXIF orientation"
+            )
+        return () if turned else tuple(rigs)
+
+    def _find_rigs(self, images: ImageSet) -> tuple[Rig, ...]:
+        """Return the rigs of the COLMAP database or models that the user gave for other inputs."""
+        source = self._source
+        databases = [file for file in source.matches if file.suffix == ".db"]
+        for path in [*databases, source.cameras, source.poses]:
+            if not isinstance(path, Path) or not (path.is_dir() or path.suffix == ".db"):
+                continue
+            try:
+                if rigs := read_rigs(path, images.names, self._image_folder, required=False):
+                    return rigs
+            except InputError as error:
+                self._stages.warn(f"{error}. The images are mapped without rigs")
+        return ()
 
     def _extract(self, images: ImageSet) -> tuple[ImageSet, Extraction]:
         """Run the providers, with features and matcher of a fast first pass if configured."""
@@ -396,6 +437,8 @@ class _Run:
             images = estimate_focal_lengths(images, self._config, self._registry, self._stages)
             config = self._config.fast_pass_config() or self._config
             extraction = extract(images, config, self._registry, self._stages, self._imported)
+            problem = replace(extraction.problem, rigs=self._rigs)
+            extraction = replace(extraction, problem=problem)
             self._doubts = extraction.doubts
             for doubt in extraction.doubts:
                 explanation = explain(doubt)

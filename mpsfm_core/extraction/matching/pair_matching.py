@@ -291,7 +291,7 @@ def merge_matches(problem: MappingProblem, more: AssembledMatches) -> MappingPro
         key = pair.image_a, pair.image_b
         rows = pair.matches + np.array([offsets[index] for index in key])
         pairs[key] = _merge_pair(pairs.get(key), replace(pair, matches=rows))
-    return MappingProblem(images, tuple(pairs[key] for key in sorted(pairs)))
+    return replace(problem, images=images, pairs=tuple(pairs[key] for key in sorted(pairs)))
 
 
 def _std_factor(image: MappingImage) -> Float64:
