@@ -34,7 +34,7 @@ _Sensors = Mapping[int, Pose | None]
 def read_rigs(
     path: Path, names: Collection[str], images_folder: Path | None, *, required: bool = True
 ) -> tuple[Rig, ...]:
-    """Read the rigs of images, as far as two images belong to one frame.
+    """Read the rigs of images; a frame is the images that one rig takes at one moment.
 
     Args:
         path: COLMAP's ``rig_config.json``, a COLMAP model folder, or a COLMAP database (``.db``).

@@ -34,7 +34,7 @@ MIN_METRIC_IMAGES = 3
 
 
 def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | None:
-    """Estimate meters per world unit from the baselines of rigs, or else from metric depth priors.
+    """Estimate meters per world unit from baselines of rigs, else from metric depth priors.
 
     Args:
         scene: The scene.
