@@ -53,6 +53,13 @@ def reconstruct(
             "OPENCV_FISHEYE cameras.",
         ),
     ] = None,
+    projection: Annotated[
+        str | None,
+        typer.Option(
+            metavar="auto|perspective|equirectangular",
+            help="Cut 360-degree panoramas (equirectangular) into perspective photos of a rig.",
+        ),
+    ] = None,
     image_list: ImageList = None,
     poses: Annotated[
         Path | None,
@@ -103,6 +110,8 @@ def reconstruct(
         settings.append(f"inputs.camera_per={camera_per}")
     if camera_model is not None:
         settings.append(f"inputs.camera_model={camera_model}")
+    if projection is not None:
+        settings.append(f"inputs.projection={projection}")
     run(
         images,
         output,

@@ -15,7 +15,8 @@ from types import MappingProxyType
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Float64, MappingProblem, Pose, VerifiedPair
+from mpsfm_core.data import Float64, MappingProblem, Pose, Rig, VerifiedPair
+from mpsfm_core.geometry import compose, invert
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.support.threads import thread_limit
@@ -44,6 +45,7 @@ def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path],
         options.random_seed = 0
         options.ba_refine_focal_length = False
         options.ba_refine_extra_params = False
+        options.ba_refine_sensor_from_rig = False
         options.mapper.abs_pose_refine_focal_length = False
         options.mapper.abs_pose_refine_extra_params = False
         if tuned:
@@ -97,17 +99,23 @@ def write_database(problem: MappingProblem, path: Path) -> None:
     """Write keypoints, verified matches and two-view geometries as a COLMAP database.
 
     A COLMAP image id is the image index in the mapping problem plus one. In the COLMAP database,
-    each image has its own camera.
+    each image has its own camera, except that the images of one sensor of a rig share a camera.
     """
+    in_rig = {name for rig in problem.rigs for name in rig.image_names}
     with pycolmap.Database.open(path) as database:
+        for rig in problem.rigs:
+            _write_rig(database, problem, rig)
         for number, image in enumerate(problem.images, start=1):
+            if image.name in in_rig:
+                database.write_keypoints(number, image.keypoints.astype(np.float32))
+                continue
             camera = colmap_from_pinhole(image.camera)
             camera.camera_id = number
             camera.has_prior_focal_length = True
             database.write_camera(camera, use_camera_id=True)
-            rig = pycolmap.Rig(rig_id=number)
-            rig.add_ref_sensor(camera.sensor_id)
-            database.write_rig(rig, use_rig_id=True)
+            own_rig = pycolmap.Rig(rig_id=number)
+            own_rig.add_ref_sensor(camera.sensor_id)
+            database.write_rig(own_rig, use_rig_id=True)
             row = pycolmap.Image(name=image.name, camera_id=number, image_id=number)
             database.write_image(row, use_image_id=True)
             frame = pycolmap.Frame(frame_id=number, rig_id=number)
@@ -118,6 +126,38 @@ def write_database(problem: MappingProblem, path: Path) -> None:
             ids = pair.image_a + 1, pair.image_b + 1
             database.write_matches(*ids, pair.matches.astype(np.uint32))
             database.write_two_view_geometry(*ids, _geometry(problem, pair))
+
+
+def _write_rig(database: pycolmap.Database, problem: MappingProblem, rig: Rig) -> None:
+    """Write the cameras, images and frames of a rig, whose first sensor is the reference.
+
+    The id of a camera, rig or frame is the id of its first image.
+    """
+    numbers = {image.name: number for number, image in enumerate(problem.images, start=1)}
+    members = [[numbers.get(name or "", 0) for name in frame] for frame in rig.frames]
+    cameras = [min(filter(None, column)) for column in zip(*members, strict=True)]
+    colmap_rig = pycolmap.Rig(rig_id=cameras[0])
+    rig_from_reference = invert(*rig.sensor_from_rig[0])
+    for camera_id, pose in zip(cameras, rig.sensor_from_rig, strict=True):
+        camera = colmap_from_pinhole(problem.images[camera_id - 1].camera)
+        camera.camera_id = camera_id
+        camera.has_prior_focal_length = True
+        database.write_camera(camera, use_camera_id=True)
+        if camera_id == cameras[0]:
+            colmap_rig.add_ref_sensor(camera.sensor_id)
+        else:
+            relative = np.column_stack(compose(pose, rig_from_reference))
+            colmap_rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(relative))
+    database.write_rig(colmap_rig, use_rig_id=True)
+    for images in members:
+        present = [(n, camera) for n, camera in zip(images, cameras, strict=True) if n]
+        frame = pycolmap.Frame(frame_id=min(n for n, _ in present), rig_id=colmap_rig.rig_id)
+        for number, camera_id in present:
+            name = problem.images[number - 1].name
+            row = pycolmap.Image(name=name, camera_id=camera_id, image_id=number)
+            database.write_image(row, use_image_id=True)
+            frame.add_data_id(row.data_id)
+        database.write_frame(frame, use_frame_id=True)
 
 
 def _geometry(problem: MappingProblem, pair: VerifiedPair) -> pycolmap.TwoViewGeometry:

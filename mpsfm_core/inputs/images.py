@@ -567,13 +567,15 @@ def _probe(path: Path, options: InputOptions) -> _ProbedImage:
     try:
         reduced = check_decodable(data, path)
         header = read_header(data)
-        projection = header.projection
-        if projection is None and reduced is not None and is_equirectangular(reduced):
+        projection = None if options.projection == "perspective" else header.projection
+        detects = options.projection == "auto"
+        if projection is None and detects and reduced is not None and is_equirectangular(reduced):
             projection = "equirectangular, by its pixels"
         if projection is not None:
             raise InputError(
-                f"image {path} is a panorama ({projection}): cut it into perspective views "
-                f"first, for example with ffmpeg's v360 filter"
+                f"image {path} is a panorama ({projection}); if all images are panoramas of 360 x "
+                f"180 degrees, set --projection equirectangular, and --projection perspective if "
+                f"the image is none"
             )
         size = upright_size(data, header, path)
         is_transparent = decode_opacity(data, path) is not None

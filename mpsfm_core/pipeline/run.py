@@ -19,13 +19,18 @@ from mpsfm_core.data import MappingProblem, Pose, Rig
 from mpsfm_core.data.decisions import Reason
 from mpsfm_core.data.errors import ConfigError, InputError, ReconstructionError
 from mpsfm_core.data.events import EventCallback
-from mpsfm_core.data.result_layout import IMAGES, SUMMARY
+from mpsfm_core.data.result_layout import IMAGES, SUMMARY, VIEWS_OF_PANORAMAS
 from mpsfm_core.dense.densify import densify
 from mpsfm_core.extraction.active_provider import thread_count, worker_count
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
 from mpsfm_core.extraction.runner import Extraction, extend_matches, extract
-from mpsfm_core.inputs.image_search import check_images_folder, check_output_folder
+from mpsfm_core.inputs.image_search import (
+    check_images_folder,
+    check_output_folder,
+    find_images,
+    select_listed_images,
+)
 from mpsfm_core.inputs.images import ImageSet, load_images
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.matches import (
@@ -34,6 +39,7 @@ from mpsfm_core.inputs.matches import (
     matches_from_hloc,
 )
 from mpsfm_core.inputs.models import Poses, describe_name_difference, match_names, read_poses
+from mpsfm_core.inputs.panorama_views import PanoramaViews, cut_panoramas
 from mpsfm_core.inputs.rigs import read_rigs
 from mpsfm_core.inputs.video import VideoSelection, extract_frames, is_video, read_selection
 from mpsfm_core.mapping import mapper
@@ -278,6 +284,7 @@ class _Run:
         self._imported: ImportedMatches | None = None
         self._known_poses: dict[str, Pose] = {}
         self._rigs: tuple[Rig, ...] = ()
+        self._panorama_views: PanoramaViews | None = None
         self._georeference_report: dict[str, object] | None = None
         self._dense_reports: list[dict[str, Any]] | None = None
         self._doubts: tuple[Reason, ...] = ()
@@ -314,6 +321,7 @@ class _Run:
         """Run all stages of the reconstruction and return the result."""
         self._resolve_providers()
         self._extract_video_frames()
+        self._cut_panoramas()
         self._start_compilation()
         images = self._load_inputs()
         images, extraction = self._extract(images)
@@ -374,6 +382,35 @@ class _Run:
             )
             self._selection = read_selection(self._image_folder)
 
+    def _cut_panoramas(self) -> None:
+        """Cut panoramas into perspective views in the output folder, and use these as images."""
+        options, source = self._config.inputs, self._source
+        if options.projection != "equirectangular":
+            return
+        others = {"cameras": source.cameras, "poses": source.poses, "rigs": source.rigs}
+        given = [name for name, value in others.items() if value is not None]
+        given += ["inputs.masks"] if options.masks is not None else []
+        given += ["database or hloc"] if source.matches else []
+        if given or self._image_folder is None or self._output is None:
+            what = given[0] if given else "an image set in memory, or no output folder,"
+            raise InputError(
+                f"projection equirectangular: {what} cannot be used, because panoramas are files "
+                "that are cut into views with known cameras and rigs in the output folder"
+            )
+        with self._stages.stage("panoramas"):
+            names = find_images(self._image_folder, self._output)
+            if source.image_list is not None:
+                names = select_listed_images(source.image_list, names, self._image_folder)
+            progress = partial(self._stages.stage_progress, "panoramas")
+            self._panorama_views = cut_panoramas(
+                self._image_folder,
+                names,
+                self._output / VIEWS_OF_PANORAMAS,
+                options.max_pixels,
+                progress,
+            )
+            self._image_folder = self._panorama_views.folder
+
     def _load_inputs(self) -> ImageSet:
         """Read image headers, intrinsics, poses and imported matches; check memory and disk."""
         source = self._source
@@ -385,10 +422,11 @@ class _Run:
                     images = images.written_to(self._image_folder)
             else:
                 assert self._image_folder is not None
+                views = self._panorama_views
                 images = load_images(
                     self._image_folder,
-                    source.cameras,
-                    source.image_list,
+                    source.cameras if views is None else views.cameras,
+                    source.image_list if views is None else None,
                     self._config.inputs,
                     model=source.camera_model,
                     without=self._output,
@@ -403,6 +441,8 @@ class _Run:
     def _read_rigs(self, images: ImageSet) -> tuple[Rig, ...]:
         """Return the rigs of the images, by default those of other COLMAP input files."""
         source, rigs = self._source, self._source.rigs
+        if self._panorama_views is not None:
+            return (self._panorama_views.rig,)
         if isinstance(rigs, Path):
             rigs = read_rigs(rigs, images.names, self._image_folder)
         elif rigs is None:
@@ -570,6 +610,8 @@ class _Run:
         every, video = self._config.inputs.video.trajectory_every, self._source.video
         if video is None or self._selection is None or not every:
             return
+        if self._panorama_views is not None:
+            return  # the frames of a video between keyframes are not cut into views
         with self._stages.stage("trajectory"):
             progress = partial(self._stages.stage_progress, "trajectory")
             self._trajectory = localize_frames(

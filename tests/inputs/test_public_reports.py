@@ -272,7 +272,7 @@ def test_portrait_photos_keep_their_pixels_and_intrinsics(tmp_path: Path) -> Non
 def test_equirectangular_photos_name_a_remedy(tmp_path: Path) -> None:
     """cvg/mpsfm#10: photos of 360 degrees."""
     xmp = b'<rdf:Description GPano:ProjectionType="equirectangular"/>'
-    with pytest.raises(InputError, match=r"panorama \(equirectangular\).*v360"):
+    with pytest.raises(InputError, match=r"panorama \(equirectangular\).*--projection"):
         load(write_photos(tmp_path, xmp=xmp))
 
 

@@ -7,10 +7,10 @@ from itertools import combinations
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import Float64, MappingProblem, PinholeCamera, Pose, Rig
 from mpsfm_core.geometry import compose, inside
+from mpsfm_core.geometry.panorama import make_view_rotations
 from mpsfm_core.testing.synthetic.problems import (
     SyntheticNoise,
     make_verified_pair,
@@ -45,8 +45,8 @@ def make_rig_sensors(kind: RigKind) -> tuple[Pose, ...]:
     if kind == "stereo":
         return ((np.eye(3), np.zeros(3)), (np.eye(3), np.array([-0.2, 0.0, 0.0])))
     count, distance = (4, 0.1) if kind == "around" else (8, 0.0)
-    turns = Rotation.from_euler("y", -360.0 * np.arange(count)[:, None] / count, degrees=True)
-    return tuple((turn, np.array([0.0, 0.0, -distance])) for turn in turns.as_matrix())
+    shift = np.array([0.0, 0.0, -distance])
+    return tuple((rotation, shift) for rotation in make_view_rotations(count))
 
 
 def make_rig_problem(
