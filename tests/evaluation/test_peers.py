@@ -11,6 +11,7 @@ from mpsfm_core.evaluation import CONVENTIONS, pose_errors_deg
 from mpsfm_core.evaluation.peers import PEERS, run_peer, write_database
 from mpsfm_core.support.threads import limit_threads
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
+from mpsfm_core.testing.synthetic.rigs import make_rig_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(640, 480, 520.0, 515.0, 318.0, 242.0)
@@ -44,6 +45,15 @@ def test_write_database_contains_problem(problem: MappingProblem, tmp_path) -> N
         lines = np.column_stack([a, np.ones(len(a))]) @ np.asarray(geometry.F).T
         distance = (lines[:, :2] * b).sum(1) + lines[:, 2]
         assert np.median(np.abs(distance) / np.linalg.norm(lines[:, :2], axis=1)) < 0.5
+
+
+def test_write_database_with_rig_contains_relative_poses_and_frames(tmp_path) -> None:
+    problem = make_rig_problem(room_scene(), "stereo", POSES[:2], num_points=100).problem
+    write_database(problem, tmp_path / "database.db")
+    with pycolmap.Database.open(tmp_path / "database.db") as database:
+        assert (database.num_rigs(), database.num_frames(), database.num_cameras()) == (1, 2, 2)
+        ((pose,),) = [rig.non_ref_sensors.values() for rig in database.read_all_rigs()]
+    np.testing.assert_allclose(pose.translation, [-0.2, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("name", PEERS)
