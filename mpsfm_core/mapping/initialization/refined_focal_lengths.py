@@ -22,7 +22,7 @@ MIN_FOCAL_CHANGE = 1.1
 """Ratio of refined and initial focal length from which the initial focal length has distorted the
 relative poses of pairs, so that the mapper runs again. [ours]"""
 MAX_ERROR_PX = 4.0
-"""Largest Sampson error of an inlier of the essential matrix. [COLMAP two-view max_error]"""
+"""Largest error of an inlier of the two-view geometry. [COLMAP two-view max_error]"""
 MIN_INLIER_RATIO = 0.25
 """Assumed inlier ratio from which RANSAC computes its number of trials. [COLMAP two-view
 min_inlier_ratio]
@@ -36,8 +36,7 @@ def apply_refined_focal_lengths(
 
     If no focal length changed much, images that deviate from the focal length of their shared
     camera get their own cameras. The priors on focal lengths keep their original means. Each pair
-    of an image whose focal length changes gets a new relative pose from the essential matrix of its
-    matches.
+    of an image whose focal length changes gets a new relative pose from its matches.
 
     Args:
         problem: The mapping problem that was reconstructed.
@@ -104,24 +103,33 @@ def estimate_relative_poses(problem: MappingProblem, changed: Bool, seed: int) -
 
 
 def _estimate_relative_pose(problem: MappingProblem, pair: VerifiedPair, seed: int) -> VerifiedPair:
-    """Return a pair with a new relative pose if RANSAC finds an essential matrix."""
+    """Return a pair with a new relative pose if COLMAP's two-view geometry has one.
+
+    The pair is calibrated if COLMAP prefers the essential matrix to fundamental matrix and
+    homography.
+    """
     image_a, image_b = problem.images[pair.image_a], problem.images[pair.image_b]
-    result = pycolmap.estimate_essential_matrix(
-        _undistort_keypoints(image_a, pair.matches[:, 0]),
-        _undistort_keypoints(image_b, pair.matches[:, 1]),
+    options = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True, detect_watermark=False)
+    options.ransac.max_error = MAX_ERROR_PX * max(image_a.keypoint_std_px, image_b.keypoint_std_px)
+    options.ransac.min_inlier_ratio = MIN_INLIER_RATIO
+    options.ransac.random_seed = seed
+    geometry = pycolmap.estimate_calibrated_two_view_geometry(
         colmap_from_pinhole(image_a.camera),
+        _undistort_keypoints(image_a, pair.matches[:, 0]),
         colmap_from_pinhole(image_b.camera),
-        pycolmap.RANSACOptions(
-            max_error=MAX_ERROR_PX * max(image_a.keypoint_std_px, image_b.keypoint_std_px),
-            min_inlier_ratio=MIN_INLIER_RATIO,
-            random_seed=seed,
-        ),
+        _undistort_keypoints(image_b, pair.matches[:, 1]),
+        np.repeat(np.arange(len(pair), dtype=np.uint32)[:, None], 2, axis=1),
+        options,
     )
-    if result is None:
+    pose = geometry.cam2_from_cam1
+    if pose is None:
         return pair
-    pose = result["cam2_from_cam1"]
-    rotation = np.array(pose.rotation.matrix(), order="C")
-    return replace(pair, rotation=rotation, translation=np.array(pose.translation))
+    return replace(
+        pair,
+        rotation=np.array(pose.rotation.matrix(), order="C"),
+        translation=np.array(pose.translation),
+        calibrated=geometry.config == pycolmap.TwoViewGeometryConfiguration.CALIBRATED,
+    )
 
 
 def _undistort_keypoints(image: MappingImage, rows: Int64) -> Float64:
