@@ -12,10 +12,26 @@ provider.
 
 from __future__ import annotations
 
-from mpsfm_core.testing.contract import CheckResult, run_checks
-from mpsfm_core.testing.contract_case import ContractCase, ContractSetup
-from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
-from mpsfm_core.testing.pytest_tests import contract_tests, hook_tests
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mpsfm_core.testing.contract import CheckResult, run_checks
+    from mpsfm_core.testing.contract_case import ContractCase, ContractSetup
+    from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+    from mpsfm_core.testing.pytest_tests import contract_tests, hook_tests
+
+_LAZY_NAMES = {
+    "CheckFailed": "outcome",
+    "CheckResult": "contract",
+    "CheckSkipped": "outcome",
+    "ContractCase": "contract_case",
+    "ContractSetup": "contract_case",
+    "contract_tests": "pytest_tests",
+    "hook_tests": "pytest_tests",
+    "run_checks": "contract",
+}
+"""Module of each exported name. The second process of a contract imports few of the modules."""
 
 __all__ = [
     "CheckFailed",
@@ -27,3 +43,12 @@ __all__ = [
     "hook_tests",
     "run_checks",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import an exported name at first use."""
+    if name not in _LAZY_NAMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_LAZY_NAMES[name]}"), name)
+    globals()[name] = value
+    return value

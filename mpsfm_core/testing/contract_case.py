@@ -198,6 +198,20 @@ class ContractCase:
                 self._example = outdoor_example(appearance).with_common_camera()
         return self._example
 
+    @cached_property
+    def small_example(self) -> Example:
+        """Synthetic view of 104 x 120 pixels, for checks that do not depend on the image size."""
+        return self.example.sized(104, 120)
+
+    @property
+    def example_sequence(self) -> tuple[Example, ...]:
+        """Synthetic views in the order of the calls of :attr:`observed`.
+
+        The sequence starts with a view of another size than :attr:`example`, because a provider may
+        store values of the first view.
+        """
+        return self.small_example, self.example.partner, self.example
+
     def create_provider(self, **inner_options: Any) -> Any:
         """Construct a new instance of the provider under test.
 
@@ -220,15 +234,16 @@ class ContractCase:
 
     @cached_property
     def observed(self) -> ObservedInstance:
-        """Second instance of the provider under test, with the recorded effects of two calls."""
-        example = self.example
-        self.run(example)  # imports the provider's libraries, which may change the process
+        """Second instance of the provider under test, with the recorded effects of its calls."""
+        self.run(self.example)  # imports the provider's libraries, which may change the process
+        calls = [self._prepare_call(example) for example in self.example_sequence]
+        return observe_instance(self.create_provider, calls, self.process_before)
+
+    def _prepare_call(self, example: Example) -> Callable[[Any], Any]:
+        """Return a function that calls a provider instance with a view and its prepared inputs."""
+        self.prepare(example, *([example.partner] if self._uses_pair else []))
         auxiliary = self.make_auxiliary_input(example.view, example)
-        return observe_instance(
-            self.create_provider,
-            lambda provider: self.run_on_view(example.view, example, provider, auxiliary),
-            self.process_before,
-        )
+        return lambda provider: self.run_on_view(example.view, example, provider, auxiliary)
 
     def run(self, example: Example, provider: Any = None) -> Any:
         """Run the provider on a synthetic view and validate the output.
@@ -373,7 +388,7 @@ class ContractCase:
         return replace(self.spec, capabilities=frozenset({"needs-depth"}))
 
     def _detect(self, view: View) -> Features:
-        spec = self._choose_detector()
+        spec = self._detector_spec
         digest = hashlib.blake2b(view.image.tobytes()).digest()
         detection = _Detection(spec, digest, view.camera, self._device, view, self._create_detector)
         return deepcopy(_detect_once(detection))
@@ -385,8 +400,9 @@ class ContractCase:
             self._detector = self._create(self.registry, "features", spec.name, options)
         return self._detector
 
-    def _choose_detector(self) -> ProviderSpec:
-        """Choose a detector of the matcher's family and plugin, or SIFT without a family."""
+    @cached_property
+    def _detector_spec(self) -> ProviderSpec:
+        """Detector of the matcher's family and plugin, or SIFT without a family."""
         family = set(self.spec.tags)
         plugin = self.registry.version(self.spec.kind, self.name)
 

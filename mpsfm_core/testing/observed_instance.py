@@ -7,7 +7,7 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -21,16 +21,16 @@ from mpsfm_core.testing.process_state import (
 
 @dataclass(frozen=True)
 class ObservedInstance:
-    """Provider instance and everything that its construction and two calls did."""
+    """Provider instance and everything that its construction and its calls did."""
 
     provider: Any
     """The provider instance."""
-    answer: Any
-    """Output of the second call."""
+    answers: tuple[Any, ...]
+    """Output of each call."""
     construction_s: float
     """Time in seconds to construct the provider."""
     call_s: tuple[float, float]
-    """Time in seconds of the first and of the second call."""
+    """Time in seconds of the first and of the last call."""
     changes: dict[str, str]
     """Name of the global setting that the construction and the first call changed, or an empty
     text."""
@@ -41,17 +41,17 @@ class ObservedInstance:
 
 
 def observe_instance(
-    create: Callable[[], Any], call: Callable[[Any], Any], settings: ProcessSettings
+    create: Callable[[], Any], calls: Sequence[Callable[[Any], Any]], settings: ProcessSettings
 ) -> ObservedInstance:
-    """Construct a provider and call the provider twice while observing the process.
+    """Construct a provider and call the provider several times while observing the process.
 
     The construction and the first call run with known random numbers, threads and environment
-    variables, so that every change is visible. The second call runs with the settings of a
+    variables, so that every change is visible. Later calls run with the settings of a
     reconstruction.
 
     Args:
         create: Function that constructs the provider.
-        call: Function that calls a provider and returns the output.
+        calls: At least two functions that call a provider and return the output.
         settings: Settings of the process before any instance of the provider was created.
     """
     with _capture_output() as printed, _record_connections() as connections:
@@ -62,7 +62,7 @@ def observe_instance(
             construction_s = time.perf_counter() - started
             constructed = read_process_state()
             started = time.perf_counter()
-            call(provider)
+            answers = [calls[0](provider)]
             first_s = time.perf_counter() - started
             changes = {
                 "constructing the provider": before.changes(
@@ -70,11 +70,12 @@ def observe_instance(
                 ),
                 "a call of the provider": constructed.changes(read_process_state()),
             }
-        started = time.perf_counter()
-        answer = call(provider)
-        second_s = time.perf_counter() - started
+        for call in calls[1:]:
+            started = time.perf_counter()
+            answers.append(call(provider))
+            last_s = time.perf_counter() - started
     return ObservedInstance(
-        provider, answer, construction_s, (first_s, second_s), changes, printed, connections
+        provider, tuple(answers), construction_s, (first_s, last_s), changes, printed, connections
     )
 
 

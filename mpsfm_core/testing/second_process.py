@@ -6,6 +6,7 @@ once.
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import tempfile
 import weakref
 from functools import lru_cache
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 from mpsfm_core.support.child_process import subprocess_environment
 from mpsfm_core.testing.outcome import CheckFailed
@@ -23,6 +24,8 @@ class SecondProcess:
     """Python process that runs one provider after another."""
 
     def __init__(self) -> None:
+        self.is_new = True
+        """True until the process has imported a plugin or a provider."""
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - lives as long as the process
         self._process = subprocess.Popen(
             [sys.executable, "-c", _SCRIPT],
@@ -33,6 +36,21 @@ class SecondProcess:
             text=True,
         )
         weakref.finalize(self, _stop, self._process, self._errors)
+
+    def measure_import(self, modules: tuple[str, ...], heavy: tuple[str, ...]) -> Any:
+        """Import plugin modules in the second process, which must be new.
+
+        Args:
+            modules: Names of the modules of one plugin.
+            heavy: Names of heavy libraries.
+
+        Returns:
+            Import time in seconds and the names of imported heavy libraries.
+
+        Raises:
+            CheckFailed: a module cannot be imported.
+        """
+        return self._call("importing the plugin module fails", "measure_import", modules, heavy)
 
     def run(self, data: bytes) -> bytes:
         """Restore a contract case in the second process, and call its provider.
@@ -48,20 +66,33 @@ class SecondProcess:
         Raises:
             CheckFailed: the provider raises an exception or ends the process.
         """
-        assert self._process.stdin is not None and self._process.stdout is not None
         with tempfile.TemporaryDirectory(prefix="mpsfm-second-process-") as folder:
             path = Path(folder, "input")
             path.write_bytes(data)
-            try:
-                print(path, Path.cwd(), sep="\t", file=self._process.stdin, flush=True)
-                message = self._process.stdout.readline()
-            except BrokenPipeError:
-                message = ""
-            if message != "\n":
-                _start.cache_clear()
-                reason = message.strip() or self._last_error()
-                raise CheckFailed(f"the provider fails in a second process: {reason}")
+            what = "the provider fails in a second process"
+            self._call(what, "run_provider", str(path), str(Path.cwd()))
             return path.with_suffix(".answer").read_bytes()
+
+    def _call(self, what: str, function: str, *arguments: Any) -> Any:
+        """Call a function of the second process and return its result.
+
+        Args:
+            what: Beginning of the error message if the call fails.
+            function: Name of a function in :data:`_SCRIPT`.
+            arguments: Arguments of the function that JSON can represent.
+        """
+        assert self._process.stdin is not None and self._process.stdout is not None
+        self.is_new = False
+        try:
+            print(json.dumps([function, arguments]), file=self._process.stdin, flush=True)
+            line = self._process.stdout.readline()
+        except BrokenPipeError:
+            line = ""
+        error, result = json.loads(line) if line else (self._last_error(), None)
+        if error:
+            _start.cache_clear()
+            raise CheckFailed(f"{what}: {error}")
+        return result
 
     def _last_error(self) -> str:
         """Return the last line on standard error of the process that ended."""
@@ -73,6 +104,26 @@ class SecondProcess:
 def run_in_second_process(data: bytes) -> bytes:
     """Call :meth:`SecondProcess.run` of the second process, which is started at first use."""
     return _start(os.getpid(), tuple(sys.path)).run(data)
+
+
+@lru_cache(maxsize=8)
+def measure_import(path: tuple[str, ...], modules: tuple[str, ...], heavy: tuple[str, ...]) -> Any:
+    """Import plugin modules in a new process, once for all providers of a plugin.
+
+    Args:
+        path: Module search path.
+        modules: Names of the modules of one plugin.
+        heavy: Names of heavy libraries.
+
+    Returns:
+        Import time in seconds and the names of imported heavy libraries.
+
+    Raises:
+        CheckFailed: a module cannot be imported.
+    """
+    shared = _start(os.getpid(), path)
+    process = shared if shared.is_new else SecondProcess()
+    return process.measure_import(modules, heavy)
 
 
 @lru_cache(maxsize=1)
@@ -88,30 +139,42 @@ def _stop(process: subprocess.Popen[str], errors: IO[str]) -> None:
 
 
 _SCRIPT = """
-import os, pathlib, pickle, sys, time
+import importlib, json, os, pathlib, pickle, sys, time
 # A provider may print, so the messages to the first process have a file of their own.
 messages = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)
-from mpsfm_core.testing.contract_case import restore_case
-for line in sys.stdin:
-    path, folder = line.rstrip("\\n").split("\\t")
+import mpsfm_core.providers.registry
+
+def measure_import(modules, heavy):
+    before, started = set(sys.modules), time.perf_counter()
+    for name in modules:
+        importlib.import_module(name).mpsfm_providers()
+    seconds = time.perf_counter() - started
+    return seconds, sorted(set(heavy) & (set(sys.modules) - before))
+
+def run_provider(path, folder):
+    from mpsfm_core.testing.contract_case import restore_case
     path = pathlib.Path(path)
     os.chdir(folder)
-    message = ""
+    started = time.perf_counter()
     try:
-        started = time.perf_counter()
-        try:
-            state, example, auxiliary = pickle.loads(path.read_bytes())
-        except Exception as error:
-            found = f"the provider cannot be imported in a second process: {error}", 0.0
-        else:
-            case = restore_case(*state)
-            case.prepare(example, example.partner)
-            case.provider
-            seconds = time.perf_counter() - started
-            found = case.run_on_view(example.view, example, auxiliary=auxiliary), seconds
-        path.with_suffix(".answer").write_bytes(pickle.dumps(found))
+        state, example, auxiliary = pickle.loads(path.read_bytes())
     except Exception as error:
-        message = f"{type(error).__name__}: {error}".replace("\\n", " ")
-    print(message, file=messages, flush=True)
+        found = f"the provider cannot be imported in a second process: {error}", 0.0
+    else:
+        case = restore_case(*state)
+        case.prepare(example, example.partner)
+        case.provider
+        seconds = time.perf_counter() - started
+        found = case.run_on_view(example.view, example, auxiliary=auxiliary), seconds
+    path.with_suffix(".answer").write_bytes(pickle.dumps(found))
+
+for line in sys.stdin:
+    function, arguments = json.loads(line)
+    error = result = None
+    try:
+        result = globals()[function](*arguments)
+    except Exception as caught:
+        error = f"{type(caught).__name__}: {caught}".replace("\\n", " ")
+    print(json.dumps([error, result]), file=messages, flush=True)
 """

@@ -247,9 +247,9 @@ class StdOfNetwork(Detector):
     ("factory", "check", "message"),
     [
         (FirstRows, "features-coverage", "keypoints cover . of 9 parts"),
-        (FirstTile, "features-large-view", "have 100% and 0% of the keypoints"),
+        (FirstTile, "features-large-view", "and 0% of the keypoints"),
         (LowIsStrong, "features-scores", "without contrast have higher scores"),
-        (ScalesOfNetwork, "features-scales", "scales grow .* times"),
+        (ScalesOfNetwork, "features-scales", "scales are .* times"),
         (StdOfNetwork, "features-std", "times the declared std_px"),
     ],
 )

@@ -13,14 +13,11 @@ of a second. Outputs of a provider are compared bit for bit, because a run reuse
 
 from __future__ import annotations
 
-import json
 import pickle
-import subprocess
 import sys
 import threading
 import time
 from dataclasses import fields, replace
-from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -35,6 +32,7 @@ from mpsfm_core.testing.checks.process import PROCESS_CHECKS
 from mpsfm_core.testing.contract_case import ContractCase, describe_difference
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
+from mpsfm_core.testing.second_process import measure_import
 
 HEAVY_MODULES = (
     *("torch", "torchvision", "onnxruntime", "tensorflow", "jax", "kornia", "transformers"),
@@ -80,52 +78,12 @@ def check_light_import(case: ContractCase) -> str:
     modules = _find_plugin_modules(case)
     if not modules:
         raise CheckSkipped("the provider was registered in this process, not by an entry point")
-    seconds, heavy = _measure_import(tuple(sys.path), tuple(modules))
+    seconds, heavy = measure_import(tuple(sys.path), tuple(modules), HEAVY_MODULES)
     if heavy:
         raise CheckFailed(f"the plugin module {modules[0]!r} imports {' '.join(heavy)}")
     if seconds > MAX_IMPORT_S:
         raise CheckFailed(f"importing the plugin module {modules[0]!r} takes {seconds:.1f} s")
     return f"{seconds:.3f} s to import"
-
-
-@lru_cache(maxsize=8)
-def _measure_import(path: tuple[str, ...], modules: tuple[str, ...]) -> tuple[float, list[str]]:
-    """Import plugin modules in a new process, once for all providers of a plugin.
-
-    Args:
-        path: Module search path.
-        modules: Names of the modules of one plugin.
-
-    Returns:
-        Import time in seconds and the names of imported heavy libraries.
-
-    Raises:
-        CheckFailed: a module cannot be imported.
-    """
-    command = [sys.executable, "-c", _IMPORT_SCRIPT, json.dumps([path, modules, HEAVY_MODULES])]
-    process = subprocess.run(command, capture_output=True, text=True)
-    if process.returncode:
-        last_line = (process.stderr.strip().splitlines() or ["no message"])[-1]
-        raise CheckFailed(f"importing the plugin module fails: {last_line}")
-    # The last line of the output is the script's result, because native code of a plugin may print
-    # other lines before.
-    seconds, heavy = json.loads(process.stdout.splitlines()[-1])
-    return seconds, heavy
-
-
-_IMPORT_SCRIPT = """
-import contextlib, importlib, json, sys, time
-sys.path[:], modules, heavy = json.loads(sys.argv[1])
-import mpsfm_core.providers.registry
-before = set(sys.modules)
-started = time.perf_counter()
-with contextlib.redirect_stdout(sys.stderr):
-    for name in modules:
-        importlib.import_module(name).mpsfm_providers()
-seconds = time.perf_counter() - started
-print()
-print(json.dumps([seconds, sorted(set(heavy) & (set(sys.modules) - before))]))
-"""
 
 
 def check_output_rules(case: ContractCase) -> None:
@@ -144,7 +102,7 @@ def check_deterministic(case: ContractCase) -> None:
     """
     first = case.run(case.example)
     _require_same(first, case.run(case.example, case.provider), "in a second call")
-    _require_same(first, case.observed.answer, "of a second instance")
+    _require_same(first, case.observed.answers[-1], "of a second instance")
 
 
 def check_no_state(case: ContractCase) -> None:
@@ -153,14 +111,13 @@ def check_no_state(case: ContractCase) -> None:
     A reconstruction calls a provider for the images in any order. An output that shares memory with
     a buffer of the provider changes in later calls.
     """
-    examples = [case.example, case.example.sized(104, 120), case.example.partner]
-    # Copies, because a later call could overwrite the output of an earlier call.
-    expected = [pickle.loads(pickle.dumps(case.run(example))) for example in examples]
-    # Another instance predicts in another order, so that each view has other predecessors.
-    provider, order = case.create_provider(), (1, 2, 0)
-    answers = {index: case.run(examples[index], provider) for index in order}
-    for index in order:
-        _require_same(expected[index], answers[index], "after other views, or of an earlier call,")
+    # The shared instance predicts in the reverse order, so that each view has other predecessors.
+    # Outputs are copied, because a later call could overwrite the output of an earlier call.
+    reverse = [
+        pickle.loads(pickle.dumps(case.run(example))) for example in case.example_sequence[::-1]
+    ]
+    for expected, answer in zip(reverse[::-1], case.observed.answers, strict=True):
+        _require_same(expected, answer, "after other views, or of an earlier call,")
 
 
 def check_inputs_unchanged(case: ContractCase) -> None:
@@ -168,7 +125,7 @@ def check_inputs_unchanged(case: ContractCase) -> None:
 
     Other providers of the same run use the same arrays.
     """
-    example = case.example.sized(*case.example.camera.size)
+    example = case.small_example
     image = np.array(example.view.image)
     view = View(example.name, image, example.camera, np.ones(image.shape[:2], np.bool_))
     case.prepare(example)
@@ -192,9 +149,9 @@ def check_name_does_not_matter(case: ContractCase) -> None:
         raise CheckSkipped("declares 'uncached'")
     if case.setup.prepare is not None:
         raise CheckSkipped("the provider reads one prepared file per view name")
-    expected = case.run(case.example)
-    renamed = replace(case.example.view, name="another/name.jpg")
-    _require_same(expected, case.run_on_view(renamed, case.example), "of a renamed view")
+    example = case.small_example
+    renamed = replace(example.view, name="another/name.jpg")
+    _require_same(case.run(example), case.run_on_view(renamed, example), "of a renamed view")
 
 
 def check_intrinsics_declared(case: ContractCase) -> None:
@@ -207,10 +164,10 @@ def check_intrinsics_declared(case: ContractCase) -> None:
         raise CheckSkipped("declares 'intrinsics-aware'")
     if case.declares("uncached"):
         raise CheckSkipped("declares 'uncached'")
-    expected = case.run(case.example)
-    camera = case.example.camera
+    example = case.small_example
+    expected, camera = case.run(example), example.camera
     longer = replace(camera, fx=1.3 * camera.fx, fy=1.3 * camera.fy)
-    answer = case.run_on_view(replace(case.example.view, camera=longer), case.example)
+    answer = case.run_on_view(replace(example.view, camera=longer), example)
     # Another focal length may only change which normals face the camera, not the normals
     # themselves.
     if isinstance(expected, NormalPrior):
@@ -228,7 +185,7 @@ def check_threads(case: ContractCase) -> None:
 
     A run creates one instance of a provider per thread.
     """
-    examples = [case.example, case.example.sized(*case.example.camera.size).partner]
+    examples = [case.example, case.example.partner]
     alone = [case.run(example) for example in examples]
     instances = [case.provider, case.observed.provider]
     parallel: list[Any] = [None] * len(examples)
@@ -341,8 +298,8 @@ def check_thin_view(case: ContractCase) -> None:
 
 def check_grayscale(case: ContractCase) -> None:
     """Require valid output for a grayscale image that is passed as three equal channels."""
-    gray = np.asarray(case.example.view.image).mean(axis=-1, keepdims=True)
-    shape = case.example.view.image.shape
+    gray = np.asarray(case.small_example.view.image).mean(axis=-1, keepdims=True)
+    shape = case.small_example.view.image.shape
     _run_on_image(case, np.broadcast_to(gray.astype(np.uint8), shape))
 
 
@@ -356,7 +313,7 @@ def check_sixteen_bit(case: ContractCase) -> None:
     from mpsfm_core.inputs.image_decoding import decode_rgb
     from mpsfm_core.inputs.image_header import ImageHeader
 
-    wide = case.example.view.image[..., 0].astype(np.uint16) * 257
+    wide = case.small_example.view.image[..., 0].astype(np.uint16) * 257
     data = cv2.imencode(".png", wide)[1].tobytes()
     _run_on_image(case, decode_rgb(data, ImageHeader(None, 1, {}), Path("gray16.png")))
 
@@ -364,7 +321,7 @@ def check_sixteen_bit(case: ContractCase) -> None:
 def check_flat(case: ContractCase) -> None:
     """Require valid output for black and white views without texture."""
     for value in (0, 255):
-        _run_on_image(case, np.full(case.example.view.image.shape, value, np.uint8))
+        _run_on_image(case, np.full(case.small_example.view.image.shape, value, np.uint8))
 
 
 def check_masked(case: ContractCase) -> None:
@@ -455,9 +412,9 @@ def _reduce_map(answer: Any, example: Example) -> Any:
 
 
 def _run_on_image(case: ContractCase, image: UInt8) -> None:
-    case.prepare(case.example)
-    view = replace(case.example.view, image=np.ascontiguousarray(image))
-    case.run_on_view(view, case.example)
+    example = case.small_example
+    case.prepare(example)
+    case.run_on_view(replace(example.view, image=np.ascontiguousarray(image)), example)
 
 
 def _find_plugin_modules(case: ContractCase) -> list[str]:

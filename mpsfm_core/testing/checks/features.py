@@ -15,7 +15,7 @@ PIXEL_TOLERANCE = 0.25
 """Largest accepted shift of keypoints in pixels, or in multiples of the keypoint std if ``std_px``
 exceeds one. Integer pixel centers shift keypoints by 0.5 pixels, but the shift is 0.00 for SIFT and
 at most 0.08 for XFeat."""
-LARGE_SIZE = (4096, 512)
+LARGE_SIZE = (4096, 256)
 """Width and height in pixels of a view as wide as phone photos. Networks limit the longer side; the
 small height limits the run time."""
 _SAME_KEYPOINT_PX = 2.5
@@ -40,7 +40,7 @@ _MIN_ORDER = 0.4
 """Smallest accepted probability that a keypoint with contrast has a higher score than one without.
 Meaningless scores give a probability of 0.5, inverted scores a probability of 0."""
 _SCALE_RANGE = (1.4, 2.8)
-"""Accepted range of the growth factor of keypoint scales in a view of twice the size."""
+"""Accepted range of the ratio of keypoint scales in a view and in a view of half the size."""
 _MAX_STD_FACTOR = 3.0
 """Largest accepted ratio of the measured keypoint error and ``std_px``, which is 0.03 for SIFT."""
 _MAX_ERROR_PX = 6.0
@@ -127,15 +127,17 @@ def check_features_scores(case: ContractCase) -> str:
 
 
 def check_features_scales(case: ContractCase) -> str:
-    """Require keypoint scales in pixels, which double in a view of twice the size."""
+    """Require keypoint scales in pixels, which halve in a view of half the size."""
     case.require_truth("image")
     width, height = case.example.camera.size
-    large = case.example.sized(2 * width, 2 * height)
-    small_features, features = case.run(case.example), case.run(large)
-    if small_features.scales is None or features.scales is None:
+    features: Features = case.run(case.example)
+    if features.scales is None:
         raise CheckSkipped("the features have no scales")
-    if np.ptp(small_features.scales) < 0.01 * small_features.scales.mean():
+    if np.ptp(features.scales) < 0.01 * features.scales.mean():
         raise CheckSkipped("all features have the same scale")
+    small_features: Features = case.run(case.example.sized(width // 2, height // 2))
+    if small_features.scales is None:
+        raise CheckSkipped("the features of a smaller view have no scales")
     distance = np.linalg.norm(
         2 * small_features.keypoints[:, None] - features.keypoints[None], axis=2
     )
@@ -144,14 +146,14 @@ def check_features_scales(case: ContractCase) -> str:
         near = np.flatnonzero(distance[row] < _SAME_KEYPOINT_PX)
         pairs.append(features.scales[near] / small_features.scales[row])
     if len(pairs) < _MIN_COUNT:
-        raise CheckSkipped(f"only {len(pairs)} keypoints repeat in a view of twice the size")
-    # A keypoint can have features of several scales, one of which must be twice as large in the
-    # view of twice the size.
+        raise CheckSkipped(f"only {len(pairs)} keypoints repeat in a view of half the size")
+    # A keypoint can have features of several scales, one of which must be twice the scale in the
+    # view of half the size.
     best = np.array([ratio[np.abs(np.log(ratio / 2)).argmin()] for ratio in pairs])
     factor = float(np.median(best))
     if not _SCALE_RANGE[0] < factor < _SCALE_RANGE[1]:
-        raise CheckFailed(f"scales grow {factor:.2g} times in a view of twice the size")
-    return f"scales grow {factor:.2g} times"
+        raise CheckFailed(f"scales are {factor:.2g} times those in a view of half the size")
+    return f"scales are {factor:.2g} times those in a view of half the size"
 
 
 def check_features_std(case: ContractCase) -> str:
@@ -208,7 +210,7 @@ def check_features_pixel_convention(case: ContractCase) -> str:
 def check_features_large_view(case: ContractCase) -> str:
     """Require keypoints in pixels of a large view, even if the provider reduces the image.
 
-    Only two opposite corners of the view of 4096 x 512 pixels have texture. Keypoints of a reduced
+    Only two opposite corners of the view of 4096 x 256 pixels have texture. Keypoints of a reduced
     image that are not scaled back, or of the first tiles only, miss one of the corners.
     """
     case.require_truth("image")
