@@ -183,10 +183,11 @@ def check_matcher_few_features(case: ContractCase) -> None:
 
 
 def check_matcher_many_features(case: ContractCase) -> str:
-    """Require correct matches of 4096 and 600 features in views of 480 x 360 and 240 x 180 pixels.
+    """Require correct matches of 4096 and 600 features.
 
-    Real images have about 4096 features each. A fixed buffer or a size limit of the matching
-    network must not end a run, and must not leave the last features without matches.
+    The views have 480 x 360 and 240 x 180 pixels. Real images have about 4096 features each. A
+    fixed buffer or a size limit of the matching network must not end a run, and must not leave the
+    last features without matches.
     """
     if not case.declares("sparse"):
         raise CheckSkipped("the matcher needs no features")
