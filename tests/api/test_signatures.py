@@ -31,6 +31,7 @@ MODULES_WITH_DOCTESTS = (
     "mpsfm_core.data.features",
     "mpsfm_core.data.mapping_problem",
     "mpsfm_core.data.priors",
+    "mpsfm_core.data.rigs",
     "mpsfm_core.providers.provider_config",
     "mpsfm_core.providers.protocols",
 )
