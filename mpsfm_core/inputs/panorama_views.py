@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -63,16 +64,20 @@ def cut_panoramas(
 ) -> PanoramaViews:
     """Cut all panoramas of a folder into views, and write the views.
 
+    The views of an earlier call are removed, because the panoramas may have changed.
+
     Args:
         folder: Folder of the panoramas.
         names: Names of the panoramas below the folder.
-        output: Folder of the views.
+        output: Folder of the views, which contains nothing else.
         max_pixels: Maximum number of pixels of a panorama.
         progress: Function that receives the number of cut panoramas and their total number.
 
     Raises:
         InputError: A panorama cannot be decoded, or is not twice as wide as high.
     """
+    if output.is_dir():
+        shutil.rmtree(output)
     rotations = make_view_rotations()
     cameras: dict[str, PinholeCamera] = {}
     frames = []

@@ -78,6 +78,15 @@ def test_cut_panoramas_writes_views_cameras_and_frames(tmp_path: Path) -> None:
         assert image.shape[:2] == (camera.height, camera.width)
 
 
+def test_views_of_earlier_panoramas_are_removed(tmp_path: Path) -> None:
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), np.zeros((32, 64, 3), np.uint8))
+    for name in ("a.png", "b.png"):
+        views = cut_panoramas(tmp_path, [name], tmp_path / "views", 10**6)
+    written = {path.relative_to(views.folder).as_posix() for path in views.folder.rglob("*.jpg")}
+    assert written == {f"camera{view}/b.jpg" for view in range(8)}
+
+
 def test_image_that_is_not_twice_as_wide_as_high_is_an_error(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((64, 96, 3), np.uint8))
     with pytest.raises(InputError, match=r"a\.png has 96 x 64 pixels.*twice as wide"):
