@@ -40,8 +40,9 @@ SCENES = ("data/fountain", "data/rendered_kitchen", "photos/lund_door", "photos/
 FOCAL_RATIOS = (0.6, 2.5)
 """Smallest and largest focal length in longer image sides."""
 CORNER_SHIFTS = (-0.05, 0.02)
-"""Range of the displacement of the image corners by radial distortion, as a share of the distance
-from the corner to the image center. Negative displacements are towards the center."""
+"""Smallest and largest displacement of an image corner by the simulated radial distortion, divided
+by the distance from the corner to the image center. Negative displacements are towards the
+center."""
 ASPECTS = (4 / 3, 3 / 2, 3 / 4, 1.0)
 MAX_MAGNIFICATION = 1.5
 """Largest enlargement of a photo, because an enlarged photo has no fine details."""

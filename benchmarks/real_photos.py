@@ -92,7 +92,7 @@ def add_method_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def open_folder(arguments: argparse.Namespace) -> AbstractContextManager[str | Path]:
-    """Open the folder of resampled images and table rows, by default a temporary one."""
+    """Return the folder ``--folder`` for table rows and images, or a temporary folder."""
     if arguments.folder:
         return nullcontext(arguments.folder)
     return tempfile.TemporaryDirectory(prefix="mpsfm-photos-")

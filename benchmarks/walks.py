@@ -328,7 +328,7 @@ def _evaluate_model(folder: Path, poses: Mapping[int, Pose]) -> Record:
 
 
 def make_table(records: Sequence[Record]) -> str:
-    """Return a Markdown table with one row for each video."""
+    """Format the results of all videos as a Markdown table with one row per video."""
     lines = [
         "| video | frames | keyframes | placed | ATE all | ATE keyframes | WATE-AUC 10 m, full | "
         "COLMAP keyframes | ATE | memory GB | CPU s, COLMAP | CPU min per min |",

@@ -11,7 +11,7 @@ from mpsfm_core.data.arrays import Float64, Pose
 from mpsfm_core.data.errors import DataError
 
 MAX_ROTATION_DEVIATION = 1e-6
-"""Largest entry of ``R @ R.T - I`` of a rotation matrix of a rig."""
+"""Largest entry of ``R @ R.T - I`` up to which a matrix ``R`` is accepted as a rotation."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,7 @@ class Rig:
 
     @property
     def image_names(self) -> list[str]:
-        """Names of the images of all frames."""
+        """Names of all images that the cameras of the rig took, frame by frame."""
         return [name for frame in self.frames for name in frame if name is not None]
 
     @property

@@ -24,6 +24,7 @@ from scipy.sparse import csr_matrix
 
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.data.errors import DataError
+from mpsfm_core.geometry import camera_center
 from mpsfm_core.optimize import bundle_kernels as kernels
 
 _POSE = 6
@@ -46,7 +47,7 @@ class RigConstraint:
     scale: float = 1.0
     """Scale of the rig, in world units per meter."""
     variable_scale: bool = False
-    """Whether bundle adjustment estimates the scale of the rig."""
+    """True if bundle adjustment estimates the scale of the rig."""
     variable_frame: Bool | None = None
     """(f,) bool, True for frames with a variable pose (None makes all frames variable)."""
 
@@ -115,7 +116,7 @@ class RigConstraint:
             )
         turns, shifts = self.frame_poses(rotations, translations)
         first = int(np.argmin(variable))
-        center = -turns[first].T @ shifts[first]
+        center = camera_center(turns[first], shifts[first])
         offset = turns[anchor] @ center + shifts[anchor]
         return int(self.frame_of_image[anchor]), 3 + int(np.argmax(np.abs(offset)))
 
@@ -156,6 +157,9 @@ class RigBasis(NamedTuple):
     reduced camera system. The first ``6 * num_frames`` columns are the poses of frames."""
     frame_of_slot: Int64
     """(s,) position of the variable frame of each pose slot among the variable frames, or -1."""
+    slot_from_frame: Float64
+    """(s, 7, 6) blocks of the matrix that map the pose of a variable frame to each of its pose
+    slots."""
     num_frames: int
     """Number of variable frames."""
     scale_column: int | None
@@ -220,7 +224,12 @@ class RigBasis(NamedTuple):
         shape = (size * num_slots + num_intrinsics, next_column)
         matrix = csr_matrix((value, (row, column)), shape=shape)
         matrix.eliminate_zeros()
-        return cls(matrix, frame_of_slot, num_frames, scale_column)
+        slot_from_frame = np.zeros((num_slots, size, _POSE))
+        for slot in np.flatnonzero(frame_of_slot >= 0):
+            top, left = size * slot, _POSE * int(frame_of_slot[slot])
+            block = matrix[top : top + _POSE, left : left + _POSE]
+            slot_from_frame[slot, :_POSE] = block.toarray()
+        return cls(matrix, frame_of_slot, slot_from_frame, num_frames, scale_column)
 
     def solve_dense(self, matrix: Float64, rhs: Float64) -> Float64:
         """Solve the reduced camera system for steps that keep the relative poses of the rig.
@@ -273,7 +282,7 @@ class RigBasis(NamedTuple):
         frame = self.frame_of_slot[pairs]
         same = np.flatnonzero((frame[:, 0] == frame[:, 1]) & (frame[:, 0] >= 0))
         first, second = pairs[same].T
-        maps = self._slot_maps(blocks.shape[1])
+        maps = self.slot_from_frame
         products = maps[first].transpose(0, 2, 1) @ blocks[same] @ maps[second]
         between = first != second
         products[between] += products[between].transpose(0, 2, 1)
@@ -291,12 +300,3 @@ class RigBasis(NamedTuple):
             return np.concatenate([poses.ravel(), x[num_pose:] / scalar])
 
         return precondition
-
-    def _slot_maps(self, size: int) -> Float64:
-        """Return the blocks (s, 7, 6) of the matrix from a frame to each of its images."""
-        maps = np.zeros((len(self.frame_of_slot), size, _POSE))
-        for slot in np.flatnonzero(self.frame_of_slot >= 0):
-            column = _POSE * int(self.frame_of_slot[slot])
-            rows = self.matrix[size * slot : size * slot + _POSE, column : column + _POSE]
-            maps[slot, :_POSE] = rows.toarray()
-        return maps

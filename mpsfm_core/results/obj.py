@@ -75,9 +75,10 @@ def read_obj(path: Path) -> TexturedMesh:
     first, numbers = unique_rows(pairs)
     vertex, coordinate = pairs[first].T
     flipped = (uv[coordinate] * (1, -1) + (0, 1)).astype(np.float32)
-    texture = cv2.imread(str(_find_texture(path, library)), cv2.IMREAD_COLOR_RGB)
+    image = _find_texture(path, library)
+    texture = cv2.imread(str(image), cv2.IMREAD_COLOR_RGB)
     if texture is None:
-        raise InputError(f"{_find_texture(path, library)}: the texture cannot be read")
+        raise InputError(f"{image}: the texture cannot be read")
     return TexturedMesh(
         vertices[vertex], numbers.reshape(-1, 3), flipped, np.asarray(texture, np.uint8)
     )

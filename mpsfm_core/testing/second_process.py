@@ -40,15 +40,7 @@ class SecondProcess:
     def measure_import(self, modules: tuple[str, ...], heavy: tuple[str, ...]) -> Any:
         """Import plugin modules in the second process, which must be new.
 
-        Args:
-            modules: Names of the modules of one plugin.
-            heavy: Names of heavy libraries.
-
-        Returns:
-            Import time in seconds and the names of imported heavy libraries.
-
-        Raises:
-            CheckFailed: a module cannot be imported.
+        The function :func:`measure_import` describes arguments, result and errors.
         """
         return self._call("importing the plugin module fails", "measure_import", modules, heavy)
 

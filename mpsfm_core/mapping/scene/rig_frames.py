@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, Pose
+from mpsfm_core.geometry import compose, invert
 from mpsfm_core.optimize.rig_basis import RigConstraint, measure_rig_scale
 
 
@@ -69,13 +70,12 @@ class RigFrames:
             pose: Pose ``cam_from_world`` of ``image``.
             other: Image of the same frame.
         """
-        rotation, translation = pose
-        frame_turn = self.rotations[image].T @ rotation
-        frame_shift = self.rotations[image].T @ (
-            translation - self.scale * self.translations[image]
-        )
-        turn = self.rotations[other]
-        return turn @ frame_turn, turn @ frame_shift + self.scale * self.translations[other]
+        frame_from_world = compose(invert(*self._sensor_from_rig(image)), pose)
+        return compose(self._sensor_from_rig(other), frame_from_world)
+
+    def _sensor_from_rig(self, image: int) -> Pose:
+        """Return ``sensor_from_rig`` of an image, with the translation in world units."""
+        return self.rotations[image], self.scale * self.translations[image]
 
     def constrain(
         self, images: Int64, variable: Bool, *, refine_scale: bool = False

@@ -575,9 +575,9 @@
     // and all cameras are visible. Far points do not count.
     function reset() {
       const mean = centers.reduce((sum, p) => sum.add(p), new THREE.Vector3()).divideScalar(centers.length);
-      const back = mean.clone().sub(target);
-      back.addScaledVector(up, -back.dot(up));
-      if (back.length() < 1e-3 * radius) back.copy(new THREE.Vector3(1, 0.3, 0.2)).addScaledVector(up, -up.dot(new THREE.Vector3(1, 0.3, 0.2)));
+      const horizontal = (vector) => vector.addScaledVector(up, -vector.dot(up));
+      let back = horizontal(mean.sub(target));
+      if (back.length() < 1e-3 * radius) back = horizontal(new THREE.Vector3(1, 0.3, 0.2));
       back.normalize().addScaledVector(up, 0.8).normalize();
       const right = new THREE.Vector3().crossVectors(up, back).normalize();
       const above = new THREE.Vector3().crossVectors(back, right);

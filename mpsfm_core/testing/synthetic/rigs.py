@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Float64, MappingProblem, PinholeCamera, Pose, Rig
-from mpsfm_core.geometry import compose, inside
+from mpsfm_core.geometry import camera_center, compose, inside
 from mpsfm_core.geometry.panorama import make_view_rotations
 from mpsfm_core.testing.synthetic.problems import (
     SyntheticNoise,
@@ -31,7 +31,7 @@ class RigProblem(NamedTuple):
 
     problem: MappingProblem
     poses: list[Float64]
-    """Pose ``cam_from_world`` (3, 4) of each image, in meters."""
+    """True pose ``cam_from_world`` (3, 4) of each image, with translations in meters."""
 
 
 def make_rig_sensors(kind: RigKind) -> tuple[Pose, ...]:
@@ -60,7 +60,7 @@ def make_rig_problem(
     map_width: int = 80,
     seed: int = 0,
 ) -> RigProblem:
-    """Create a mapping problem of a rig with exact relative poses.
+    """Create the mapping problem of a moving rig, whose images have exact relative poses.
 
     Args:
         scene: Scene to render.
@@ -121,7 +121,7 @@ def _sample_points(
     points = np.zeros((count, 3))
     for frame, pose in enumerate(frame_poses):
         rows = frames == frame
-        center = -pose[:, :3].T @ pose[:, 3]
+        center = camera_center(pose[:, :3], pose[:, 3])
         distance, _, _ = scene.first_hit(center, directions[rows])
         points[rows] = center + distance[:, None] * directions[rows]
     return points
@@ -133,7 +133,7 @@ def _find_visible(
     """Return the indices (m,) of the points that a view sees, and their pixels (m, 2)."""
     xy, depth = project(camera, pose, points)
     rows = np.flatnonzero((depth > 0) & inside(xy, camera.size))
-    center = -pose[:, :3].T @ pose[:, 3]
+    center = camera_center(pose[:, :3], pose[:, 3])
     t, _, _ = scene.first_hit(center, points[rows] - center)
     rows = rows[np.abs(t - 1.0) < 1e-6]
     return rows, xy[rows]

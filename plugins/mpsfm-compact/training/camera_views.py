@@ -296,8 +296,9 @@ def _draw_cameras(
 
 
 def _rotations(heading: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
-    """Convert heading, pitch and roll (n,) in rad to rotations (n, 3, 3) world_from_camera.
+    """Convert heading, pitch and roll of cameras to rotation matrices from camera to world.
 
+    Angles are arrays (n,) in radians, and the rotation matrices have shape (n, 3, 3).
     The z axis of the world points up.
     """
     zero = torch.zeros_like(heading)
