@@ -139,12 +139,11 @@ def _read_triangles(path: Path, file: _PlyFile) -> Int64:
         case [
             ["element", "vertex", _],
             ["element", "face", number],
-            ["property", "list", "uchar" | "uint8" as size, index, _],
+            ["property", "list", size, index, _],
             *_,
-        ] if index in _TYPES and number.isdecimal():
-            face = np.dtype(
-                [("count", _TYPES[size]), ("rows", _ORDERS[encoding] + _TYPES[index], 3)]
-            )
+        ] if {size, index} <= _TYPES.keys() and number.isdecimal():
+            order = _ORDERS[encoding]
+            face = np.dtype([("count", order + _TYPES[size]), ("rows", order + _TYPES[index], 3)])
         case _:
             raise InputError(
                 f"{path}: the PLY header has elements other than vertices and triangles"

@@ -35,6 +35,19 @@ def test_triangles_of_other_libraries_are_read(tmp_path: Path, encoding: str) ->
     np.testing.assert_array_equal(read_mesh(tmp_path / "a.ply")[2], mesh.faces)
 
 
+def test_mesh_of_colmaps_poisson_meshing_is_read(tmp_path: Path) -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    normals = np.asarray(sphere.vertex_normals, np.float32)
+    gray = np.full((len(normals), 3), 128, np.uint8)
+    write_ply(tmp_path / "a.ply", np.asarray(sphere.vertices), gray, normals)
+    options = pycolmap.PoissonMeshingOptions(depth=5, trim=0.0)
+    pycolmap.poisson_meshing(tmp_path / "a.ply", tmp_path / "b.ply", options)
+    points, _, triangles = read_mesh(tmp_path / "b.ply")
+    assert len(triangles) > 500
+    radii = np.linalg.norm(points[triangles], axis=2)
+    assert np.abs(radii - 1).max() < 0.1
+
+
 def test_written_triangles_are_read_and_clouds_have_none(tmp_path: Path) -> None:
     points, colors = np.eye(3), np.zeros((3, 3), np.uint8)
     write_ply(tmp_path / "a.ply", points, colors, triangles=np.array([(0, 1, 2), (2, 1, 0)]))
