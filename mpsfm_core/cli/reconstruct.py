@@ -73,7 +73,8 @@ def reconstruct(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Cameras that move as one: COLMAP's rig_config.json, model or database.",
+            help="Cameras that move as one: COLMAP's rig_config.json, model or database, or "
+            "'folders' for one folder of photos per camera.",
         ),
     ] = None,
     overrides: Overrides = None,

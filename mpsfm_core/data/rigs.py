@@ -18,6 +18,9 @@ MAX_ROTATION_DEVIATION = 1e-6
 class Rig:
     """Cameras with constant relative poses, and their images (COLMAP's ``Rig`` and ``Frame``).
 
+    If a relative pose is unknown, the mapper reconstructs the images without the rig first, and
+    estimates all relative poses of the rig from this reconstruction.
+
     Examples:
         >>> left = np.eye(3), np.zeros(3)
         >>> right = np.eye(3), np.array([-0.1, 0.0, 0.0])
@@ -26,14 +29,18 @@ class Rig:
         True
     """
 
-    sensor_from_rig: tuple[Pose, ...]
-    """Pose of each sensor, as rotation (3, 3) and translation (3,) in meters."""
+    sensor_from_rig: tuple[Pose | None, ...]
+    """Pose of each sensor, as rotation (3, 3) and translation (3,) in meters, or None if the pose
+    is unknown."""
     frames: tuple[tuple[str | None, ...], ...]
     """Name of the image of each sensor for each frame, None if the sensor has no image. A frame is
     the set of images that the rig takes at one moment."""
+    is_estimated: bool = False
+    """True if the relative poses are estimates. Bundle adjustment refines such poses, and their
+    baseline does not determine the metric scale."""
 
     def __post_init__(self) -> None:
-        for rotation, translation in self.sensor_from_rig:
+        for rotation, translation in filter(None, self.sensor_from_rig):
             if np.shape(rotation) != (3, 3) or np.shape(translation) != (3,):
                 raise DataError(
                     "sensor_from_rig", "pose must be a rotation (3, 3), translation (3)"
@@ -51,15 +58,32 @@ class Rig:
         return [name for frame in self.frames for name in frame if name is not None]
 
     @property
+    def is_calibrated(self) -> bool:
+        """True if the pose of every sensor is known or estimated."""
+        return None not in self.sensor_from_rig
+
+    @property
+    def sensor_poses(self) -> tuple[Pose, ...]:
+        """Pose ``sensor_from_rig`` of each sensor.
+
+        Raises:
+            ValueError: The pose of a sensor is unknown.
+        """
+        poses = tuple(pose for pose in self.sensor_from_rig if pose is not None)
+        if len(poses) < len(self.sensor_from_rig):
+            raise ValueError("the pose sensor_from_rig of a sensor is unknown")
+        return poses
+
+    @property
     def has_baseline(self) -> bool:
-        """True if the centers of two sensors differ."""
+        """True if the centers of two sensors differ, and their distance is known."""
+        if self.is_estimated or not self.is_calibrated:
+            return False
         return bool(np.ptp(self.sensor_centers(), axis=0).max() > 0)
 
     def sensor_centers(self) -> Float64:
         """Return the camera centers (s, 3) of the sensors in the frame of the rig, in meters."""
-        return np.array(
-            [-rotation.T @ translation for rotation, translation in self.sensor_from_rig]
-        )
+        return np.array([-rotation.T @ translation for rotation, translation in self.sensor_poses])
 
     def subset(self, names: Collection[str]) -> Rig:
         """Return the rig restricted to the named images, without frames that have no image."""
@@ -69,5 +93,5 @@ class Rig:
 
     def scaled(self, factor: float) -> Rig:
         """Return the rig with all translations multiplied by a factor."""
-        sensors = tuple((rotation, factor * shift) for rotation, shift in self.sensor_from_rig)
+        sensors = tuple((rotation, factor * shift) for rotation, shift in self.sensor_poses)
         return replace(self, sensor_from_rig=sensors)

@@ -137,8 +137,8 @@ def _write_rig(database: pycolmap.Database, problem: MappingProblem, rig: Rig) -
     members = [[numbers.get(name or "", 0) for name in frame] for frame in rig.frames]
     cameras = [min(filter(None, column)) for column in zip(*members, strict=True)]
     colmap_rig = pycolmap.Rig(rig_id=cameras[0])
-    rig_from_reference = invert(*rig.sensor_from_rig[0])
-    for camera_id, pose in zip(cameras, rig.sensor_from_rig, strict=True):
+    rig_from_reference = invert(*rig.sensor_poses[0])
+    for camera_id, pose in zip(cameras, rig.sensor_poses, strict=True):
         camera = colmap_from_pinhole(problem.images[camera_id - 1].camera)
         camera.camera_id = camera_id
         camera.has_prior_focal_length = True

@@ -117,7 +117,9 @@ def digest(value: object) -> str:
 
 
 def pack(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
-    """Flatten a data object to a dictionary of arrays by field path; omit fields that are None."""
+    """Flatten a data object to a dictionary of arrays by field path; omit values that are None."""
+    if value is None:
+        return {}
     if isinstance(value, Reason):
         value = json.dumps(value.to_json())
     if isinstance(value, (tuple, Mapping)):
@@ -136,9 +138,8 @@ def pack(value: object, prefix: str = "") -> dict[str, NDArray[Any]]:
         return {prefix or "value": array}
     arrays: dict[str, NDArray[Any]] = {}
     for field in fields(value):
-        content = getattr(value, field.name)
-        if content is not None:
-            arrays |= pack(content, f"{prefix}/{field.name}" if prefix else field.name)
+        path = f"{prefix}/{field.name}" if prefix else field.name
+        arrays |= pack(getattr(value, field.name), path)
     return arrays
 
 

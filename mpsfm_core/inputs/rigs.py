@@ -17,6 +17,8 @@ from mpsfm_core.data.errors import DataError, InputError
 from mpsfm_core.inputs.models import describe_name_difference, match_names, read_model
 from mpsfm_core.inputs.text_files import read_text_file
 
+FOLDERS = Path("folders")
+"""Value of the option ``rigs`` for cameras whose images are in different folders."""
 _CAMERA = int(pycolmap.SensorType.CAMERA)
 _POSE_BYTES = 7 * 8
 """Size in bytes of a pose in a COLMAP database, 4 + 3 numbers of a quaternion and translation."""
@@ -37,17 +39,21 @@ def read_rigs(
     """Read the rigs of images; a frame is the images that one rig takes at one moment.
 
     Args:
-        path: COLMAP's ``rig_config.json``, a COLMAP model folder, or a COLMAP database (``.db``).
+        path: COLMAP's ``rig_config.json``, a COLMAP model folder, a COLMAP database (``.db``), or
+            ``folders`` if the images of each camera are in a folder, with equal names for the
+            images of one moment.
         names: Names of the images of the run.
         images_folder: Folder of the images, for models of images before EXIF rotation.
         required: Raise an error if the file has no rig for two images of the run.
 
     Raises:
-        InputError: The file cannot be read, a relative pose is unknown or no rotation, or no frame
-            has two images of the run although rigs are ``required``.
+        InputError: The file cannot be read, a relative pose is no rotation, or no frame has two
+            images of the run although rigs are ``required``.
     """
     try:
-        if path.suffix == ".json":
+        if path == FOLDERS:
+            rigs = rig_from_folders(names)
+        elif path.suffix == ".json":
             rigs = _read_config(path, names)
         elif path.suffix == ".db":
             rigs = _read_database(path, names)
@@ -58,9 +64,30 @@ def read_rigs(
     if required and not rigs:
         raise InputError(
             f"rigs {path}: no frame has two images of {images_folder or 'the run'}; check that the "
-            "names of the images of one moment are equal after the image_prefix, or in the model"
+            "names of the images of one moment are equal after the image_prefix or the folder of "
+            "their camera, or in the model"
         )
     return rigs
+
+
+def rig_from_folders(names: Collection[str]) -> tuple[Rig, ...]:
+    """Return the rig of cameras whose images are in different folders, with unknown poses.
+
+    Args:
+        names: Names of the images. The first folder of a name is the camera, and images with equal
+            names below it form a frame.
+
+    Raises:
+        InputError: The images are in fewer than two folders.
+    """
+    folders = sorted({name.split("/")[0] for name in names if "/" in name})
+    if len(folders) < 2:
+        raise InputError(
+            f"rigs {FOLDERS}: the photos must be in at least two folders, one per camera, below "
+            "the input folder"
+        )
+    prefixes = [f"{folder}/" for folder in folders]
+    return _group_by_name(names, prefixes, [None] * len(folders), f"rigs {FOLDERS}")
 
 
 def rigs_from_model(
@@ -74,7 +101,7 @@ def rigs_from_model(
         source: Path of the model, for error messages.
 
     Raises:
-        InputError: A relative pose is unknown.
+        InputError: The model and the run have no image name in common.
     """
     rigs = {number: rig for number, rig in model.rigs.items() if rig.num_sensors() > 1}
     members: dict[int, dict[int, dict[int, str]]] = {}
@@ -142,32 +169,27 @@ def _build_rigs(
     ours_of = {their: ours for ours, their in match_names(names, theirs).items()}
     if theirs and not ours_of:
         raise InputError(f"rigs {source}: {describe_name_difference(names, theirs)}")
-    rigs = []
+    rigs: list[Rig] = []
     for number, frames in members.items():
         order = sorted(sensors[number])
         poses = [sensors[number][sensor] for sensor in order]
-        known = [pose for pose in poses if pose is not None]
-        if len(known) < len(poses):
-            sensor = order[[pose is None for pose in poses].index(True)]
-            raise InputError(
-                f"rigs {source}: the pose sensor_from_rig of camera {sensor} is unknown; calibrate "
-                "the rig first"
-            )
         named = [
             tuple(ours_of.get(frames[frame].get(sensor, "")) for sensor in order)
             for frame in sorted(frames)
         ]
-        rigs += _with_frames(known, named)
+        rigs += _with_frames(poses, named)
     return tuple(rigs)
 
 
-def _with_frames(poses: Sequence[Pose], frames: Sequence[tuple[str | None, ...]]) -> list[Rig]:
+def _with_frames(
+    poses: Sequence[Pose | None], frames: Sequence[tuple[str | None, ...]]
+) -> tuple[Rig, ...]:
     """Return a rig with the frames that have images, empty if no frame has two images."""
     counts = [sum(name is not None for name in frame) for frame in frames]
     if max(counts, default=0) < 2:
-        return []
+        return ()
     used = [frame for frame, count in zip(frames, counts, strict=True) if count]
-    return [Rig(tuple(poses), tuple(used))]
+    return (Rig(tuple(poses), tuple(used)),)
 
 
 def _read_config(path: Path, names: Collection[str]) -> tuple[Rig, ...]:
@@ -180,7 +202,7 @@ def _read_config(path: Path, names: Collection[str]) -> tuple[Rig, ...]:
         raise InputError(
             f"rigs {path}: the file must be a list of rigs, as COLMAP's rig_config.json"
         )
-    rigs = []
+    rigs: list[Rig] = []
     for number, rig in enumerate(content, start=1):
         where = f"rigs {path}, rig {number}"
         cameras = rig.get("cameras")
@@ -191,16 +213,23 @@ def _read_config(path: Path, names: Collection[str]) -> tuple[Rig, ...]:
             _config_pose(f"{where}, camera {prefix!r}", camera)
             for prefix, camera in zip(prefixes, cameras, strict=True)
         ]
-        by_suffix: dict[str, list[str | None]] = {}
-        for name in sorted(names):
-            matching = [k for k, prefix in enumerate(prefixes) if name.startswith(prefix)]
-            if len(matching) > 1:
-                raise InputError(f"{where}: image {name!r} starts with two of the image_prefixes")
-            for k in matching:
-                suffix = name[len(prefixes[k]) :]
-                by_suffix.setdefault(_stem(suffix), [None] * len(prefixes))[k] = name
-        rigs += _with_frames(poses, [tuple(frame) for frame in by_suffix.values()])
+        rigs += _group_by_name(names, prefixes, poses, where)
     return tuple(rigs)
+
+
+def _group_by_name(
+    names: Collection[str], prefixes: Sequence[str], poses: Sequence[Pose | None], where: str
+) -> tuple[Rig, ...]:
+    """Return the rig whose frames are images with equal names after the prefix of their camera."""
+    by_suffix: dict[str, list[str | None]] = {}
+    for name in sorted(names):
+        matching = [k for k, prefix in enumerate(prefixes) if name.startswith(prefix)]
+        if len(matching) > 1:
+            raise InputError(f"{where}: image {name!r} starts with two of the image_prefixes")
+        for k in matching:
+            suffix = name[len(prefixes[k]) :]
+            by_suffix.setdefault(_stem(suffix), [None] * len(prefixes))[k] = name
+    return _with_frames(poses, [tuple(frame) for frame in by_suffix.values()])
 
 
 def _stem(name: str) -> str:
@@ -216,16 +245,18 @@ def _prefix(where: str, camera: Any) -> str:
     return prefix
 
 
-def _config_pose(where: str, camera: Mapping[str, Any]) -> Pose:
-    """Return ``sensor_from_rig`` of a camera of a rig configuration."""
+def _config_pose(where: str, camera: Mapping[str, Any]) -> Pose | None:
+    """Return ``sensor_from_rig`` of a camera of a rig configuration, None if unknown."""
     if camera.get("ref_sensor"):
         return np.eye(3), np.zeros(3)
     rotation = camera.get("cam_from_rig_rotation")
     translation = camera.get("cam_from_rig_translation")
+    if rotation is None and translation is None:
+        return None
     if rotation is None or translation is None:
         raise InputError(
-            f"{where}: 'cam_from_rig_rotation' or 'cam_from_rig_translation' is missing, and the "
-            "camera is not the 'ref_sensor'; calibrate the rig first"
+            f"{where}: 'cam_from_rig_rotation' or 'cam_from_rig_translation' is missing; give "
+            "both, or none if the pose is unknown"
         )
     try:
         values = np.array([*rotation, *translation], dtype=np.float64)

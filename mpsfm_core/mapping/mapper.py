@@ -19,8 +19,8 @@ The steps of :func:`reconstruct`, compared with COLMAP's ``IncrementalMapper``::
                 refine locally; refine globally if the model has grown
             component.reregister_images()               # misregistered images in other poses
             component.finalize()                        # global refinement, depth check of all
-        stop if enough matches are explained, no guessed focal length was far off, and no image
-            deviates from the focal length of its shared camera
+        stop if enough matches are explained, no guessed focal length was far off, no image
+            deviates from the focal length of its shared camera, and no rig got calibrated
     select the run that explains the most matches
     register duplicates in the poses of their originals
     register the remaining images tentatively           # if this option is set
@@ -42,6 +42,7 @@ from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.events import MappingEvents, NullMappingEvents
 from mpsfm_core.mapping.initialization.initial_pair import InitialPairSelector
 from mpsfm_core.mapping.initialization.refined_focal_lengths import apply_refined_focal_lengths
+from mpsfm_core.mapping.initialization.rig_calibration import calibrate_rigs
 from mpsfm_core.mapping.initialization.view_graph_calibration import calibrate_view_graph
 from mpsfm_core.mapping.model_selection import (
     MapperRun,
@@ -76,9 +77,11 @@ def reconstruct(
 
     Guessed focal lengths and distortion that image pairs contradict are replaced first. If
     many matches observe no common 3D point, the mapper runs again with other random seeds. If
-    guessed focal lengths were far off, the mapper runs again with the refined focal lengths. The
-    run with the most matches that observe common 3D points is kept. The same problem, options and
-    machine give bit-identical results, also if an interrupted run continues from a checkpoint.
+    guessed focal lengths were far off, the mapper runs again with the refined focal lengths. If a
+    rig has an unknown relative pose, the mapper runs again with the rig that the first run
+    calibrates. The run with the most matches that observe common 3D points is kept. The same
+    problem, options and machine give bit-identical results, also if an interrupted run continues
+    from a checkpoint.
 
     Args:
         problem: Images with depth and normal priors, and geometrically verified matches.
@@ -99,7 +102,7 @@ def reconstruct(
     distinct = remove_duplicates(problem, options)
     initial_problem = _calibrate_view_graph(distinct, options)
     for run in runs:  # completed mapper runs, oldest first
-        initial_problem = _apply_refined_focals(initial_problem, run, options) or initial_problem
+        initial_problem = _improve_problem(initial_problem, run, options) or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):
         run_options = options.model_copy(update={"seed": options.seed + number})
         mapper = Mapper(initial_problem, run_options, events, pair_weights)
@@ -114,14 +117,15 @@ def reconstruct(
         pair_weights = mapper.pair_weights
         if mapper.is_deterministic:
             break
-        refined_problem = _apply_refined_focals(initial_problem, runs[-1], options)
-        if refined_problem is not None:
-            initial_problem, pair_weights = refined_problem, None
+        improved_problem = _improve_problem(initial_problem, runs[-1], options)
+        if improved_problem is not None:
+            initial_problem, pair_weights = improved_problem, None
         elif is_settled(runs, options.enough_explained):
             break
     checkpointer.save_completed(runs)
     selected = select_run(runs, options.consistency)
     models = list(selected.models)
+    distinct = calibrate_rigs(distinct, models) or distinct
     if models and options.register_tentatively:
         models[0] = register_tentatively(models[0], models[1:], distinct, options)
     report = sum_run_times(selected.report, runs)
@@ -142,13 +146,14 @@ def _calibrate_view_graph(problem: MappingProblem, options: MapperOptions) -> Ma
     )
 
 
-def _apply_refined_focals(
+def _improve_problem(
     problem: MappingProblem, run: MapperRun, options: MapperOptions
 ) -> MappingProblem | None:
-    """Return the problem with refined focal lengths, or None if their changes are small."""
-    if not run.models or not options.refinement.refine_focal:
-        return None
-    return apply_refined_focal_lengths(problem, run.models[0], options)
+    """Return the problem with focal lengths and rigs of a run, or None if they change little."""
+    improved = None
+    if run.models and options.refinement.refine_focal:
+        improved = apply_refined_focal_lengths(problem, run.models[0], options)
+    return calibrate_rigs(improved or problem, run.models) or improved
 
 
 class Mapper:

@@ -46,6 +46,11 @@ class MapperRun(NamedTuple):
         """Number of images of the largest component."""
         return len(self.models[0].images) if self.models else 0
 
+    @property
+    def num_rigs(self) -> int:
+        """Number of calibrated rigs."""
+        return len(self.models[0].rigs) if self.models else 0
+
     def state_dict(self) -> StateDict:
         """Return the state of the mapper run for a checkpoint."""
         return {
@@ -72,14 +77,16 @@ def is_settled(runs: Sequence[MapperRun], min_explained_ratio: float) -> bool:
 def select_run(runs: Sequence[MapperRun], options: ConsistencyOptions) -> MapperRun:
     """Select the run whose largest component explains the most matches.
 
-    Among runs that explain equal shares of the match scores, the result that occurs in most runs is
-    selected. Among equally frequent results, the result with the best agreement of its depth maps
-    is selected.
+    Among runs that explain equal shares of the match scores, those with the most calibrated rigs
+    are considered, and the result that occurs in most runs is selected. Among equally frequent
+    results, the result with the best agreement of its depth maps is selected.
     """
     max_ratio = max(run.largest_explained_ratio for run in runs)
     candidates = [
         run for run in runs if max_ratio - run.largest_explained_ratio < MAX_RATIO_DIFFERENCE
     ]
+    num_rigs = max(run.num_rigs for run in candidates)
+    candidates = [run for run in candidates if run.num_rigs == num_rigs]
     counts = [sum(_are_equal(run, other) for other in runs) for run in candidates]
     frequent = [run for run, count in zip(candidates, counts, strict=True) if count == max(counts)]
     if len(frequent) == 1 or not max_ratio:

@@ -35,7 +35,7 @@ from mpsfm_core.optimize.bundle_problem import (
     range_executor,
 )
 from mpsfm_core.optimize.options import BundleOptions
-from mpsfm_core.optimize.rig_basis import measure_rig_scale
+from mpsfm_core.optimize.rig_basis import RigBasis, RigConstraint
 
 __all__ = ["BundleProblem", "BundleResult", "adjust_bundle"]
 
@@ -81,6 +81,9 @@ class BundleResult:
     cost."""
     message: str
     """Reason why the Levenberg-Marquardt solver stopped."""
+    rig: RigConstraint | None = None
+    """Rig with the adjusted scale and the adjusted poses ``sensor_from_rig``, or None without a
+    rig."""
     std_rig_scale: float = np.inf
     """Posterior standard deviation of the scale of the rig in world units per meter, infinite if
     the scale is constant or undetermined, or if conjugate gradients solve the reduced system."""
@@ -88,13 +91,9 @@ class BundleResult:
 
 def start_at(problem: BundleProblem, result: BundleResult) -> BundleProblem:
     """Return the bundle adjustment problem with the parameters of a result as initial values."""
-    rig = problem.rig
-    if rig is not None and rig.variable_scale:
-        scale = measure_rig_scale(rig, result.translations)
-        rig = rig if scale is None else replace(rig, scale=scale)
     return replace(
         problem,
-        rig=rig,
+        rig=result.rig,
         rotations=result.rotations,
         translations=result.translations,
         log_scales=result.log_scales,
@@ -153,6 +152,7 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
         min_decrease = max(options.function_tolerance, np.finfo(float).eps) * cost
         if np.isfinite(decrease) and decrease >= max(MIN_GAIN * predicted, 0.0):
             state, trial, cost = trial, state, trial_cost
+            normal.accept_step(state)
             gain = min(decrease / predicted, 1.0) if predicted > 0 else 1.0
             damping = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), MIN_DAMPING)
             growth = 2.0
@@ -169,7 +169,7 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
             break
     stds, std_rig_scale = normal.compute_intrinsic_stds(state), normal.compute_rig_scale_std(state)
     return BundleResult(
-        *state, stds, initial_cost, cost, iteration, converged, message, std_rig_scale
+        *state, stds, initial_cost, cost, iteration, converged, message, normal.rig, std_rig_scale
     )
 
 
@@ -193,6 +193,22 @@ class SchurComplementSolver:
         self.run = run
         self.dense = poses <= options.dense_poses
         self.tolerance = options.function_tolerance
+        self.rig, self.basis = p.rig, self._build_basis(p.rig, p.state)
+        self._trial_rig = p.rig
+
+    def _build_basis(
+        self, rig: RigConstraint | None, state: kernels.BundleParameters
+    ) -> RigBasis | None:
+        """Return the map from steps of the rig to steps of images, or None without a rig."""
+        if rig is None:
+            return None
+        return RigBasis.build(rig, self.p.bundle.layout, self.p.rig_gauge, state.translations)
+
+    def accept_step(self, state: kernels.BundleParameters) -> None:
+        """Update the rig to the accepted parameters ``state`` of the last step."""
+        self.rig = self._trial_rig
+        if self.rig is not None and self.rig.num_variable_sensors:
+            self.basis = self._build_basis(self.rig, state)
 
     def linearize(self, state: kernels.BundleParameters, damping: float) -> float:
         """Linearize the residuals at ``state``, eliminate the 3D points, and return the cost."""
@@ -271,9 +287,10 @@ class SchurComplementSolver:
         units = np.zeros((len(diagonal), len(rows)))
         units[rows, np.arange(len(rows))] = 1.0
         if self.dense:
-            columns = self._solve_dense(boost, units)
+            columns = self._expand(self._solve_dense(boost, units))
         else:
-            columns = np.stack([self._solve_sparse(boost, unit) for unit in units.T], axis=1)
+            solutions = [self._expand(self._solve_sparse(boost, unit)) for unit in units.T]
+            columns = np.stack(solutions, axis=1)
         variances = columns[rows, np.arange(len(rows))]
         determined = (diagonal[rows] > 0) & (variances > 0)
         stds[variable] = np.where(determined, np.sqrt(np.where(determined, variances, 1)), np.inf)
@@ -281,7 +298,7 @@ class SchurComplementSolver:
 
     def compute_rig_scale_std(self, state: kernels.BundleParameters) -> float:
         """Compute the posterior standard deviation of the scale of the rig, or infinity."""
-        basis = self.p.rig_basis
+        basis = self.basis
         if basis is None or basis.scale_column is None or not self.dense:
             return np.inf
         self.linearize(state, MIN_DAMPING)
@@ -320,13 +337,15 @@ class SchurComplementSolver:
         diagonal = self.total.diagonal
         boost = np.where(diagonal > 0, damping * diagonal, 1.0)
         solve = self._solve_dense if self.dense else self._solve_sparse
-        delta = solve(boost, -self.total.rhs)
-        if not np.isfinite(delta).all():
+        steps = solve(boost, -self.total.rhs)
+        if not np.isfinite(steps).all():
             return np.inf, -np.inf, np.inf
+        delta = self._expand(steps)
         self._limit_intrinsic_steps(delta)
         for old, new in zip(state[:-1], trial[:-1], strict=True):
             np.copyto(new, old)
         kernels.update_cameras(delta, self.p.bundle.layout, state, trial)
+        self._retract_rig(state, trial, steps)
 
         def move(n: int, first: int, last: int) -> tuple[float, float, float]:
             costs: tuple[float, float, float] = kernels.update_points(
@@ -348,6 +367,29 @@ class SchurComplementSolver:
         predicted += 0.5 * float(delta @ (boost * delta - self.total.gradient))
         return visible, cost - visible - lost, predicted
 
+    def _expand(self, steps: Float64) -> Float64:
+        """Return the steps of the reduced camera system for steps of the rig's parameters."""
+        if self.basis is None:
+            return steps
+        expanded: Float64 = self.basis.matrix @ steps
+        return expanded
+
+    def _retract_rig(
+        self, state: kernels.BundleParameters, trial: kernels.BundleParameters, steps: Float64
+    ) -> None:
+        """Compute the rig of a trial step; with variable sensors, the poses of images, too."""
+        rig, basis = self.rig, self.basis
+        if rig is None or basis is None:
+            return
+        if rig.num_variable_sensors:
+            self._trial_rig, rotations, translations = rig.retract(
+                state.rotations, state.translations, basis, steps
+            )
+            np.copyto(trial.rotations, rotations)
+            np.copyto(trial.translations, translations)
+        elif basis.scale_column is not None:
+            self._trial_rig = replace(rig, scale=rig.scale + float(steps[basis.scale_column]))
+
     def _limit_intrinsic_steps(self, delta: Float64) -> None:
         """Limit the changes of focal lengths and distortion in a step ``delta`` (d,)."""
         slots, first = self.p.bundle.layout.intrinsic_slot, self.total.border.shape[1]
@@ -362,8 +404,8 @@ class SchurComplementSolver:
             return boost
         matrix = np.zeros((len(boost), len(boost)))
         kernels.assemble_reduced_matrix(self.total, boost, self.p.bundle.layout.pair, matrix)
-        if self.p.rig_basis is not None:
-            return self.p.rig_basis.solve_dense(matrix, rhs)
+        if self.basis is not None:
+            return self.basis.solve_dense(matrix, rhs)
         # LAPACK does not copy the transposed matrix, because the transpose has Fortran's memory
         # order.
         _, solution, info = lapack.dposv(matrix.T, rhs, lower=0, overwrite_a=1)
@@ -384,18 +426,16 @@ class SchurComplementSolver:
             kernels.multiply_reduced_matrix(total, boost, self.p.pairs, x, out)
             return out
 
-        basis = self.p.rig_basis
+        basis = self.basis
         if basis is not None:
             blocks = total.blocks.copy()
             blocks[self.p.pairs[:, 0] == self.p.pairs[:, 1]] = diagonal
             entries = np.concatenate([np.einsum("nii->ni", diagonal).ravel(), corner])
-            solution = _conjugate_gradients(
+            return _conjugate_gradients(
                 lambda x: basis.matrix.T @ multiply(basis.matrix @ x),
                 basis.create_preconditioner(blocks, self.p.pairs, entries),
                 basis.matrix.T @ rhs,
             )
-            steps: Float64 = basis.matrix @ solution
-            return steps
         inverse = np.linalg.inv(diagonal)
 
         def precondition(x: Float64) -> Float64:

@@ -21,7 +21,7 @@ from mpsfm_core.data.camera_models import (
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.options import BundleOptions
-from mpsfm_core.optimize.rig_basis import RigBasis, RigConstraint
+from mpsfm_core.optimize.rig_basis import RigConstraint
 from mpsfm_core.support.threads import thread_limit
 
 RANGE_SIZE = 8000
@@ -103,9 +103,9 @@ class BundleProblem:
     scale. The constant translation coordinate is the one most sensitive to a change of scale about
     the first constant pose."""
     rig: RigConstraint | None = None
-    """Constant relative poses of the images of each frame of a rig, or None if all poses are
-    independent. With a rig, ``rig.variable_frame`` replaces ``variable_pose``, and ``scale_anchor``
-    keeps a coordinate of the frame of the image constant."""
+    """Relative poses of the images of each frame of a rig, or None if all poses are independent.
+    With a rig, ``rig.variable_frame`` replaces ``variable_pose``, and ``scale_anchor`` keeps a
+    coordinate of the frame of the image constant."""
 
 
 class ScalePrior(NamedTuple):
@@ -166,8 +166,10 @@ class PreparedBundle(NamedTuple):
     ranges: list[PointRange]
     longest: int
     """Number of observations of the longest track."""
-    rig_basis: RigBasis | None
-    """Map from steps of frames to steps of images, or None if all poses are independent."""
+    rig: RigConstraint | None
+    """Relative poses of the images of frames, or None if all poses are independent."""
+    rig_gauge: tuple[int, int] | None
+    """Frame and pose parameter that is constant to fix the scale gauge of a rig, or None."""
 
 
 class RangeExecutor(Protocol):
@@ -214,12 +216,9 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
     pairs = np.argwhere(layout.pair >= 0)
     held = np.repeat(~variable_pose[:, None], kernels.NUM_IMAGE_PARAMS, axis=1)
     held[:, kernels.LOG_SCALE_IDX] = ~variable_scale
-    rig_basis = None
-    if rig is not None:
-        rig_gauge = None
-        if anchor is not None:
-            rig_gauge = rig.find_gauge(anchor, state.rotations, state.translations)
-        rig_basis = RigBasis.build(rig, layout, rig_gauge)
+    rig_gauge = None
+    if rig is not None and anchor is not None:
+        rig_gauge = rig.find_gauge(anchor, state.rotations, state.translations)
     elif anchor is not None:
         held[_scale_gauge(anchor, variable_pose, state)] = True
     robust = kernels.RobustLosses(
@@ -237,7 +236,8 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
         held[moving],
         _ranges(obs.start, len(pairs)),
         int(np.diff(obs.start).max(initial=0)),
-        rig_basis,
+        rig,
+        rig_gauge,
     )
 
 

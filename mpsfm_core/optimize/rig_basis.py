@@ -10,17 +10,23 @@ linear in steps of frames::
 
 The reduced camera system ``H`` of the images gives the system ``B.T @ H @ B`` of the frames. ``B``
 is constant, and the images of a frame keep their relative poses exactly.
+
+If bundle adjustment estimates a ``sensor_from_rig``, its step ``(a, b)``, ``S' = exp(a) S`` and
+``(k s)' = k s + b``, adds ``(a, a x (S t) + b)`` to the step of the image, with the translation
+``t`` of the frame. ``B`` then depends on the poses, and :meth:`RigConstraint.retract` composes the
+poses of images from those of frames and sensors.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
 from scipy.sparse import csr_matrix
+from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.data.errors import DataError
@@ -36,7 +42,7 @@ translation."""
 
 @dataclass(frozen=True, eq=False)
 class RigConstraint:
-    """Constant relative poses of the n images of a bundle adjustment problem with f frames."""
+    """Relative poses of the n images of a bundle adjustment problem with f frames."""
 
     frame_of_image: Int64
     """(n,) index of the frame of each image."""
@@ -50,6 +56,26 @@ class RigConstraint:
     """True if bundle adjustment estimates the scale of the rig."""
     variable_frame: Bool | None = None
     """(f,) bool, True for frames with a variable pose (None makes all frames variable)."""
+    variable_sensor: Int64 | None = None
+    """(n,) number of the sensor of each image whose ``sensor_from_rig`` is estimated, starting at
+    0, or -1 for a constant ``sensor_from_rig`` (None makes all constant). The scale of the rig does
+    not change the translation of these sensors."""
+
+    @property
+    def num_variable_sensors(self) -> int:
+        """Number of sensors whose ``sensor_from_rig`` is estimated."""
+        return 0 if self.variable_sensor is None else int(self.variable_sensor.max(initial=-1)) + 1
+
+    def constant_sensors(self) -> Bool:
+        """Return a bool mask (n,) of the images with a constant ``sensor_from_rig``."""
+        if self.variable_sensor is None:
+            return np.ones(len(self.frame_of_image), dtype=np.bool_)
+        return self.variable_sensor < 0
+
+    @property
+    def fixes_scale(self) -> bool:
+        """True if a constant baseline determines the scale of the world."""
+        return not self.variable_scale and bool(self.translations[self.constant_sensors()].any())
 
     def frame_poses(self, rotations: Float64, translations: Float64) -> tuple[Float64, Float64]:
         """Return the rotations (n, 3, 3) and translations (n, 3) of ``frame_from_world``.
@@ -71,7 +97,7 @@ class RigConstraint:
 
     def variable_images(self) -> Bool:
         """Return a bool mask (n,) of the images with a variable pose."""
-        variable: Bool = self.variable_frames()[self.frame_of_image]
+        variable: Bool = self.variable_frames()[self.frame_of_image] | ~self.constant_sensors()
         if self.variable_scale:
             variable = variable | (self.translations != 0).any(axis=1)
         return variable
@@ -97,6 +123,46 @@ class RigConstraint:
             if np.abs(poses - poses[first[rows]]).max(initial=0.0) > limit:
                 raise DataError("rig", "initial poses differ from the relative poses of the rig")
 
+    def retract(
+        self, rotations: Float64, translations: Float64, basis: RigBasis, steps: Float64
+    ) -> tuple[RigConstraint, Float64, Float64]:
+        """Apply steps of frames, sensors and scale, which keep the relative poses exactly.
+
+        Args:
+            rotations: (n, 3, 3) rotation of ``cam_from_world`` of each image.
+            translations: (n, 3) translation of ``cam_from_world`` of each image.
+            basis: Basis of the reduced camera system at these poses.
+            steps: (e,) steps of the parameters of the basis.
+
+        Returns:
+            The updated rig, and rotations (n, 3, 3) and translations (n, 3) of the images.
+        """
+        turns, shifts = self.frame_poses(rotations, translations)
+        of_frame = np.zeros((len(self.variable_frames()), _POSE))
+        of_frame[self.variable_frames()] = steps[: _POSE * basis.num_frames].reshape(-1, _POSE)
+        of_frame = of_frame[self.frame_of_image]
+        turns = Rotation.from_rotvec(of_frame[:, :3]).as_matrix() @ turns
+        shifts = shifts + of_frame[:, 3:]
+        scale = self.scale
+        if basis.scale_column is not None:
+            scale += float(steps[basis.scale_column])
+        constant = self.constant_sensors()
+        of_sensor = np.zeros((len(constant), _POSE))
+        if basis.sensor_column is not None and self.variable_sensor is not None:
+            by_sensor = steps[basis.sensor_column :].reshape(-1, _POSE)
+            of_sensor[~constant] = by_sensor[self.variable_sensor[~constant]]
+        sensors = Rotation.from_rotvec(of_sensor[:, :3]).as_matrix() @ self.rotations
+        offsets = np.where(constant[:, None], scale, self.scale) * self.translations
+        offsets += of_sensor[:, 3:]
+        rig = replace(
+            self,
+            rotations=sensors,
+            translations=np.where(constant[:, None], self.translations, offsets / scale),
+            scale=scale,
+        )
+        moved = np.einsum("nij,nj->ni", sensors, shifts) + offsets
+        return rig, sensors @ turns, moved
+
     def find_gauge(self, anchor: int, rotations: Float64, translations: Float64) -> tuple[int, int]:
         """Return the frame and pose parameter to keep constant, which fixes the scale gauge.
 
@@ -121,23 +187,29 @@ class RigConstraint:
         return int(self.frame_of_image[anchor]), 3 + int(np.argmax(np.abs(offset)))
 
 
-def measure_rig_scale(rig: RigConstraint, translations: Float64) -> float | None:
+def measure_rig_scale(
+    rig: RigConstraint, translations: Float64, used: Bool | None = None
+) -> float | None:
     """Measure the scale of a rig from poses of images, by linear least squares over all frames.
 
     Args:
         rig: Relative poses and frames of the images.
         translations: (n, 3) translation of ``cam_from_world`` of each image.
+        used: (n,) bool mask of the images to use (None uses all images).
 
     Returns:
         World units per meter, or None if no frame has images with different camera centers.
     """
     in_rig = np.einsum("nji,nj->ni", rig.rotations, translations)
     offsets = np.einsum("nji,nj->ni", rig.rotations, rig.translations)
-    offsets = _subtract_frame_means(offsets, rig.frame_of_image)
+    frames = rig.frame_of_image
+    if used is not None:
+        in_rig, offsets, frames = in_rig[used], offsets[used], frames[used]
+    offsets = _subtract_frame_means(offsets, frames)
     energy = float((offsets**2).sum())
     if energy <= 0:
         return None
-    return float((offsets * _subtract_frame_means(in_rig, rig.frame_of_image)).sum()) / energy
+    return float((offsets * _subtract_frame_means(in_rig, frames)).sum()) / energy
 
 
 def _subtract_frame_means(values: Float64, frames: Int64) -> Float64:
@@ -164,6 +236,8 @@ class RigBasis(NamedTuple):
     """Number of variable frames."""
     scale_column: int | None
     """Column of the scale of the rig, or None if the scale is constant."""
+    sensor_column: int | None
+    """First column of the poses of variable sensors, which are the last columns, or None."""
 
     @classmethod
     def build(
@@ -171,6 +245,7 @@ class RigBasis(NamedTuple):
         rig: RigConstraint,
         layout: kernels.ParameterLayout,
         gauge: tuple[int, int] | None,
+        translations: Float64,
     ) -> RigBasis:
         """Build the linear map for the parameters of a bundle adjustment.
 
@@ -178,6 +253,7 @@ class RigBasis(NamedTuple):
             rig: Relative poses and frames of the images.
             layout: Layout of the parameters of the reduced camera system.
             gauge: Frame and pose parameter that is constant, or None.
+            translations: (n, 3) translation of ``cam_from_world`` of each image.
         """
         size, num_slots = int(kernels.NUM_IMAGE_PARAMS), len(layout.pair)
         variable = rig.variable_frames()
@@ -211,13 +287,31 @@ class RigBasis(NamedTuple):
         values.append(np.ones(len(free)))
         next_column += len(free)
         scale_column = None
+        is_constant = rig.constant_sensors()[images]
         if rig.variable_scale:
             scale_column = next_column
             next_column += 1
+            scaled_slots = slots[is_constant]
             for i in range(3):
-                rows.append(size * slots + 3 + i)
-                columns.append(np.full(len(slots), scale_column))
-                values.append(rig.translations[images, i])
+                rows.append(size * scaled_slots + 3 + i)
+                columns.append(np.full(len(scaled_slots), scale_column))
+                values.append(rig.translations[images[is_constant], i])
+        sensor_column = None
+        if rig.variable_sensor is not None and rig.num_variable_sensors:
+            sensor_column = next_column
+            next_column += _POSE * rig.num_variable_sensors
+            chosen = images[~is_constant]
+            starts = size * slots[~is_constant]
+            sensors = sensor_column + _POSE * rig.variable_sensor[chosen]
+            levers = translations[chosen] - rig.scale * rig.translations[chosen]
+            for i in range(_POSE):
+                rows.append(starts + i)
+                columns.append(sensors + i)
+                values.append(np.ones(len(chosen)))
+            for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # cross product a x levers
+                rows += [starts + 3 + i, starts + 3 + i]
+                columns += [sensors + j, sensors + k]
+                values += [levers[:, k], -levers[:, j]]
         row, column, value = (np.concatenate(parts) for parts in (rows, columns, values))
         if gauge is not None:
             value = np.where(column == _POSE * position[gauge[0]] + gauge[1], 0.0, value)
@@ -229,22 +323,20 @@ class RigBasis(NamedTuple):
             top, left = size * slot, _POSE * int(frame_of_slot[slot])
             block = matrix[top : top + _POSE, left : left + _POSE]
             slot_from_frame[slot, :_POSE] = block.toarray()
-        return cls(matrix, frame_of_slot, slot_from_frame, num_frames, scale_column)
+        return cls(matrix, frame_of_slot, slot_from_frame, num_frames, scale_column, sensor_column)
 
     def solve_dense(self, matrix: Float64, rhs: Float64) -> Float64:
-        """Solve the reduced camera system for steps that keep the relative poses of the rig.
+        """Solve the reduced camera system for the parameters of the rig.
 
         Args:
             matrix: (d, d) reduced camera matrix with damping, of which the lower triangle is used.
             rhs: (d,) or (d, r) right side.
 
         Returns:
-            Steps of the shape of ``rhs``, NaN if the matrix is not positive definite.
+            (e,) or (e, r) steps, NaN if the matrix is not positive definite.
         """
         _, solution, info = lapack.dposv(self._project(matrix), self.matrix.T @ rhs, lower=1)
-        if info != 0:
-            return np.full_like(rhs, np.nan)
-        steps: Float64 = self.matrix @ solution
+        steps: Float64 = solution if info == 0 else np.full_like(solution, np.nan)
         return steps
 
     def compute_scale_variance(self, matrix: Float64) -> float:

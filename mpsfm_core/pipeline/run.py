@@ -44,6 +44,7 @@ from mpsfm_core.inputs.rigs import read_rigs
 from mpsfm_core.inputs.video import VideoSelection, extract_frames, is_video, read_selection
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
+from mpsfm_core.mapping.initialization.rig_calibration import calibrate_rigs
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import (
@@ -156,9 +157,10 @@ def reconstruct(
             :func:`build_problem` accepts. The option ``mapping.known_poses`` chooses whether known
             poses are fixed or refined.
         rigs: Cameras that move as one, as path of COLMAP's ``rig_config.json``, of a COLMAP model
-            or of a COLMAP database, or :class:`~mpsfm_core.Rig` objects. All images of a frame get
-            one pose. Without ``rigs``, the rigs of ``database``, ``intrinsics`` or ``poses`` are
-            used.
+            or of a COLMAP database, as ``"folders"`` for one folder of images per camera, or as
+            :class:`~mpsfm_core.Rig` objects. All images of a frame get one pose. Unknown relative
+            poses are estimated. Without ``rigs``, the rigs of ``database``, ``intrinsics`` or
+            ``poses`` are used.
         features: Provider of features that replaces the configured provider. Each provider argument
             is a name, a configuration block, or an object with the method that its provider kind
             requires. Results of a provider object are not cached for later runs.
@@ -337,6 +339,7 @@ class _Run:
         originals = OriginalImages(refined, problem)
         if not mapping.reconstructions:
             self._fail(images, extraction, mapping, originals)
+        self._warn_of_uncalibrated_rigs(mapping.reconstructions[0])
         mapping = self._georeference(images, mapping)
         mapping = self._densify(hold_out(mapping, self._config.dense.hold_out_every), originals)
         self._localize_frames(mapping, originals)
@@ -541,6 +544,7 @@ class _Run:
         problem = undistort_problem(images, refined, extraction.problem)
         changed = np.array([new is not old for new, old in zip(refined, images, strict=True)])
         problem = estimate_relative_poses(problem, changed, config.runtime.seed)
+        problem = calibrate_rigs(problem, mapping.reconstructions) or problem
         return extraction, refined, self._map_from_seeds(problem, seeds)
 
     def _map_from_seeds(
@@ -563,6 +567,19 @@ class _Run:
         with self._stages.stage("mapping"):
             parts = refine_reconstructions(refined, problem, mapping.reconstructions, options)
             return replace(mapping, reconstructions=parts)
+
+    def _warn_of_uncalibrated_rigs(self, largest: Reconstruction) -> None:
+        """Warn of rigs whose relative poses could not be estimated from the largest component."""
+        used = {name for rig in largest.rigs for name in rig.image_names}
+        for rig in self._rigs:
+            if not rig.is_calibrated and not used & set(rig.image_names):
+                names = [name for frame in rig.frames for name in frame[:1] if name is not None]
+                self._stages.warn(
+                    f"the rig of {names[0] if names else rig.image_names[0]} has unknown relative "
+                    "poses that could not be estimated, so its photos have independent poses; take "
+                    "photos whose cameras see the same place, also at different moments, or check "
+                    "that the photos of a frame were taken at the same moment"
+                )
 
     def _georeference(self, images: ImageSet, mapping: MappingResult) -> MappingResult:
         """Align reconstructions with GPS positions, if enough images have a position."""

@@ -113,9 +113,9 @@ def _add_rig(
     reference = min(cameras)
     colmap_rig = pycolmap.Rig(rig_id=max([0, *model.rigs]) + 1)
     colmap_rig.add_ref_sensor(model.cameras[cameras[reference]].sensor_id)
-    rig_from_reference = invert(*rig.sensor_from_rig[reference])
+    rig_from_reference = invert(*rig.sensor_poses[reference])
     from_reference = {
-        sensor: compose(rig.sensor_from_rig[sensor], rig_from_reference) for sensor in cameras
+        sensor: compose(rig.sensor_poses[sensor], rig_from_reference) for sensor in cameras
     }
     for sensor in sorted(cameras.keys() - {reference}):
         pose = pycolmap.Rigid3d(np.column_stack(from_reference[sensor]))

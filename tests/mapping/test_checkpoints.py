@@ -18,7 +18,8 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult
 from mpsfm_core.mapping.state import CheckpointArrays, flatten_state, unflatten_state
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
-from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.rigs import make_rig_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, look_at, room_scene
 
 CAMERA = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)
 
@@ -118,6 +119,22 @@ def test_run_interrupted_after_each_checkpoint_gives_identical_result(
     # A resumed mapper saves a checkpoint at once, so each interruption loses one step.
     again = reconstruct(problem, OPTIONS, checkpoints=Memory(kept, -1))
     assert same(content(again), content(result))
+
+
+def test_resumed_run_with_calibrated_rig_gives_identical_result() -> None:
+    poses = [
+        look_at([-1.2 + 0.4 * k, -0.6, 1.4], [2.0 + 0.4 * k, 0.3 * (-1) ** k, 1.2])
+        for k in range(4)
+    ]
+    problem = make_rig_problem(room_scene(), "stereo", poses, num_points=500, map_width=40).problem
+    rig = replace(problem.rigs[0], sensor_from_rig=(None, None))
+    problem, memory = replace(problem, rigs=(rig,)), Memory([], -1)
+    result = reconstruct(problem, checkpoints=memory)
+    assert result.report.runs == 2
+    assert result.reconstructions[0].rigs[0].is_estimated
+    for last in (1, len(memory.states) - 1, len(memory.states)):
+        again = reconstruct(problem, checkpoints=Memory(memory.states[:last], -1))
+        assert same(content(again), content(result))
 
 
 def test_saving_checkpoints_does_not_change_result(problem: MappingProblem, uninterrupted) -> None:

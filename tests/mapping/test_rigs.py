@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.data import Float64, Rig
+from mpsfm_core.data import Float64, MappingProblem, Rig
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.evaluation.alignment import umeyama
-from mpsfm_core.geometry import camera_center, compose, invert
+from mpsfm_core.geometry import camera_center, compose, invert, rotation_angle_deg
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, transform_reconstruction
@@ -33,11 +33,21 @@ def make_frame_poses(count: int) -> list[Float64]:
     ]
 
 
-def make_problem(kind: RigKind, count: int) -> RigProblem:
+def make_turning_poses(count: int) -> list[Float64]:
+    """Return poses of frames that turn by 30 degrees each, so that outward cameras overlap."""
+    return [
+        look_at(eye, [eye[0] + np.cos(angle), eye[1] + np.sin(angle), 1.3])
+        for angle in np.radians(30.0) * np.arange(count)
+        for eye in [[-0.8 + 0.3 * angle, 0.2 * np.sin(2 * angle), 1.4 + 0.1 * np.cos(angle)]]
+    ]
+
+
+def make_problem(kind: RigKind, count: int, frame_poses: list[Float64] | None = None) -> RigProblem:
     """Return a rig problem with noisy keypoints, and depth with a wrong scale per image."""
     noise = SyntheticNoise(keypoints_px=0.5, scale=0.1, depth=0.01)
+    frame_poses = frame_poses or make_frame_poses(count)
     return make_rig_problem(
-        room_scene(), kind, make_frame_poses(count), num_points=800, map_width=60, noise=noise
+        room_scene(), kind, frame_poses, num_points=800, map_width=60, noise=noise
     )
 
 
@@ -100,6 +110,53 @@ def test_panorama_views_share_one_center() -> None:
     assert len(model.images) == 24
     assert_rigid_frames(model)
     assert center_errors(model, rig_problem.poses)[1].max() < 0.01
+
+
+def hide_sensor_poses(problem: MappingProblem) -> MappingProblem:
+    """Return the problem with unknown relative poses of its rig."""
+    (rig,) = problem.rigs
+    return replace(problem, rigs=(replace(rig, sensor_from_rig=(None,) * len(rig.sensor_poses)),))
+
+
+@pytest.mark.parametrize(("kind", "max_angle_deg"), [("stereo", 0.05), ("around", 0.1)])
+def test_unknown_relative_poses_are_calibrated(kind: RigKind, max_angle_deg: float) -> None:
+    rig_problem = make_problem(kind, 6, make_turning_poses(6))
+    result = reconstruct(hide_sensor_poses(rig_problem.problem))
+    model = result.reconstructions[0]
+    assert len(model.images) == len(rig_problem.poses)
+    assert_rigid_frames(model)
+    assert model.metric is None or model.metric.by != "rig baselines"
+    (rig,), (true_rig,) = model.rigs, rig_problem.problem.rigs
+    assert rig.is_estimated
+    first, true_first = rig.sensor_poses[0][0], true_rig.sensor_poses[0][0]
+    for (rotation, _), (true_rotation, _) in zip(
+        rig.sensor_poses, true_rig.sensor_poses, strict=True
+    ):
+        error = rotation @ first.T @ (true_rotation @ true_first.T).T
+        assert rotation_angle_deg(error) < max_angle_deg
+    assert center_errors(model, rig_problem.poses)[1].max() < 0.01
+
+
+def test_rig_without_common_frame_stays_uncalibrated() -> None:
+    rig_problem = make_problem("stereo", 4)
+    (rig,) = hide_sensor_poses(rig_problem.problem).rigs
+    frames = tuple((a, None) if k % 2 else (None, b) for k, (a, b) in enumerate(rig.frames))
+    problem = replace(rig_problem.problem, rigs=(replace(rig, frames=frames),))
+    result = reconstruct(problem)
+    assert result.report.runs == 1
+    assert result.reconstructions[0].rigs == ()
+
+
+def test_images_that_do_not_move_as_one_stay_uncalibrated() -> None:
+    rig_problem = make_problem("stereo", 6, make_turning_poses(6))
+    (rig,) = hide_sensor_poses(rig_problem.problem).rigs
+    left, right = zip(*rig.frames, strict=True)
+    frames = tuple(zip(left, right[::-1], strict=True))
+    problem = replace(rig_problem.problem, rigs=(replace(rig, frames=frames),))
+    result = reconstruct(problem)
+    assert result.report.runs == 1
+    assert result.reconstructions[0].rigs == ()
+    assert center_errors(result.reconstructions[0], rig_problem.poses)[1].max() < 0.01
 
 
 def test_colmap_model_has_rigs_and_frames() -> None:

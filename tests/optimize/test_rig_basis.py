@@ -8,12 +8,14 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import Float64
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.optimize.bundle_adjustment import BundleProblem, BundleResult, adjust_bundle
+from mpsfm_core.optimize.bundle_problem import prepare_bundle
 from mpsfm_core.optimize.options import Loss
-from mpsfm_core.optimize.rig_basis import RigConstraint, measure_rig_scale
+from mpsfm_core.optimize.rig_basis import RigBasis, RigConstraint, measure_rig_scale
 from tests.optimize.bundle_reference import FOCAL, SIZE, rotation, soft_l1
 
 TIGHT = soft_l1(
@@ -146,12 +148,14 @@ def build_colmap_rig(problem: BundleProblem) -> pycolmap.Reconstruction:
     return model
 
 
-def adjust_with_ceres(model: pycolmap.Reconstruction) -> None:
-    """Adjust the frames of a COLMAP model, with constant intrinsics and relative poses."""
+def adjust_with_ceres(
+    model: pycolmap.Reconstruction, *, refine_sensor_from_rig: bool = False
+) -> None:
+    """Adjust the frames, and the relative poses if asked, with constant intrinsics."""
     options = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=False,
         refine_extra_params=False,
-        refine_sensor_from_rig=False,
+        refine_sensor_from_rig=refine_sensor_from_rig,
         print_summary=False,
     )
     options.ceres.solver_options.max_num_iterations = 500
@@ -188,6 +192,73 @@ def test_adjust_bundle_with_rig_has_same_optimum_as_ceres(dense_poses: int) -> N
     np.testing.assert_allclose(result.rotations, turns, atol=1e-6)
     shifts = np.stack([pose.translation for pose in poses])
     np.testing.assert_allclose(result.translations, shifts, atol=1e-5)
+
+
+def free_sensors(problem: BundleProblem) -> RigConstraint:
+    """Return the rig of a problem with estimated poses of all sensors except the first."""
+    assert problem.rig is not None
+    sensors = np.tile(np.arange(SENSORS), len(problem.rotations) // SENSORS) - 1
+    return replace(problem.rig, variable_sensor=sensors)
+
+
+def perturb_sensors(problem: BundleProblem) -> BundleProblem:
+    """Perturb the relative poses of all sensors except the first."""
+    rig = free_sensors(problem)
+    assert rig.variable_sensor is not None
+    turns, shifts = rig.frame_poses(problem.rotations, problem.translations)
+    rotations, translations = rig.rotations.copy(), rig.translations.copy()
+    for sensor, (turn, shift) in enumerate([([0.01, -0.02, 0], 0.03), ([0, 0.015, 0.01], -0.02)]):
+        rows = rig.variable_sensor == sensor
+        rotations[rows] = rotation(turn) @ rotations[rows]
+        translations[rows] += shift
+    rig = replace(rig, rotations=rotations, translations=translations)
+    moved = rotations @ turns, np.einsum("nij,nj->ni", rotations, shifts) + translations
+    return replace(problem, rotations=moved[0], translations=moved[1], rig=rig)
+
+
+@pytest.mark.parametrize("dense_poses", [500, 0])
+def test_adjust_bundle_with_variable_sensors_has_same_optimum_as_ceres(dense_poses: int) -> None:
+    start = perturb_sensors(perturb_frames(*make_rig_problem()))
+    start = replace(start, scale_anchor=SENSORS)
+    model = build_colmap_rig(start)
+    adjust_with_ceres(model, refine_sensor_from_rig=True)
+    result = adjust_bundle(start, TIGHT.model_copy(update={"dense_poses": dense_poses}))
+    assert result.converged
+    assert result.rig is not None
+    adjusted = replace(start, rig=result.rig)
+    assert_keeps_rig(adjusted, result)
+    (rig,) = model.rigs.values()
+    scale = np.linalg.norm(result.rig.translations[1])
+    for sensor, pose in enumerate(rig.non_ref_sensors.values(), start=1):
+        np.testing.assert_allclose(result.rig.rotations[sensor], pose.rotation.matrix(), atol=1e-5)
+        if sensor == 1:
+            scale /= np.linalg.norm(pose.translation)
+        np.testing.assert_allclose(
+            result.rig.translations[sensor], scale * pose.translation, atol=1e-4
+        )
+
+
+def test_reduced_system_of_variable_sensors_is_the_derivative_of_the_retraction() -> None:
+    """Finite differences of the poses of images by steps of frames, sensors and scale."""
+    problem, *_ = make_rig_problem()
+    rig = replace(free_sensors(problem), variable_scale=True, scale=1.2)
+    rotations = problem.rotations
+    translations = problem.translations + (rig.scale - 1) * rig.translations
+    start = replace(problem, rotations=rotations, translations=translations, rig=rig)
+    layout = prepare_bundle(start, TIGHT).bundle.layout
+    basis = RigBasis.build(rig, layout, None, translations)
+    slots = layout.pose_slot
+    step = 1e-6
+    matrix = basis.matrix.toarray()
+    for parameter in range(basis.matrix.shape[1]):
+        steps = np.zeros(basis.matrix.shape[1])
+        steps[parameter] = step
+        _, moved, shifted = rig.retract(rotations, translations, basis, steps)
+        turned = Rotation.from_matrix(moved @ rotations.transpose(0, 2, 1)).as_rotvec()
+        expected = np.hstack([turned, shifted - translations]) / step
+        rows = matrix[:, parameter].reshape(-1, 7)[:, :6]
+        actual = np.where((slots >= 0)[:, None], rows[slots], 0.0)
+        np.testing.assert_allclose(actual, expected, atol=1e-4)
 
 
 def test_adjust_bundle_with_rig_recovers_exact_poses_and_depth_scales() -> None:

@@ -42,7 +42,6 @@ from mpsfm_core.optimize.covariance import (
 )
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
 from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, BundleOptions, Loss
-from mpsfm_core.optimize.rig_basis import measure_rig_scale
 from mpsfm_core.optimize.subsampling import (
     compute_subsampling_step,
     subsample_camera,
@@ -283,13 +282,14 @@ class Refiner:
             depth_map.set_scale(depth_map.scale * float(np.exp(result.log_scales[row])))
 
     def _update_rigs(self, bundle: _Bundle, result: BundleResult) -> None:
-        """Update the scale of rigs, and the poses of images that observe no points."""
+        """Update rigs, and the poses of images that observe no points."""
         scene, rig = self.scene, bundle.problem.rig
         assert rig is not None
-        if rig.variable_scale:
-            scale = measure_rig_scale(rig, result.translations)
-            if scale is not None and scale > 0:
-                scene.set_rig_scale(scale, result.std_rig_scale)
+        if result.rig is not None:
+            adjusted = result.rig
+            scene.rigs.set_sensor_poses(bundle.images, adjusted.rotations, adjusted.translations)
+            if rig.variable_scale and adjusted.scale > 0:
+                scene.set_rig_scale(adjusted.scale, result.std_rig_scale)
         _, first = np.unique(rig.frame_of_image, return_index=True)
         for image in map(int, bundle.images[first]):
             scene.register(image, scene.rotations[image].copy(), scene.translations[image].copy())
@@ -426,13 +426,13 @@ class Refiner:
         if moving.all():
             moving[scene.rigs.frame_of[images] == scene.rigs.frame_of[images[0]]] = False
         refines_all = not local and len(variable) == np.count_nonzero(scene.registered)
-        rig = scene.rigs.constrain(images, moving, refine_scale=refines_all)
+        rig = scene.rigs.constrain(images, moving, refine_rigs=refines_all)
         long_track = np.bincount(point_rows) >= MAX_LOCAL_TRACK_LENGTH
         log_depth, log_std = self._depth_observations(observations, refined_depth)
         regularized = self.options.depth_regularization and bool(np.isfinite(log_depth).any())
         num_constant = len(np.unique(scene.rigs.frame_of[images[~moving]]))
         free_scale = not regularized and moving.any() and num_constant == 1
-        free_scale &= rig is None or rig.variable_scale or not rig.translations.any()
+        free_scale &= rig is None or not rig.fixes_scale
         weight = scene.graph.keypoint_weight[observations]
         expected, std = self._expected_log_scales(images)
         _, first, camera_rows = np.unique(

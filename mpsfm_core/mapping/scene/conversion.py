@@ -93,7 +93,7 @@ def convert_scene(
         convert_image(scene, int(i), factor, in_metres, errors) for i in scene.registered_images()
     )
     names = {image.name for image in images}
-    rigs = tuple(rig.subset(names).scaled(scene.rigs.scale * factor) for rig in scene.problem.rigs)
+    rigs = tuple(rig.subset(names).scaled(factor) for rig in scene.rigs.rigs())
     return Reconstruction(images, tracks.xyz * factor, mean_errors, metric, rigs)
 
 

@@ -214,7 +214,11 @@ class Reconstruction:
         images = tuple(RegisteredImage.from_state_dict(image) for image in state["images"])
         metric = state["metric"] and MetricScale(**state["metric"])
         rigs = tuple(
-            Rig(tuple(map(tuple, rig["sensor_from_rig"])), tuple(map(tuple, rig["frames"])))
+            Rig(
+                tuple(map(tuple, rig["sensor_from_rig"])),
+                tuple(map(tuple, rig["frames"])),
+                rig["is_estimated"],
+            )
             for rig in state["rigs"]
         )
         return cls(**{**state, "images": images, "metric": metric, "rigs": rigs})

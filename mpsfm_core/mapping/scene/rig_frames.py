@@ -1,23 +1,28 @@
-"""Frames of the rigs of a scene: images whose relative poses are known."""
+"""Frames of the rigs of a scene: images with constant relative poses."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, Pose
+from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, Pose, Rig
 from mpsfm_core.geometry import compose, invert
+from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.optimize.rig_basis import RigConstraint, measure_rig_scale
 
 
 class RigFrames:
     """Frame and ``sensor_from_rig`` of each image of a mapping problem with n images.
 
-    An image without a rig is the only image of its frame.
+    An image without a rig, or in a rig with an unknown relative pose, is the only image of its
+    frame.
 
     Attributes:
         frame_of: (n,) int64 frame of each image.
+        variable_sensor: (n,) int64 number of the sensor of each image whose ``sensor_from_rig``
+            bundle adjustment refines, or -1. The first sensor of an estimated rig is constant.
         rotations: (n, 3, 3) float64 rotation of ``sensor_from_rig`` of each image.
         translations: (n, 3) float64 translation of ``sensor_from_rig`` of each image, in meters.
         scale: World units per meter, which converts the translations of rigs.
@@ -32,12 +37,20 @@ class RigFrames:
         self.translations: Float64 = np.zeros((count, 3))
         self.scale = 1.0
         self.scale_std = np.inf
-        for rig in problem.rigs:
+        self.variable_sensor: Int64 = np.full(count, -1, dtype=np.int64)
+        self._rigs = tuple(rig for rig in problem.rigs if rig.is_calibrated)
+        num_variable = 0
+        for rig in self._rigs:
             for frame in rig.frames:
                 sensors = [(row_of[name], s) for s, name in enumerate(frame) if name in row_of]
                 for row, sensor in sensors:
                     self.frame_of[row] = sensors[0][0]
-                    self.rotations[row], self.translations[row] = rig.sensor_from_rig[sensor]
+                    self.rotations[row], self.translations[row] = rig.sensor_poses[sensor]
+                    if rig.is_estimated and sensor > 0:
+                        self.variable_sensor[row] = num_variable + sensor - 1
+            if rig.is_estimated:
+                num_variable += len(rig.sensor_from_rig) - 1
+        self._row_of = row_of
         self._images = {
             int(frame): np.flatnonzero(self.frame_of == frame)
             for frame in np.flatnonzero(np.bincount(self.frame_of, minlength=1) > 1)
@@ -54,6 +67,62 @@ class RigFrames:
         if images is None:
             return [image]
         return [image, *(int(k) for k in images if k != image)]
+
+    def state_dict(self) -> StateDict:
+        """Return the scale and the relative poses of the rigs for a snapshot or checkpoint."""
+        return {
+            "scale": self.scale,
+            "scale_std": self.scale_std,
+            "rotations": self.rotations.copy(),
+            "translations": self.translations.copy(),
+        }
+
+    def load_state_dict(self, state: StateDict) -> None:
+        """Restore the scale and the relative poses of the rigs."""
+        self.scale, self.scale_std = state["scale"], state["scale_std"]
+        self.rotations = state["rotations"].copy()
+        self.translations = state["translations"].copy()
+
+    def resume(self, rigs: Sequence[Rig]) -> None:
+        """Load the relative poses of estimated rigs of a reconstruction."""
+        for rig in rigs:
+            for frame in rig.frames:
+                for name, (rotation, translation) in zip(frame, rig.sensor_poses, strict=True):
+                    if name in self._row_of:
+                        rows = np.array([self._row_of[name]])
+                        self.set_sensor_poses(rows, rotation[None], translation[None])
+
+    def rigs(self) -> tuple[Rig, ...]:
+        """Return the calibrated rigs with current relative poses, translations in world units."""
+        return tuple(
+            replace(rig, sensor_from_rig=self._sensor_poses(rig)).scaled(self.scale)
+            for rig in self._rigs
+        )
+
+    def _sensor_poses(self, rig: Rig) -> tuple[Pose, ...]:
+        """Return the current ``sensor_from_rig`` of a rig, with translations in meters."""
+        poses = list(rig.sensor_poses)
+        for frame in rig.frames:
+            for sensor, name in enumerate(frame):
+                if name in self._row_of:
+                    row = self._row_of[name]
+                    poses[sensor] = self.rotations[row].copy(), self.translations[row].copy()
+        return tuple(poses)
+
+    def set_sensor_poses(self, images: Int64, rotations: Float64, translations: Float64) -> None:
+        """Set ``sensor_from_rig`` of variable sensors to those of images.
+
+        Args:
+            images: (m,) images.
+            rotations: (m, 3, 3) rotation of ``sensor_from_rig`` of each image.
+            translations: (m, 3) translation of ``sensor_from_rig`` of each image, in meters.
+        """
+        sensors, first = np.unique(self.variable_sensor[images], return_index=True)
+        for sensor, row in zip(sensors, first, strict=True):
+            if sensor >= 0:
+                is_sensor = self.variable_sensor == sensor
+                self.rotations[is_sensor] = rotations[row]
+                self.translations[is_sensor] = translations[row]
 
     def complete(self, images: list[int]) -> list[int]:
         """Return the given images, followed by the other images of their frames."""
@@ -78,7 +147,7 @@ class RigFrames:
         return self.rotations[image], self.scale * self.translations[image]
 
     def constrain(
-        self, images: Int64, variable: Bool, *, refine_scale: bool = False
+        self, images: Int64, variable: Bool, *, refine_rigs: bool = False
     ) -> RigConstraint | None:
         """Return the constraint of a bundle adjustment problem, None if no frame has two images.
 
@@ -86,7 +155,8 @@ class RigFrames:
             images: (m,) image of each row of the bundle adjustment problem.
             variable: (m,) bool mask of the images with a variable pose. A frame is variable if
                 all of its images are variable.
-            refine_scale: Estimate the scale of the rigs, if a frame has a baseline.
+            refine_rigs: Estimate the scale of the rigs, if a frame has a known baseline, and the
+                relative poses of estimated rigs.
         """
         frames, rows = np.unique(self.frame_of[images], return_inverse=True)
         if len(frames) == len(images):
@@ -99,8 +169,15 @@ class RigFrames:
             self.scale,
             variable_frame=~is_constant,
         )
-        has_baseline = measure_rig_scale(constraint, constraint.translations) is not None
-        return replace(constraint, variable_scale=refine_scale and has_baseline)
+        if not refine_rigs:
+            return constraint
+        _, sensors = np.unique(
+            np.append(self.variable_sensor[images], -1), return_inverse=True
+        )  # without gaps between the numbers of sensors
+        constraint = replace(constraint, variable_sensor=sensors[:-1] - 1)
+        known = constraint.constant_sensors()
+        has_baseline = measure_rig_scale(constraint, constraint.translations, known) is not None
+        return replace(constraint, variable_scale=has_baseline)
 
     def measure_scale(self, images: Int64, translations: Float64) -> float | None:
         """Measure world units per meter from the poses of images, None without a baseline.
@@ -109,5 +186,9 @@ class RigFrames:
             images: (m,) images with known poses.
             translations: (m, 3) translation of ``cam_from_world`` of each image.
         """
-        constraint = self.constrain(images, np.ones(len(images), dtype=np.bool_))
-        return None if constraint is None else measure_rig_scale(constraint, translations)
+        constraint = self.constrain(images, np.ones(len(images), dtype=np.bool_), refine_rigs=True)
+        if constraint is None:
+            return None
+        known = constraint.constant_sensors()
+        scale = measure_rig_scale(constraint, translations, known)
+        return measure_rig_scale(constraint, translations) if scale is None else scale

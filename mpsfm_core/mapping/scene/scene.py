@@ -34,8 +34,7 @@ class Snapshot(NamedTuple):
     maps: Sequence[tuple[float, bool, RefinedDepth | None]]
     distortion: Float64
     estimated_intrinsics: StateDict
-    rig_scale: tuple[float, float]
-    """World units per meter of the rigs, and the standard deviation."""
+    rigs: StateDict
 
 
 class Scene:
@@ -337,6 +336,7 @@ class Scene:
         self.tracks.xyz = reconstruction.points.copy()
         rows = np.array([image.index for image in reconstruction.images], dtype=np.int64)
         translations = np.array([image.translation for image in reconstruction.images])
+        self.rigs.resume(reconstruction.rigs)
         self.rigs.scale = self.rigs.measure_scale(rows, translations) or 1.0
         for image in reconstruction.images:
             self.register(image.index, image.rotation, image.translation)
@@ -372,7 +372,7 @@ class Scene:
             maps,
             self.distortion.copy(),
             self.estimated_intrinsics.state_dict(),
-            (self.rigs.scale, self.rigs.scale_std),
+            self.rigs.state_dict(),
         )
 
     def restore(self, snapshot: Snapshot) -> None:
@@ -380,7 +380,7 @@ class Scene:
         self.rotations = snapshot.rotations.copy()
         self.translations = snapshot.translations.copy()
         self.registered = snapshot.registered.copy()
-        self.rigs.scale, self.rigs.scale_std = snapshot.rig_scale
+        self.rigs.load_state_dict(snapshot.rigs)
         changed = (self.intrinsics != snapshot.intrinsics).any(axis=1)
         changed |= (self.distortion != snapshot.distortion).any(axis=1)
         for image in np.flatnonzero(changed):
