@@ -33,9 +33,9 @@ from mpsfm_core import reconstruct
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.data.camera_models import CameraModel
 from mpsfm_core.data.errors import MpsfmError
-from mpsfm_core.evaluation.alignment import umeyama
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
+from mpsfm_core.geometry.similarity import umeyama
 from mpsfm_core.inputs.gps import convert_to_enu, read_gps
 from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.report.verdict import judge

@@ -24,9 +24,9 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Float64, MappingProblem, Pose, Rig
-from mpsfm_core.evaluation.alignment import umeyama
 from mpsfm_core.evaluation.peers import run_peer, write_database
 from mpsfm_core.geometry import camera_center
+from mpsfm_core.geometry.similarity import umeyama
 from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise

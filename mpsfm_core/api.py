@@ -51,8 +51,8 @@ from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.models import read_poses
 from mpsfm_core.inputs.video import extract_frames, is_video
-from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.parts import part_mapping
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.pipeline.provider_resolution import resolve_providers
 from mpsfm_core.pipeline.stages import Stages
@@ -311,7 +311,7 @@ def run_mapper(
     """
     stages = Stages(Registry(), on_event)
     with stages.stage("mapping"):
-        return mapper.reconstruct(problem, _parse_mapper_options(options), stages)
+        return part_mapping.reconstruct(problem, _parse_mapper_options(options), stages)
 
 
 def _parse_mapper_options(options: MapperOptions | Mapping[str, Any] | None) -> MapperOptions:

@@ -223,7 +223,8 @@ class MappingProblem:
 
     def subset(self, names: list[str]) -> MappingProblem:
         """Return the mapping problem restricted to the named images and their pairs."""
-        indices = [i for i, image in enumerate(self.images) if image.name in set(names)]
+        chosen = set(names)
+        indices = [i for i, image in enumerate(self.images) if image.name in chosen]
         position = {old: new for new, old in enumerate(indices)}
         pairs = tuple(
             replace(pair, image_a=position[pair.image_a], image_b=position[pair.image_b])

@@ -9,23 +9,7 @@ import numpy as np
 
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
-
-
-@dataclass(frozen=True, eq=False)
-class SimilarityTransform:
-    """Similarity transform ``x_b = scale * rotation @ x_a + translation``."""
-
-    scale: float
-    """Scale > 0."""
-    rotation: Float64
-    """(3, 3) rotation."""
-    translation: Float64
-    """(3,) translation."""
-
-    def apply(self, points: Float64) -> Float64:
-        """Transform points (n, 3) from frame a to frame b."""
-        moved: Float64 = self.scale * points @ self.rotation.T + self.translation
-        return moved
+from mpsfm_core.geometry.similarity import SimilarityTransform, umeyama
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,27 +56,6 @@ class TrajectoryErrors:
             "rotation_max_deg": float(self.rotations_deg.max()),
             "scale": self.truth_from_estimate.scale,
         }
-
-
-def umeyama(a: Float64, b: Float64) -> SimilarityTransform:
-    """Fit the least-squares similarity transform ``b_from_a`` (Umeyama, PAMI 1991).
-
-    Args:
-        a: (n, 3) corresponding points in frame a.
-        b: (n, 3) corresponding points in frame b.
-
-    Raises:
-        ValueError: All points in one of the frames coincide, so the scale is undefined.
-    """
-    mean_a, mean_b = a.mean(axis=0), b.mean(axis=0)
-    spread_a, spread_b = a - mean_a, b - mean_b
-    if not (spread_a.any() and spread_b.any()):
-        raise ValueError("all points coincide")
-    u, singular, vt = np.linalg.svd(spread_b.T @ spread_a)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = (u * signs) @ vt
-    scale = float((singular * signs).sum() / (spread_a**2).sum())
-    return SimilarityTransform(scale, rotation, mean_b - scale * rotation @ mean_a)
 
 
 def trajectory_errors(

@@ -20,8 +20,8 @@ from mpsfm_core.data import MappingProblem, PinholeCamera, Pose
 from mpsfm_core.evaluation.chained_pnp import estimate_chained_poses
 from mpsfm_core.evaluation.dense_geometry import DenseEvaluation
 from mpsfm_core.evaluation.peers import PEERS, run_peer
-from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.parts import part_mapping
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.pipeline.stages import peak_memory_mb
 from mpsfm_core.support.threads import limit_threads
@@ -104,7 +104,7 @@ def run_method(run: MethodRun) -> MethodResult:
             elif run.method != OURS:
                 models = run_peer(run.method, run.problem)
             else:
-                reconstructions = mapper.reconstruct(run.problem, run.options).reconstructions
+                reconstructions = part_mapping.reconstruct(run.problem, run.options).reconstructions
                 models = [model.poses for model in reconstructions]
     except Exception as raised:  # The benchmark continues, because a failed run is also a result.
         error = f"{type(raised).__name__}: {raised}"

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.config import Config
+from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data.errors import ConfigError, InputError, did_you_mean
 from mpsfm_core.extraction.active_provider import thread_count
 from mpsfm_core.extraction.cache import content_key
@@ -43,7 +43,7 @@ def use_executor(context: ExtractionContext) -> Iterator[None]:
     Raises:
         ConfigError: no plugin provides the executor, or its workers are unavailable.
     """
-    executor = _create_executor(context)
+    executor = create_executor(context.config.runtime, context.registry)
     if executor is None:
         yield
         return
@@ -54,12 +54,16 @@ def use_executor(context: ExtractionContext) -> Iterator[None]:
         executor.close()
 
 
-def _create_executor(context: ExtractionContext) -> Executor | None:
-    runtime = context.config.runtime
+def create_executor(runtime: RuntimeOptions, registry: Registry) -> Executor | None:
+    """Create the configured executor, or return None if all work runs on threads.
+
+    Raises:
+        ConfigError: no plugin provides the executor, or its workers are unavailable.
+    """
     name, options = runtime.executor, runtime.executor_options
     if name == THREADS:
         return None
-    created: Executor | None = context.registry.hook.mpsfm_executor(name=name, options=options)
+    created: Executor | None = registry.hook.mpsfm_executor(name=name, options=options)
     if created is None:
         known = (THREADS, *EXECUTORS)
         hint = (

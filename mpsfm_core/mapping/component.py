@@ -28,6 +28,7 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.filtering import filter_points, find_lost_images
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.scene.conversion import convert_scene
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, triangulate_image
 
 _log = logging.getLogger(__name__)
@@ -111,6 +112,25 @@ class Component:
         if not len(scene.tracks):
             _log.warning("images with known poses share no points: %s", _WITHOUT_POINTS[is_fixed])
         self.maintenance.refine_globally()
+        if self.size < 2:
+            return False
+        for image in self._first_images():
+            self.maintenance.confirm(image)
+        return True
+
+    def initialize_from_model(self, model: Reconstruction) -> bool:
+        """Register the images of a joined reconstruction, and complete tracks across its parts.
+
+        The depth maps of the parts are kept. The depth of all images is checked, because the parts
+        compared only their own images.
+
+        Returns:
+            False if fewer than two images observe enough points.
+        """
+        self.scene.resume(model, refined_map_width=self._options.refinement.map_width)
+        self.refiner.adapts_reprojection_loss = True
+        self.maintenance.refine_globally(depth_maps=False)
+        self.maintenance.check_all_images(MAX_FINAL_VIOLATIONS, "final-check")
         if self.size < 2:
             return False
         for image in self._first_images():

@@ -11,6 +11,7 @@ The steps of :func:`reconstruct`, compared with COLMAP's ``IncrementalMapper``::
     for each seed:
         while images are unregistered:
             component = new component
+            component.initialize_from_model()           # joined reconstructions of parts, or
             component.initialize_from_known_poses()     # poses that came with the images, or
             component.initialize_globally()             # all well connected images, or
             component.initialize_from_pair()            # one pair, best first
@@ -28,7 +29,7 @@ The steps of :func:`reconstruct`, compared with COLMAP's ``IncrementalMapper``::
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -49,7 +50,7 @@ from mpsfm_core.mapping.model_selection import (
     compute_explained_ratios,
     is_settled,
     select_run,
-    sum_run_times,
+    sum_step_times,
 )
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.registration.duplicate_registration import (
@@ -72,6 +73,7 @@ def reconstruct(
     options: MapperOptions | None = None,
     events: MappingEvents | None = None,
     checkpoints: CheckpointStore | None = None,
+    models: Sequence[Reconstruction] = (),
 ) -> MappingResult:
     """Reconstruct poses, points and refined depth of all images that can be verified.
 
@@ -88,6 +90,8 @@ def reconstruct(
         options: Options of the mapper.
         events: Receiver of progress events.
         checkpoints: Storage of checkpoints.
+        models: Reconstructions of some images, from which the first components start. With models,
+            there is one mapper run.
 
     Returns:
         Connected components, sorted by decreasing number of images, and the report.
@@ -100,12 +104,12 @@ def reconstruct(
     is_complete = bool(runs) and interrupted is None
     pair_weights = None
     distinct = remove_duplicates(problem, options)
-    initial_problem = _calibrate_view_graph(distinct, options)
+    initial_problem = distinct if models else _calibrate_view_graph(distinct, options)
     for run in runs:  # completed mapper runs, oldest first
         initial_problem = _improve_problem(initial_problem, run, options) or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):
         run_options = options.model_copy(update={"seed": options.seed + number})
-        mapper = Mapper(initial_problem, run_options, events, pair_weights)
+        mapper = Mapper(initial_problem, run_options, events, pair_weights, models)
         if interrupted is not None:
             mapper.load_state_dict(interrupted)
             interrupted = None
@@ -115,7 +119,7 @@ def reconstruct(
 
         runs.append(mapper.run(save_checkpoint))
         pair_weights = mapper.pair_weights
-        if mapper.is_deterministic:
+        if mapper.is_deterministic or models:
             break
         improved_problem = _improve_problem(initial_problem, runs[-1], options)
         if improved_problem is not None:
@@ -128,7 +132,7 @@ def reconstruct(
     distinct = calibrate_rigs(distinct, models) or distinct
     if models and options.register_tentatively:
         models[0] = register_tentatively(models[0], models[1:], distinct, options)
-    report = sum_run_times(selected.report, runs)
+    report = sum_step_times(selected.report, [run.report for run in runs])
     if distinct is not problem:
         max_error_px = options.triangulation.max_error_px
         models = [register_duplicates(model, problem, max_error_px) for model in models]
@@ -178,6 +182,7 @@ class Mapper:
         options: MapperOptions,
         events: MappingEvents,
         pair_weights: Float64 | None = None,
+        initial_models: Sequence[Reconstruction] = (),
     ) -> None:
         self.problem = problem
         self.options = options
@@ -185,6 +190,7 @@ class Mapper:
         self.models: list[Reconstruction] = []
         self.unregistered: Bool = np.ones(len(problem.images), dtype=np.bool_)
         self._pair_selector = InitialPairSelector(options)
+        self._initial_models = tuple(initial_models)
         self._num_components = 0
         self._is_growing = False
         self._uses_known_poses = sum(image.known_pose is not None for image in problem.images) >= 2
@@ -262,15 +268,20 @@ class Mapper:
             if np.count_nonzero(self.unregistered) < 2:
                 return False
             self.component = self._create_component()
-            if not self._initialize_from_known_poses() and not self._initialize():
+            if not (
+                self._initialize_from_model()
+                or self._initialize_from_known_poses()
+                or self._initialize()
+            ):
                 return False
             self._is_growing = True
         save_checkpoint()
         if not self.is_deterministic:
-            self.component.register_images(self.unregistered, save_checkpoint)
-            self.component.reregister_images(self.unregistered)
+            candidates = self._select_candidates()
+            self.component.register_images(candidates, save_checkpoint)
+            self.component.reregister_images(candidates)
         self._is_growing = False
-        if self._uses_known_poses or not self._absorb_components():
+        if self._uses_known_poses or self._initial_models or not self._absorb_components():
             self.component.finalize()
         self._store_component()
         if self.is_deterministic:
@@ -296,6 +307,22 @@ class Mapper:
             if self._initialize_globally():
                 return True
         return self.component.initialize_from_pair(self.unregistered)
+
+    def _initialize_from_model(self) -> bool:
+        """Start the component from the next initial model, if one remains."""
+        if self._num_components >= len(self._initial_models):
+            return False
+        if self.component.initialize_from_model(self._initial_models[self._num_components]):
+            return True
+        self.component = self._create_component()
+        return False
+
+    def _select_candidates(self) -> Bool:
+        """Return the unregistered images (n,), without those of the remaining initial models."""
+        candidates: Bool = self.unregistered.copy()
+        for model in self._initial_models[self._num_components + 1 :]:
+            candidates[[image.index for image in model.images]] = False
+        return candidates
 
     def _initialize_globally(self) -> bool:
         is_enabled = self.options.initialization.global_initialization

@@ -122,15 +122,16 @@ class ModelMaintenance:
         if num_images > growth * self._last_size[0] or num_points > growth * self._last_size[1]:
             self.refine_globally()
 
-    def refine_globally(self, *, final: bool = False) -> None:
+    def refine_globally(self, *, final: bool = False, depth_maps: bool = True) -> None:
         """Refine all images and points, then deregister images with few or unconnected points.
 
         Args:
             final: Sharpen the depth loss as in the paper's final robust reconstruction.
+            depth_maps: False keeps the depth maps, and only adapts their scales.
         """
         before = self.scene.snapshot()
         with self.event_log.timed("global refinement"):
-            self.refiner.refine_globally(final=final)
+            self.refiner.refine_globally(final=final, depth_maps=depth_maps)
             self.scene.tracks.compact()
         self._undo_jump(before)
         self.history.clear()

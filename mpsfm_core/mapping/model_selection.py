@@ -105,14 +105,14 @@ def _are_equal(a: MapperRun, b: MapperRun) -> bool:
     return a.size == b.size and difference < MAX_RATIO_DIFFERENCE
 
 
-def sum_run_times(report: MappingReport, runs: Sequence[MapperRun]) -> MappingReport:
-    """Return the report of one mapper run, with the step times summed over all runs."""
+def sum_step_times(report: MappingReport, reports: Sequence[MappingReport]) -> MappingReport:
+    """Return the report of one mapper run, with the step times summed over several runs."""
     seconds: Counter[str] = Counter()
     counts: Counter[str] = Counter()
-    for run in runs:
-        seconds.update(run.report.seconds)
-        counts.update(run.report.counts)
-    return replace(report, seconds=dict(seconds), counts=dict(counts), runs=len(runs))
+    for other in reports:
+        seconds.update(other.seconds)
+        counts.update(other.counts)
+    return replace(report, seconds=dict(seconds), counts=dict(counts), runs=len(reports))
 
 
 def compute_explained_ratios(

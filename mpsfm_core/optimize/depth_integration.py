@@ -104,6 +104,11 @@ class RefinedDepth:
     """True if the depth map was not refined again, because the anchors fit about as well as before.
     The energies of a skipped map are those of its last refinement."""
 
+    @classmethod
+    def from_log_depth(cls, log_depth: Float64, valid: Bool, scale: float) -> RefinedDepth:
+        """Build a refined depth map of unknown energy, whose next refinement is never skipped."""
+        return cls(log_depth, valid, scale, 0.0, 0.0, 0.0, 0, 0, converged=False, skipped=False)
+
     @property
     def depth(self) -> Float32:
         """(h, w) float32 depth in the unit of the scaled prior."""

@@ -42,11 +42,11 @@ from mpsfm_core.inputs.models import Poses, describe_name_difference, match_name
 from mpsfm_core.inputs.panorama_views import PanoramaViews, cut_panoramas
 from mpsfm_core.inputs.rigs import read_rigs
 from mpsfm_core.inputs.video import VideoSelection, extract_frames, is_video, read_selection
-from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.rig_calibration import calibrate_rigs
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.parts import part_mapping
 from mpsfm_core.mapping.scene.reconstruction import (
     MappingResult,
     Reconstruction,
@@ -55,6 +55,7 @@ from mpsfm_core.mapping.scene.reconstruction import (
 )
 from mpsfm_core.pipeline import precompile, resources
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, MappingCheckpoints
+from mpsfm_core.pipeline.parts import PartMapper
 from mpsfm_core.pipeline.provider_resolution import ProviderResolution, resolve_providers
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.pipeline.trajectory import localize_frames
@@ -294,7 +295,7 @@ class _Run:
         self._trajectory: list[TrajectoryFrame] = []
         self._estimate = resources.ResourceEstimate(0, 0, 0)
         self._children = ChildMemoryMonitor()
-        self._checkpoints: list[MappingCheckpoints | DenseCheckpoints] = []
+        self._checkpoints: list[MappingCheckpoints | DenseCheckpoints | PartMapper] = []
         self._compilation: precompile.Compilation | None = None
 
     @property
@@ -512,7 +513,9 @@ class _Run:
         options = options or self._config.mapper_options()
         with self._stages.stage("mapping"):
             checkpoints = self._mapping_checkpoints(problem, options)
-            return mapper.reconstruct(problem, options, self._stages, checkpoints)
+            return part_mapping.reconstruct(
+                problem, options, self._stages, checkpoints, self._part_mapper()
+            )
 
     def _run_second_pass(
         self, images: ImageSet, extraction: Extraction, mapping: MappingResult
@@ -817,6 +820,13 @@ class _Run:
             checkpoints.forget()
         self._checkpoints.append(checkpoints)
         return checkpoints
+
+    def _part_mapper(self) -> PartMapper:
+        part_mapper = PartMapper(
+            self._config.runtime, self._registry, self._stages, fresh=self._fresh
+        )
+        self._checkpoints.append(part_mapper)
+        return part_mapper
 
     def _dense_checkpoints(
         self, part: Reconstruction, originals: OriginalImages

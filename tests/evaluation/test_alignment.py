@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mpsfm_core.evaluation.alignment import trajectory_errors, umeyama
+from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.pose_auc import Pose
 from mpsfm_core.geometry import camera_center
+from mpsfm_core.geometry.similarity import umeyama
 
 
 def poses_at(centers: np.ndarray, rotations: np.ndarray) -> dict[str, Pose]:

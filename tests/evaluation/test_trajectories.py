@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 from mpsfm_core.cli import build_app
 from mpsfm_core.data import Pose
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.evaluation.alignment import umeyama
 from mpsfm_core.evaluation.trajectories import (
     associate_time_stamps,
     count_frames_outside_largest,
@@ -21,6 +20,7 @@ from mpsfm_core.evaluation.trajectories import (
     read_trajectory,
 )
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
+from mpsfm_core.geometry.similarity import umeyama
 from mpsfm_core.results.trajectory import TrajectoryFrame, write_trajectory
 
 TIMES = 5.0 + np.arange(120) / 10

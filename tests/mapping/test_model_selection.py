@@ -17,7 +17,7 @@ from mpsfm_core.mapping.model_selection import (
     compute_total_score,
     is_settled,
     select_run,
-    sum_run_times,
+    sum_step_times,
 )
 from mpsfm_core.mapping.options import ConsistencyOptions, MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
@@ -106,9 +106,9 @@ def test_select_run_by_explained_ratio_until_settled(
     assert select_run(runs, OPTIONS) is runs[selected]
 
 
-def test_sum_run_times_adds_seconds_and_counts_of_all_runs() -> None:
+def test_sum_step_times_adds_seconds_and_counts_of_all_runs() -> None:
     runs = [make_run([0.5])] * 3
-    report = sum_run_times(runs[0].report, runs)
+    report = sum_step_times(runs[0].report, [run.report for run in runs])
     assert (report.runs, report.seconds, report.counts) == (3, {"all": 6.0}, {"all": 3})
 
 

@@ -9,8 +9,8 @@ import pytest
 
 from mpsfm_core.data import Float64, MappingProblem, Rig
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.evaluation.alignment import umeyama
 from mpsfm_core.geometry import camera_center, compose, invert, rotation_angle_deg
+from mpsfm_core.geometry.similarity import umeyama
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, transform_reconstruction

@@ -247,9 +247,18 @@ class DepthConsistencyCheck:
         return _DepthGrid(depth, np.maximum(std, np.float32(1e-6)), valid, nearest, intrinsics)
 
 
-def find_overlapping_images(scene: Scene, image: int, max_images: int) -> list[int]:
-    """Return the registered images into which most pixels of a depth map project, best first."""
-    others = scene.registered_images()
+def find_overlapping_images(
+    scene: Scene, image: int, max_images: int, candidates: Int64 | None = None
+) -> list[int]:
+    """Return the registered images into which most pixels of a depth map project, best first.
+
+    Args:
+        scene: The scene.
+        image: Registered image with the depth map.
+        max_images: Maximum number of returned images.
+        candidates: Registered images to choose from, by default all.
+    """
+    others = scene.registered_images() if candidates is None else candidates
     others = others[(others != image) & np.array([scene.maps[i].active for i in others])]
     depth_map = scene.maps[image]
     rows, columns = depth_map.depth.shape

@@ -480,11 +480,12 @@ class Refiner:
             if changed < MAX_LOCAL_CHANGE * max(self._num_observations(), 1):
                 break
 
-    def refine_globally(self, *, final: bool = False) -> None:
+    def refine_globally(self, *, final: bool = False, depth_maps: bool = True) -> None:
         """Adjust all images and update tracks until few tracks change, then refine depth maps.
 
         Args:
             final: Sharpen the depth loss by the factor ``FINAL_DEPTH_SCALE``.
+            depth_maps: False keeps the depth maps, and only adapts their scales.
         """
         images = [int(i) for i in self.scene.registered_images()]
         complete_and_merge_tracks(self.scene, self.triangulation, create=True)
@@ -502,7 +503,8 @@ class Refiner:
             changed += complete_and_merge_tracks(self.scene, self.triangulation)
             if changed < MAX_GLOBAL_CHANGE * max(self._num_observations(), 1):
                 break
-        self.integrate(images)
+        if depth_maps:
+            self.integrate(images)
 
     def discard_integrator(self, image: int) -> None:
         """Discard the cached depth integrator of a deregistered image."""

@@ -93,6 +93,21 @@ class DepthMap:
         self._best_at = self._sample(self._best)[0]
         self.set_scale(refined.scale)
 
+    def resume(self, depth: DepthPrior, scale: float, width: int) -> None:
+        """Load the refined depth map of a reconstruction.
+
+        Args:
+            depth: Refined depth in world units, on the pixel grid of the depth prior.
+            scale: Scale of the depth prior.
+            width: Width to which depth maps are subsampled for refinement.
+        """
+        step = compute_subsampling_step(depth.shape[1], width)
+        values, valid = subsample(depth.depth, step), subsample(depth.valid, step)
+        known = values[valid].astype(np.float64)
+        log_depth = np.full(values.shape, np.log(np.median(known)) if len(known) else 0.0)
+        log_depth[valid] = np.log(known)
+        self.set_refined(RefinedDepth.from_log_depth(log_depth, valid, scale))
+
     def set_camera(self, camera: PinholeCamera) -> None:
         """Set the intrinsics of the depth map from a camera in pixels of the image."""
         rows, columns = self.prior.shape

@@ -20,6 +20,7 @@ from mpsfm_core.data import (
 )
 from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel, IntrinsicParameter
 from mpsfm_core.data.decisions import CameraReason, Reason, reason_from_json
+from mpsfm_core.mapping.problem_state import rig_from_state, rig_to_state
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     CalibrationOutcome,
     IntrinsicEstimate,
@@ -205,7 +206,7 @@ class Reconstruction:
             **vars(self),
             "images": images,
             "metric": self.metric and {**vars(self.metric)},
-            "rigs": [{**vars(rig)} for rig in self.rigs],
+            "rigs": [rig_to_state(rig) for rig in self.rigs],
         }
 
     @classmethod
@@ -213,14 +214,7 @@ class Reconstruction:
         """Restore a reconstruction from a checkpoint."""
         images = tuple(RegisteredImage.from_state_dict(image) for image in state["images"])
         metric = state["metric"] and MetricScale(**state["metric"])
-        rigs = tuple(
-            Rig(
-                tuple(map(tuple, rig["sensor_from_rig"])),
-                tuple(map(tuple, rig["frames"])),
-                rig["is_estimated"],
-            )
-            for rig in state["rigs"]
-        )
+        rigs = tuple(rig_from_state(rig) for rig in state["rigs"])
         return cls(**{**state, "images": images, "metric": metric, "rigs": rigs})
 
 

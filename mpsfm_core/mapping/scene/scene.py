@@ -331,8 +331,16 @@ class Scene:
         angles: Float64 = compute_max_triangulation_angles(self.tracks.xyz[points], rows, centers)
         return angles, np.bincount(rows, minlength=len(points)).astype(np.int64)
 
-    def resume(self, reconstruction: Reconstruction) -> None:
-        """Load poses, focal lengths, scales and points of a reconstruction."""
+    def resume(
+        self, reconstruction: Reconstruction, *, refined_map_width: int | None = None
+    ) -> None:
+        """Load poses, focal lengths, scales and points of a reconstruction.
+
+        Args:
+            reconstruction: The reconstruction.
+            refined_map_width: Width to which refined depth maps are subsampled, or None to start
+                from the scaled depth priors.
+        """
         self.tracks.xyz = reconstruction.points.copy()
         rows = np.array([image.index for image in reconstruction.images], dtype=np.int64)
         translations = np.array([image.translation for image in reconstruction.images])
@@ -341,6 +349,8 @@ class Scene:
         for image in reconstruction.images:
             self.register(image.index, image.rotation, image.translation)
             self.maps[image.index].set_scale(image.scale)
+            if refined_map_width is not None:
+                self.maps[image.index].resume(image.depth, image.scale, refined_map_width)
             self.tracks.point_of[self.graph.keypoints_of(image.index)] = image.point_ids
             self.set_shared_intrinsics(image.index, image.camera.params, image.distortion)
             for parameter, calibrated in image.calibration.items():

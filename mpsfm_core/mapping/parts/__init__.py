@@ -1,0 +1,1 @@
+"""Mapping in overlapping parts: partition of the match graph, joining of the reconstructions."""

@@ -1,0 +1,278 @@
+"""Joining of the reconstructions of overlapping parts along a tree.
+
+Two reconstructions are joined if most common images agree with one similarity transform, and the
+depth maps of both reconstructions do not contradict each other
+(:mod:`~mpsfm_core.mapping.consistency.depth_consistency`). Parts that look alike have the same
+structure at the common images, but other structure around them. Matches between both
+reconstructions are no evidence, because the matches of two places that look alike support the wrong
+transform.
+
+Pairs of reconstructions with the most common points are joined first.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import combinations, count
+from typing import NamedTuple
+
+import numpy as np
+
+from mpsfm_core.data import Int64, MappingProblem
+from mpsfm_core.mapping.consistency.depth_consistency import (
+    DepthConsistencyCheck,
+    count_visible_points,
+    find_overlapping_images,
+)
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.parts.alignment import Alignment, align_reconstructions, find_agreeing
+from mpsfm_core.mapping.refinement.depth_noise import measure_depth_noise
+from mpsfm_core.mapping.scene.reconstruction import (
+    Reconstruction,
+    RegisteredImage,
+    transform_reconstruction,
+)
+from mpsfm_core.mapping.scene.scene import Scene
+
+MAX_CONFLICT_RATIO = 0.25
+"""Share of overlapping images with contradicting depth above which a join is refused. [tuned:
+benchmarks.scale]"""
+
+_log = logging.getLogger(__name__)
+
+
+class JoinEvidence(NamedTuple):
+    """Evidence for and against the join of two reconstructions."""
+
+    num_agreeing: int
+    """Number of common images in which most common observations agree."""
+    num_common: int
+    """Number of common images with common observations."""
+    num_overlapping: int
+    """Number of images of the smaller reconstruction that overlap images of the larger one."""
+    num_conflicting: int
+    """Number of these images whose depth contradicts an image of the larger reconstruction."""
+
+    @property
+    def supports_join(self) -> bool:
+        """True if most common images agree, and the depth of few images contradicts the join."""
+        is_consistent = self.num_conflicting <= MAX_CONFLICT_RATIO * self.num_overlapping
+        return 2 * self.num_agreeing > self.num_common and is_consistent
+
+
+def join_reconstructions(
+    problem: MappingProblem, models: Sequence[Reconstruction], options: MapperOptions
+) -> list[Reconstruction]:
+    """Join the reconstructions of overlapping parts as far as the evidence allows.
+
+    Args:
+        problem: Mapping problem of all parts.
+        models: Reconstructions of the parts, with image indices of ``problem``.
+        options: Options of the mapper.
+
+    Returns:
+        Joined reconstructions, sorted by decreasing number of images. An image of several joined
+        reconstructions remains only in the largest.
+    """
+    groups = dict(enumerate(models))
+    group_of = np.arange(len(models))
+    refused: set[tuple[int, int]] = set()
+    numbers = count(len(models))
+    for row_a, row_b in _rank_joins(models):
+        key = int(group_of[row_a]), int(group_of[row_b])
+        if key[0] == key[1] or key in refused:
+            continue
+        joined = join_pair(problem, groups[key[0]], groups[key[1]], options)
+        if joined is None:
+            refused |= {key, key[::-1]}
+            continue
+        number = next(numbers)
+        groups[number] = joined
+        group_of[np.isin(group_of, key)] = number
+    return _remove_repeated_images([groups[number] for number in np.unique(group_of)])
+
+
+def join_pair(
+    problem: MappingProblem, a: Reconstruction, b: Reconstruction, options: MapperOptions
+) -> Reconstruction | None:
+    """Join two reconstructions in the frame of the larger one, or return None if refused."""
+    a, b = sorted((a, b), key=lambda model: -len(model.images))
+    alignment = align_reconstructions(a, b)
+    if alignment is None:
+        return None
+    transform = alignment.a_from_b
+    b = transform_reconstruction(
+        b, transform.scale, transform.rotation, transform.translation, a.metric
+    )
+    evidence = collect_evidence(problem, a, b, alignment, options)
+    _log.debug("join of %d and %d images: %s", len(a.images), len(b.images), evidence)
+    return merge_reconstructions(a, b) if evidence.supports_join else None
+
+
+def collect_evidence(
+    problem: MappingProblem,
+    a: Reconstruction,
+    b: Reconstruction,
+    alignment: Alignment,
+    options: MapperOptions,
+) -> JoinEvidence:
+    """Collect the evidence for and against the join of two reconstructions in the same frame.
+
+    Args:
+        problem: Mapping problem of both reconstructions.
+        a: Larger reconstruction.
+        b: Smaller reconstruction, in the frame of ``a``.
+        alignment: Agreement of the common images.
+        options: Options of the mapper.
+    """
+    only_a, only_b = _select_unshared(a, b), _select_unshared(b, a)
+    num_overlapping = num_conflicting = 0
+    near_a = _select_near(only_a, b) if only_a else set()
+    if options.consistency.enabled and near_a:
+        indices = near_a | {image.index for image in b.images}
+        scene, row_of = _create_scene(problem, merge_reconstructions(a, b), indices, options)
+        in_a = np.array([row_of[index] for index in sorted(near_a)], dtype=np.int64)
+        in_b = [row_of[image.index] for image in only_b]
+        num_overlapping, num_conflicting = _count_depth_conflicts(scene, in_a, in_b, options)
+    return JoinEvidence(
+        alignment.num_images, alignment.num_common_images, num_overlapping, num_conflicting
+    )
+
+
+def merge_reconstructions(a: Reconstruction, b: Reconstruction) -> Reconstruction:
+    """Merge two reconstructions in the same frame, with common points of common images.
+
+    A point of ``b`` is identified with the point of ``a`` that the same keypoint observes, if both
+    points project close to each other. A common image has pose and depth of the reconstruction in
+    which it observes more points.
+    """
+    images_a, images_b = ({image.index: image for image in model.images} for model in (a, b))
+    point_of = np.full(len(b.points), -1, dtype=np.int64)
+    is_taken = np.zeros(len(a.points), dtype=np.bool_)
+    for index in sorted(images_a.keys() & images_b.keys()):
+        ids_a, ids_b = images_a[index].point_ids, images_b[index].point_ids
+        seen = (ids_a >= 0) & (ids_b >= 0)
+        seen[seen] = find_agreeing(images_a[index], a.points[ids_a[seen]], b.points[ids_b[seen]])
+        is_new = (point_of[ids_b[seen]] < 0) & ~is_taken[ids_a[seen]]
+        ids_a, ids_b = ids_a[seen][is_new], ids_b[seen][is_new]
+        point_of[ids_b], is_taken[ids_a] = ids_a, True
+    is_added = point_of < 0
+    point_of[is_added] = len(a.points) + np.arange(np.count_nonzero(is_added))
+    images = dict(images_a)
+    for index, image in images_b.items():
+        renumbered = np.where(image.point_ids >= 0, point_of[image.point_ids], -1)
+        moved = replace(image, point_ids=renumbered)
+        images[index] = _merge_image(images[index], moved) if index in images else moved
+    return Reconstruction(
+        tuple(images[index] for index in sorted(images)),
+        np.concatenate([a.points, b.points[is_added]]),
+        np.concatenate([a.errors_px, b.errors_px[is_added]]),
+        a.metric,
+    )
+
+
+def _merge_image(a: RegisteredImage, b: RegisteredImage) -> RegisteredImage:
+    """Return the registration of an image that observes more points.
+
+    If most keypoints of both registrations observe the same points, the points that only the other
+    registration observes are added.
+    """
+    first, second = sorted((a, b), key=lambda image: -np.count_nonzero(image.point_ids >= 0))
+    both = (first.point_ids >= 0) & (second.point_ids >= 0)
+    num_equal = np.count_nonzero(first.point_ids[both] == second.point_ids[both])
+    if 2 * num_equal <= np.count_nonzero(both):
+        return first
+    ids = first.point_ids.copy()
+    candidates = np.flatnonzero((ids < 0) & (second.point_ids >= 0))
+    candidates = candidates[~np.isin(second.point_ids[candidates], ids)]
+    ids[candidates] = second.point_ids[candidates]
+    return replace(first, point_ids=ids)
+
+
+def _rank_joins(models: Sequence[Reconstruction]) -> list[tuple[int, int]]:
+    """Return pairs of reconstructions with common points, those with most common points first."""
+    ranked = []
+    images = [{image.index for image in model.images} for model in models]
+    for row_a, row_b in combinations(range(len(models)), 2):
+        if images[row_a] & images[row_b]:
+            alignment = align_reconstructions(models[row_a], models[row_b])
+            if alignment is not None:
+                ranked.append((-alignment.num_points, row_a, row_b))
+    return [(row_a, row_b) for _, row_a, row_b in sorted(ranked)]
+
+
+def _select_unshared(model: Reconstruction, other: Reconstruction) -> list[RegisteredImage]:
+    """Return the images of a reconstruction that the other reconstruction does not have."""
+    shared = {image.index for image in other.images}
+    return [image for image in model.images if image.index not in shared]
+
+
+def _select_near(only_a: Sequence[RegisteredImage], b: Reconstruction) -> set[int]:
+    """Select the images of ``a`` that see most points of ``b``, at most as many as ``b`` has.
+
+    The selection limits the time of a join to that of the smaller reconstruction.
+    """
+    counts = count_visible_points(
+        b.points,
+        np.array([image.rotation for image in only_a]),
+        np.array([image.translation for image in only_a]),
+        np.array([image.camera.params for image in only_a]),
+        np.array([image.camera.size for image in only_a], dtype=np.float64),
+    )
+    best = np.argsort(-counts, kind="stable")[: len(b.images)]
+    return {only_a[row].index for row in best if counts[row]}
+
+
+def _create_scene(
+    problem: MappingProblem, joined: Reconstruction, indices: set[int], options: MapperOptions
+) -> tuple[Scene, dict[int, int]]:
+    """Create a scene of some images of a reconstruction.
+
+    Returns:
+        The scene, and the row in the scene of each image index.
+    """
+    row_of = {index: row for row, index in enumerate(sorted(indices))}
+    images = tuple(
+        replace(image, index=row_of[image.index])
+        for image in joined.images
+        if image.index in row_of
+    )
+    part = problem.subset([image.name for image in images])
+    scene = Scene(part, weigh_by_score=options.weigh_by_score)
+    scene.resume(replace(joined, images=images), refined_map_width=options.refinement.map_width)
+    return scene, row_of
+
+
+def _count_depth_conflicts(
+    scene: Scene, in_a: Int64, in_b: Sequence[int], options: MapperOptions
+) -> tuple[int, int]:
+    """Count images ``in_b`` that overlap images ``in_a``, and those with contradicting depth."""
+    consistency = options.consistency
+    check = DepthConsistencyCheck(scene, consistency)
+    std_factor = max(1.0, measure_depth_noise(scene).multiplier)
+    num_overlapping = num_conflicting = 0
+    for image in in_b:
+        others = find_overlapping_images(scene, image, consistency.num_views, in_a)
+        ratios = [
+            check.measure_violation_ratio(
+                image, other, std_factor, consistency.max_violations, by_target_area=True
+            )
+            for other in others
+        ]
+        num_overlapping += bool(others)
+        num_conflicting += max(ratios, default=0.0) > consistency.max_violations
+    return num_overlapping, num_conflicting
+
+
+def _remove_repeated_images(models: Sequence[Reconstruction]) -> list[Reconstruction]:
+    """Sort reconstructions by size, and keep each image only in the largest reconstruction."""
+    seen: set[int] = set()
+    remaining = []
+    for model in sorted(models, key=lambda model: -len(model.images)):
+        images = tuple(image for image in model.images if image.index not in seen)
+        seen |= {image.index for image in images}
+        if len(images) >= 2:
+            remaining.append(replace(model, images=images))
+    return remaining

@@ -1,0 +1,177 @@
+"""Mapping of the parts of a reconstruction, on this machine or on the workers of an executor.
+
+The main process writes the mapping problem of each part to the cache folder. A worker reads the
+problem, and writes its result as a checkpoint of completed mapping. The main process then maps
+all parts itself, and finds the checkpoints. An interrupted run loses at most the parts in progress.
+"""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from mpsfm_core.config import RuntimeOptions
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.data.errors import InputError, OutputError
+from mpsfm_core.extraction.active_provider import thread_count
+from mpsfm_core.extraction.cache import cache_folder, digest
+from mpsfm_core.extraction.remote_execution import create_executor
+from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.problem_state import problem_from_state, problem_to_state
+from mpsfm_core.mapping.scene.reconstruction import MappingResult
+from mpsfm_core.mapping.state import flatten_state, unflatten_state
+from mpsfm_core.pipeline.checkpoints import MappingCheckpoints
+from mpsfm_core.pipeline.stages import Stages
+from mpsfm_core.providers import Executor
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.support.files import write_file
+from mpsfm_core.support.npz import read_npz
+from mpsfm_core.support.threads import limit_threads
+
+_STEP = "parts"
+_NEVER_S = 1e9
+"""Seconds between checkpoints if only completed parts are stored."""
+
+
+class PartMapper:
+    """Maps the parts of one reconstruction, and stores their results until :meth:`forget`.
+
+    Implements :data:`mpsfm_core.mapping.parts.part_mapping.MapParts`.
+
+    Args:
+        runtime: Executor, cache folder and threads.
+        registry: The installed providers, among them executors.
+        stages: Receiver of progress.
+        fresh: If true, ignore the results of an interrupted run.
+    """
+
+    def __init__(
+        self, runtime: RuntimeOptions, registry: Registry, stages: Stages, *, fresh: bool = False
+    ) -> None:
+        self._runtime, self._registry, self._stages = runtime, registry, stages
+        self._fresh = fresh
+        self._stored: list[_StoredPart] = []
+
+    def __call__(
+        self, problems: Sequence[MappingProblem], options: MapperOptions
+    ) -> list[MappingResult]:
+        """Map all parts, and return their results in order."""
+        runtime = self._runtime
+        step = MapPart(
+            cache_folder(runtime.cache_dir),
+            options,
+            _NEVER_S if runtime.checkpoint_s is None else runtime.checkpoint_s,
+            thread_count(runtime),
+        )
+        parts = [_StoredPart(step, problem) for problem in problems]
+        self._stored += parts
+        if self._fresh:
+            self.forget()
+        with self._stages.step(_STEP, len(parts)):
+            executor = create_executor(runtime, self._registry)
+            if executor is not None:
+                self._map_remotely(executor, step, parts)
+            stores = executor is not None or runtime.checkpoint_s is not None
+            results = []
+            for done, part in enumerate(parts, start=1):
+                results.append(step.map(part.problem, stores=stores))
+                if executor is None:
+                    self._stages.stage_progress(_STEP, done, len(parts))
+        return results
+
+    def forget(self) -> None:
+        """Delete the stored problems and results of all parts."""
+        for part in self._stored:
+            part.forget()
+
+    def _map_remotely(
+        self, executor: Executor, step: MapPart, parts: Sequence[_StoredPart]
+    ) -> None:
+        """Map the parts on the workers of an executor, which store their results."""
+        try:
+            for part in parts:
+                part.store()
+            with closing(executor.run(step, [part.key for part in parts])) as run:
+                for done, _ in enumerate(run, start=1):
+                    self._stages.stage_progress(_STEP, done, len(parts))
+        finally:
+            executor.close()
+
+
+@dataclass(frozen=True)
+class MapPart:
+    """Pickled function that maps a part on any machine, and stores the result as a checkpoint."""
+
+    cache: Path
+    """Cache folder of the run, which all workers share."""
+    options: MapperOptions
+    every_s: float
+    """Minimum seconds between checkpoints of a part in progress."""
+    threads: int
+
+    def __call__(self, key: str) -> None:
+        """Map the part whose mapping problem is stored under a key."""
+        try:
+            arrays = read_npz(self.file(key))
+        except FileNotFoundError as error:
+            raise InputError(
+                f"the worker on {socket.gethostname()} does not see the cache {self.cache} of this "
+                "run: set runtime.cache_dir to a folder that all machines share"
+            ) from error
+        with limit_threads(self.threads):
+            self.map(problem_from_state(unflatten_state(arrays)))
+
+    def map(self, problem: MappingProblem, *, stores: bool = True) -> MappingResult:
+        """Map a part, or load its result if the part is complete.
+
+        Args:
+            problem: Mapping problem of the part.
+            stores: If true, load and write checkpoints.
+        """
+        checkpoints = self.checkpoints(problem) if stores else None
+        return mapper.reconstruct(problem, self.options, None, checkpoints)
+
+    def checkpoints(self, problem: MappingProblem) -> MappingCheckpoints:
+        """Return the storage of the checkpoints of a part, which shows no messages."""
+        quiet = Stages(Registry())
+        return MappingCheckpoints(self.cache, problem, self.options, quiet, self.every_s)
+
+    def file(self, key: str) -> Path:
+        """Return the file of the mapping problem with a key."""
+        return self.cache / "mapping" / "parts" / f"{key}.npz"
+
+
+class _StoredPart:
+    """Mapping problem of a part, with its files in the cache folder."""
+
+    def __init__(self, step: MapPart, problem: MappingProblem) -> None:
+        self.problem, self.key = problem, digest(problem)
+        self._file = step.file(self.key)
+        self._checkpoints = step.checkpoints(problem)
+
+    def store(self) -> None:
+        """Write the mapping problem for the workers.
+
+        Raises:
+            OutputError: the file cannot be written.
+        """
+        arrays = cast(Any, flatten_state(problem_to_state(self.problem)))
+        try:
+            write_file(self._file, lambda file: np.savez(file, **arrays))
+        except OSError as error:
+            raise OutputError(
+                f"cannot write {self._file}: {error}; free disk space or set runtime.cache_dir"
+            ) from error
+
+    def forget(self) -> None:
+        """Delete mapping problem and checkpoint."""
+        self._checkpoints.forget()
+        with suppress(OSError):
+            self._file.unlink()
