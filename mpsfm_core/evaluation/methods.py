@@ -144,14 +144,14 @@ class _WorkerProcesses:
         # Subprocesses are not forked, because a fork copies held locks without the threads that
         # release the locks.
         context = multiprocessing.get_context("spawn")
-        process = ProcessPoolExecutor(1, mp_context=context, initializer=_initialize_process)
+        process = ProcessPoolExecutor(1, mp_context=context, initializer=initialize_process)
         self._local.process = process
         with self._lock:
             self._processes.append(process)
         return process
 
 
-def _initialize_process() -> None:
+def initialize_process() -> None:
     """Silence COLMAP and load compiled kernels, which the run time should not include."""
     pycolmap.logging.minloglevel = int(pycolmap.logging.FATAL)
     camera = PinholeCamera(160, 120, 130.0, 130.0, 80.0, 60.0)

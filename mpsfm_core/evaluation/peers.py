@@ -37,17 +37,7 @@ def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path],
     """
 
     def run(database: Path, output: Path) -> Models:
-        options = pycolmap.IncrementalPipelineOptions()
-        options.structure_less_registration_fallback = structure_less
-        options.min_model_size = 2
-        options.extract_colors = False
-        options.num_threads = thread_limit()
-        options.random_seed = 0
-        options.ba_refine_focal_length = False
-        options.ba_refine_extra_params = False
-        options.ba_refine_sensor_from_rig = False
-        options.mapper.abs_pose_refine_focal_length = False
-        options.mapper.abs_pose_refine_extra_params = False
+        options = _set_incremental(pycolmap.IncrementalPipelineOptions(), structure_less)
         if tuned:
             options.mapper.init_min_tri_angle = _TUNED_ANGLE_DEG
             options.mapper.ba_local_min_tri_angle = _TUNED_ANGLE_DEG
@@ -58,6 +48,32 @@ def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path],
         return models
 
     return run
+
+
+def _set_incremental(
+    options: pycolmap.IncrementalPipelineOptions, structure_less: bool
+) -> pycolmap.IncrementalPipelineOptions:
+    """Set the options of all incremental mappers, and return the same object."""
+    options.structure_less_registration_fallback = structure_less
+    options.min_model_size = 2
+    options.extract_colors = False
+    options.num_threads = thread_limit()
+    options.random_seed = 0
+    options.ba_refine_focal_length = False
+    options.ba_refine_extra_params = False
+    options.ba_refine_sensor_from_rig = False
+    options.mapper.abs_pose_refine_focal_length = False
+    options.mapper.abs_pose_refine_extra_params = False
+    return options
+
+
+def _hierarchical(database: Path, output: Path) -> Models:
+    """Run COLMAP's hierarchical mapper, in parts of at most 500 images with 50 common images."""
+    options = pycolmap.HierarchicalPipelineOptions()
+    options.num_threads = options.num_workers = thread_limit()
+    _set_incremental(options.incremental_options, structure_less=False)
+    models: Models = pycolmap.hierarchical_mapping(database, output, output, options)
+    return models
 
 
 def _global(database: Path, output: Path) -> Models:
@@ -79,6 +95,7 @@ PEERS: Mapping[str, Callable[[Path, Path], Models]] = MappingProxyType(
         "colmap-structureless": _incremental(tuned=False, structure_less=True),
         "colmap-tuned-structureless": _incremental(tuned=True, structure_less=True),
         "colmap-global": _global,
+        "colmap-hierarchical": _hierarchical,
     }
 )
 """Function ``run(database, output)`` of each COLMAP mapper, by mapper name. The mapper

@@ -8,19 +8,12 @@ angles, while the published code overestimates them.
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
 from pydantic import Field
 
 from mpsfm_core.data.options import Options, expert
 from mpsfm_core.optimize.options import BundleOptions, IntegrationOptions
-
-MIN_PART_IMAGES = 20
-"""Smallest number of images per part. [ours]"""
-AUTO_PARTS_FROM = 3000
-"""Number of images above which ``parts: auto`` maps in parts."""
-AUTO_PART_IMAGES = 500
-"""Number of images per part of ``parts: auto``."""
 
 
 class InitializationOptions(Options):
@@ -206,10 +199,10 @@ class MappingOptions(Options):
     images. ``fixed`` keeps known poses and their unit of length, and leaves out images without a
     known pose. ``guess`` also re-registers misregistered images, and scales the world to meters if
     depth is metric."""
-    parts: Annotated[int, Field(ge=MIN_PART_IMAGES)] | Literal["auto", "off"] = "auto"
-    """Number of images per part, for mapping in overlapping parts that are joined. ``auto`` maps
-    more than 3000 images in parts of 500, and ``off`` maps all images in one piece. Images with
-    known poses are mapped in one piece, unless the poses are guesses. [tuned: benchmarks.scale]"""
+    parts: int | None = Field(None, ge=20)
+    """Number of images per part, to map more images in overlapping parts that are joined. Parts run
+    on the workers of ``runtime.executor``. null maps all images in one piece, as images with known
+    poses that are no guesses. [tuned: benchmarks.scale]"""
     min_model_size: int = Field(2, ge=2)
     """Number of registered images below which a component is discarded. [COLMAP min_model_size]"""
     weigh_by_score: bool = expert(True)
@@ -236,12 +229,6 @@ class MappingOptions(Options):
     """Options of refinement."""
     consistency: ConsistencyOptions = ConsistencyOptions()
     """Options of the depth consistency check."""
-
-    def part_size(self, num_images: int) -> int | None:
-        """Return the number of images per part, or None to map all images in one piece."""
-        if isinstance(self.parts, int):
-            return self.parts if num_images > self.parts else None
-        return AUTO_PART_IMAGES if self.parts == "auto" and num_images > AUTO_PARTS_FROM else None
 
 
 class MapperOptions(MappingOptions):

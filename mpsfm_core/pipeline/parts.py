@@ -1,4 +1,4 @@
-"""Mapping of the parts of a reconstruction, on this machine or on the workers of an executor.
+"""Mapping of the parts of a reconstruction, on this machine or on remote workers.
 
 The main process writes the mapping problem of each part to the cache folder. A worker reads the
 problem, and writes its result as a checkpoint of completed mapping. The main process then maps

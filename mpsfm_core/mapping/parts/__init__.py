@@ -1,1 +1,1 @@
-"""Mapping in overlapping parts: partition of the match graph, joining of the reconstructions."""
+"""Mapping in overlapping parts, whose reconstructions are joined."""

@@ -65,7 +65,7 @@ class JoinEvidence(NamedTuple):
 def join_reconstructions(
     problem: MappingProblem, models: Sequence[Reconstruction], options: MapperOptions
 ) -> list[Reconstruction]:
-    """Join the reconstructions of overlapping parts as far as the evidence allows.
+    """Join the reconstructions of overlapping parts if depth does not contradict the joins.
 
     Args:
         problem: Mapping problem of all parts.

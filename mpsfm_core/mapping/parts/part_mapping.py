@@ -35,7 +35,7 @@ def reconstruct(
     checkpoints: CheckpointStore | None = None,
     map_parts: MapParts | None = None,
 ) -> MappingResult:
-    """Reconstruct all images, in overlapping parts if the option ``parts`` asks for parts.
+    """Reconstruct all images, in overlapping parts with the option ``parts``.
 
     The result is identical for each ``map_parts``, because the parts do not depend on each other.
 
@@ -73,9 +73,9 @@ def select_parts(problem: MappingProblem, options: MapperOptions) -> list[Int64]
 
     Known poses that are no guesses define the world, so these images are mapped in one piece.
     """
-    size = options.part_size(len(problem.images))
+    size = options.parts
     has_poses = any(image.known_pose is not None for image in problem.images)
-    if size is None or (has_poses and options.known_poses != "guess"):
+    if not size or len(problem.images) <= size or (has_poses and options.known_poses != "guess"):
         return []
     return partition_match_graph(remove_duplicates(problem, options), size)
 

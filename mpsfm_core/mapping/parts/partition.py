@@ -1,9 +1,11 @@
 """Partition of the match graph into overlapping parts.
 
-1. Each connected component is cut in two (recursive spectral bisection) until no cluster has more
+1. Edges on no cycle of three or four images are removed, unless they connect the graph (maximum
+   spanning forest). An edge on no such cycle is often a wrong pair of images that look alike.
+2. Each connected component is cut in two (recursive spectral bisection) until no cluster has more
    images than the limit. A cut minimizes the number of matches across the cut among the prefixes of
    the images in the order of the Fiedler vector of the normalized Laplacian (Shi and Malik 2000).
-2. Each cluster is extended by the images of adjacent clusters with which it has the most matches.
+3. Each cluster is extended by the images of adjacent clusters with which it has the most matches.
 
 Images of one frame of a rig are never separated.
 """
@@ -12,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array, eye_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import eigsh
 
 from mpsfm_core.data import Bool, Float64, Int64, MappingProblem
@@ -45,7 +47,7 @@ def partition_match_graph(
     """
     frames, frame_of = np.unique(RigFrames(problem).frame_of, return_inverse=True)
     sizes = np.bincount(frame_of, minlength=len(frames))
-    graph = _build_frame_graph(problem, frame_of, len(frames))
+    graph = _remove_unconfirmed_edges(_build_frame_graph(problem, frame_of, len(frames)))
     _, component_of = connected_components(graph, directed=False)
     clusters = []
     for component in range(component_of.max(initial=-1) + 1):
@@ -70,6 +72,25 @@ def _build_frame_graph(problem: MappingProblem, frame_of: Int64, num_frames: int
     graph = csr_array(coo_array((np.tile(counts, 2).astype(np.float64), both), shape=shape))
     graph.eliminate_zeros()
     return graph
+
+
+def _remove_unconfirmed_edges(graph: csr_array) -> csr_array:
+    """Remove edges on no cycle of three or four nodes, except those that connect the graph."""
+    edges = graph.tocoo()
+    links = csr_array((np.ones(len(edges.data)), (edges.row, edges.col)), shape=graph.shape)
+    degree = np.asarray(links.sum(axis=1)).ravel()
+    walks_2 = links @ links
+    walks_3 = walks_2 @ links  # of these, degree_a + degree_b - 1 repeat the edge a-b itself
+    num_triangles = np.asarray(walks_2[edges.row, edges.col]).ravel()
+    num_squares = np.asarray(walks_3[edges.row, edges.col]).ravel()
+    num_squares -= degree[edges.row] + degree[edges.col] - 1
+    is_confirmed = num_triangles + num_squares > 0
+    costs = 1 / edges.data + 2 * ~is_confirmed  # confirmed edges first
+    forest = minimum_spanning_tree(csr_array((costs, (edges.row, edges.col)), shape=graph.shape))
+    is_in_forest = np.asarray((forest + forest.T)[edges.row, edges.col]).ravel() > 0
+    remains = is_confirmed | is_in_forest
+    rows = edges.row[remains], edges.col[remains]
+    return csr_array((edges.data[remains], rows), shape=graph.shape)
 
 
 def _bisect(graph: csr_array, nodes: Int64, sizes: Int64, max_images: int) -> list[Int64]:

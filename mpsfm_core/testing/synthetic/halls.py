@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 import pycolmap
+from scipy.spatial import cKDTree
 
 from mpsfm_core.data import (
     Bool,
@@ -130,7 +130,7 @@ def make_hall_problem(
         prior = DepthPrior.from_arrays(depth, (errors.declared * depth) ** 2)
         images.append(replace(image, depth=prior))
     pairs = []
-    for a, b in combinations(range(views), 2):
+    for a, b in _list_near_pairs(eyes):
         _, rows_a, rows_b = np.intersect1d(numbers[a], numbers[b], return_indices=True)
         if len(rows_a) >= MIN_MATCHES:
             matches = np.stack([rows_a, rows_b], axis=1)
@@ -209,6 +209,12 @@ def _keypoints(
             numbers[j].append(i * points_per_view + rows)
             pixels[j].append(xy[rows])
     return [np.concatenate(n) for n in numbers], [np.concatenate(p) for p in pixels]
+
+
+def _list_near_pairs(eyes: Float64) -> list[tuple[int, int]]:
+    """Return the sorted pairs of views whose distances to a third view may be within the reach."""
+    pairs = cKDTree(eyes).query_pairs(2 * REACH + 1e-6)
+    return sorted(pairs)
 
 
 def _can_match(rays_a: Float64, rays_b: Float64) -> Bool:

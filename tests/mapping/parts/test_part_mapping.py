@@ -7,14 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.mapping import mapper
-from mpsfm_core.mapping.options import AUTO_PART_IMAGES, AUTO_PARTS_FROM, MapperOptions
+from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts.part_mapping import reconstruct, select_parts
 from mpsfm_core.mapping.scene.reconstruction import MappingResult
 from mpsfm_core.testing.synthetic.halls import CALIBRATED_PRIORS, HallProblem, make_hall_problem
@@ -44,7 +43,7 @@ def test_parts_are_joined_as_accurately_as_in_one_piece(
     assert len(select_parts(hall.problem, OPTIONS)) >= 3
     (model,) = in_parts.reconstructions
     assert len(model.images) == 49 and not in_parts.report.image_reasons
-    whole = measure_auc(reconstruct(hall.problem, MapperOptions(parts="off")), hall)
+    whole = measure_auc(reconstruct(hall.problem, MapperOptions()), hall)
     assert measure_auc(in_parts, hall)[1] > whole[1] - 0.01
     assert model.metric is not None and model.metric.trusted
     lengths = np.bincount(
@@ -99,17 +98,7 @@ def test_parts_without_common_images_stay_components(hall: HallProblem) -> None:
 def test_small_problems_and_known_poses_are_mapped_in_one_piece(hall: HallProblem) -> None:
     problem = hall.problem
     assert not select_parts(problem, MapperOptions())
-    assert not select_parts(problem, MapperOptions(parts="off"))
+    assert not select_parts(problem, MapperOptions(parts=49))
     assert not select_parts(problem.with_poses(hall.truth), OPTIONS)
     guess = OPTIONS.model_copy(update={"known_poses": "guess"})
     assert len(select_parts(problem.with_poses(hall.truth), guess)) > 1
-
-
-def test_part_size_is_automatic_above_the_limit() -> None:
-    automatic = MapperOptions()
-    assert automatic.part_size(AUTO_PARTS_FROM) is None
-    assert automatic.part_size(AUTO_PARTS_FROM + 1) == AUTO_PART_IMAGES
-    assert MapperOptions(parts="off").part_size(10**6) is None
-    assert OPTIONS.part_size(20) is None and OPTIONS.part_size(21) == 20
-    with pytest.raises(ValidationError):
-        MapperOptions(parts=3)

@@ -96,6 +96,18 @@ def test_cut_has_the_fewest_matches() -> None:
     assert set(first.tolist()) & set(second.tolist()) == {18, 19, 20, 21}
 
 
+def test_single_pair_of_images_that_look_alike_adds_no_image_to_a_part() -> None:
+    links = grid_links(20, 12)
+    parts = partition_match_graph(make_problem(240, links), 60)
+    false_pair = (0, 239, 400)
+    assert all(
+        np.array_equal(part, other)
+        for part, other in zip(
+            parts, partition_match_graph(make_problem(240, [*links, false_pair]), 60), strict=True
+        )
+    )
+
+
 def test_components_are_parts_and_unmatched_images_are_in_no_part() -> None:
     links = [(i, i + 1, 60) for i in range(9)] + [(i, i + 1, 60) for i in range(10, 15)]
     parts = partition_match_graph(make_problem(18, links), 30)
