@@ -73,7 +73,7 @@ def reconstruct(
     options: MapperOptions | None = None,
     events: MappingEvents | None = None,
     checkpoints: CheckpointStore | None = None,
-    models: Sequence[Reconstruction] = (),
+    initial_models: Sequence[Reconstruction] = (),
 ) -> MappingResult:
     """Reconstruct poses, points and refined depth of all images that can be verified.
 
@@ -90,8 +90,8 @@ def reconstruct(
         options: Options of the mapper.
         events: Receiver of progress events.
         checkpoints: Storage of checkpoints.
-        models: Reconstructions of some images, from which the first components start. With models,
-            there is one mapper run.
+        initial_models: Reconstructions of some images, from which the first components start. With
+            initial models, there is one mapper run.
 
     Returns:
         Connected components, sorted by decreasing number of images, and the report.
@@ -104,12 +104,12 @@ def reconstruct(
     is_complete = bool(runs) and interrupted is None
     pair_weights = None
     distinct = remove_duplicates(problem, options)
-    initial_problem = distinct if models else _calibrate_view_graph(distinct, options)
+    initial_problem = distinct if initial_models else _calibrate_view_graph(distinct, options)
     for run in runs:  # completed mapper runs, oldest first
         initial_problem = _improve_problem(initial_problem, run, options) or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):
         run_options = options.model_copy(update={"seed": options.seed + number})
-        mapper = Mapper(initial_problem, run_options, events, pair_weights, models)
+        mapper = Mapper(initial_problem, run_options, events, pair_weights, initial_models)
         if interrupted is not None:
             mapper.load_state_dict(interrupted)
             interrupted = None
@@ -119,7 +119,7 @@ def reconstruct(
 
         runs.append(mapper.run(save_checkpoint))
         pair_weights = mapper.pair_weights
-        if mapper.is_deterministic or models:
+        if mapper.is_deterministic or initial_models:
             break
         improved_problem = _improve_problem(initial_problem, runs[-1], options)
         if improved_problem is not None:

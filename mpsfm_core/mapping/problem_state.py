@@ -44,8 +44,8 @@ def rig_to_state(rig: Rig) -> StateDict:
 
 def rig_from_state(state: StateDict) -> Rig:
     """Restore a rig."""
-    sensors, frames = (tuple(map(tuple, state[name])) for name in ("sensor_from_rig", "frames"))
-    return Rig(sensors, frames, state["is_estimated"])
+    sensors = tuple(pose and tuple(pose) for pose in state["sensor_from_rig"])
+    return Rig(sensors, tuple(map(tuple, state["frames"])), state["is_estimated"])
 
 
 def _image_to_state(image: MappingImage) -> StateDict:

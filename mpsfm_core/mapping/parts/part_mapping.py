@@ -5,7 +5,7 @@ The steps of mapping in parts are::
     parts = partition_match_graph()     # overlapping clusters of well connected images
     map each part                       # mapper.reconstruct, on any worker
     join_reconstructions()              # similarity transforms from common images
-    mapper.reconstruct(models=joined)   # tracks across parts, refinement and checks of everything
+    mapper.reconstruct(initial_models)  # tracks across parts, refinement and checks of all images
 """
 
 from __future__ import annotations
