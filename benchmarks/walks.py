@@ -70,24 +70,34 @@ _TEXTURES = 64
 Record = dict[str, Any]
 
 
-def build_rooms(rng: np.random.Generator) -> tuple[Any, Any, Any]:
-    """Build four rooms around the origin, each with doors to two neighbors."""
+def build_rooms(rng: np.random.Generator, texture_factor: float = 1.0) -> tuple[Any, Any, Any]:
+    """Build four rooms around the origin, each with doors to two neighbors.
+
+    Args:
+        rng: Generator of shapes and textures.
+        texture_factor: Factor on the size of the textures of floor, ceiling and inner walls, which
+            repeat in several rooms with factor 1.
+    """
     from training.synthetic.builder import Builder
     from training.synthetic.furniture import FURNITURE, Frame
     from training.synthetic.textures import make_textures
     from training.synthetic.worlds import _wall
 
     b = Builder(rng, _TEXTURES)
+
+    def look(period: tuple[float, float]) -> Any:
+        return b.look((texture_factor * period[0], texture_factor * period[1]))
+
     length, width = 2 * ROOM
-    b.box((0, 0, -0.1), (length + 1, width + 1, 0.1), b.look((0.8, 2)), shadow=False)
-    b.box((0, 0, HEIGHT), (length + 1, width + 1, 0.1), b.look((1, 3)), shadow=False)
+    b.box((0, 0, -0.1), (length + 1, width + 1, 0.1), look((0.8, 2)), shadow=False)
+    b.box((0, 0, HEIGHT), (length + 1, width + 1, 0.1), look((1, 3)), shadow=False)
     door = b.look((1, 2))
     for side in range(4):
         along, away = (width, length) if side % 2 == 0 else (length, width)
         yaw = np.pi + side * np.pi / 2
         outward = np.array([np.cos(yaw), np.sin(yaw)]) * -away / 2
         f = Frame(b, *outward, yaw)
-        b.box(f.at(0, -0.05, 0), (0.1, along + 0.2, HEIGHT), b.look((1, 3)), yaw, shadow=False)
+        b.box(f.at(0, -0.05, 0), (0.1, along + 0.2, HEIGHT), look((1, 3)), yaw, shadow=False)
         for half in (-1, 1):
             _wall(b, Frame(b, *f.at(half * along / 4, 0, 0)[:2], yaw), along / 2 - 0.4, HEIGHT)
             for offset in (-1.1, 0.2, 1.3):
@@ -99,13 +109,13 @@ def build_rooms(rng: np.random.Generator) -> tuple[Any, Any, Any]:
         part = (half_length - DOOR) / 2
         for end in (-1, 1):
             u = end * (DOOR + part) / 2
-            look = b.look((0.6, 2))
-            b.box(inner.at(u, 0, 0), (0.12, part, HEIGHT), look, inner.yaw, shadow=False)
+            wall = look((0.6, 2))
+            b.box(inner.at(u, 0, 0), (0.12, part, HEIGHT), wall, inner.yaw, shadow=False)
             for face in (-1, 1):
                 picture = inner.at(u, 0.065 * face, rng.uniform(1.0, 1.4))
                 b.box(picture, (0.02, *rng.uniform(0.4, 0.9, 2)), b.look((0.4, 0.9)), inner.yaw)
             b.box(inner.at(end * (DOOR / 2 - 0.03), 0, 0), (0.16, 0.06, 2.1), door, inner.yaw)
-        b.box(inner.at(0, 0, 2.1), (0.12, DOOR, HEIGHT - 2.1), b.look((0.6, 2)), inner.yaw)
+        b.box(inner.at(0, 0, 2.1), (0.12, DOOR, HEIGHT - 2.1), look((0.6, 2)), inner.yaw)
     # Without lamps there are no shadows to compute, which is several times faster.
     b.lights.clear()
     b.ambient = ((0.9,) * 3, (0.5,) * 3)

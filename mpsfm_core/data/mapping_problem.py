@@ -221,6 +221,23 @@ class MappingProblem:
         """Return the number of keypoints of an image."""
         return len(self.images[image].keypoints)
 
+    def frame_of_images(self) -> Int64:
+        """Return the frame (n,) of each image, as the index of the first image of the frame."""
+        row_of = {image.name: row for row, image in enumerate(self.images)}
+        frame_of = np.arange(len(self.images), dtype=np.int64)
+        for rig in self.rigs:
+            for frame in rig.frames:
+                rows = [row_of[name] for name in frame if name in row_of]
+                frame_of[rows] = rows[:1]
+        return frame_of
+
+    def pairs_between_frames(self) -> tuple[VerifiedPair, ...]:
+        """Return the verified pairs whose images are not of the same frame of a rig."""
+        if not self.rigs:
+            return self.pairs
+        frame_of = self.frame_of_images()
+        return tuple(p for p in self.pairs if frame_of[p.image_a] != frame_of[p.image_b])
+
     def subset(self, names: list[str]) -> MappingProblem:
         """Return the mapping problem restricted to the named images and their pairs."""
         chosen = set(names)

@@ -199,10 +199,10 @@ class Component:
             self.scene.set_rig_scale(scale)
 
     def _explained_ratio(self, images: Int64) -> float:
-        """Return the share of summed match scores whose two keypoints observe the same 3D point."""
+        """Return the share of the summed match scores between frames that 3D points explain."""
         graph = self.scene.graph
-        is_chosen = self.scene.mask(images)[graph.image_of]
-        is_between = is_chosen[graph.source] & is_chosen[graph.target]
+        is_chosen = self.scene.mask(self.scene.rigs.complete(images.tolist()))[graph.image_of]
+        is_between = is_chosen[graph.source] & is_chosen[graph.target] & ~self._within_frames()
         is_explained = is_between & self.scene.explained_edges()
         return float(graph.score[is_explained].sum() / max(graph.score[is_between].sum(), 1e-12))
 
@@ -371,8 +371,14 @@ class Component:
         return [Misregistration((image,), no_pairs, 0) for image in focals]
 
     def _count_explained_matches(self) -> int:
-        """Count the matches whose keypoints observe the same 3D point."""
-        return int(np.count_nonzero(self.scene.explained_edges()))
+        """Count the matches between frames whose keypoints observe the same 3D point."""
+        return int(np.count_nonzero(self.scene.explained_edges() & ~self._within_frames()))
+
+    def _within_frames(self) -> Bool:
+        """Return a bool mask (e,) of the matches between images of the same frame of a rig."""
+        frame_of = self.scene.rigs.frame_of[self.scene.graph.image_of]
+        within: Bool = frame_of[self.scene.graph.source] == frame_of[self.scene.graph.target]
+        return within
 
     def finalize(self) -> None:
         """Refine all images, repeat the depth check, and refine with a sharper depth loss."""

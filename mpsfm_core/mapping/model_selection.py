@@ -130,5 +130,5 @@ def compute_explained_score(model: Reconstruction, problem: MappingProblem) -> f
 
 
 def compute_total_score(problem: MappingProblem) -> float:
-    """Sum the scores of all matches of the mapping problem."""
-    return sum(float(pair.scores.sum(dtype=float)) for pair in problem.pairs)
+    """Sum the scores of all matches between different frames of the mapping problem."""
+    return sum(float(pair.scores.sum(dtype=float)) for pair in problem.pairs_between_frames())

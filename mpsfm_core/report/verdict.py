@@ -84,7 +84,7 @@ def find_doubts(summary: Mapping[str, Any]) -> Iterator[Doubt]:
     """Yield the reasons to doubt the providers and the first model of a run."""
     for stored in summary.get("doubts", ()):
         yield Doubt(reason_from_json(DoubtReason, stored))
-    yield from _unexplained_pairs(summary["pairs"]["all"])
+    yield from _unexplained_pairs(_sum_over_frames(summary))
     for reconstruction in summary["reconstructions"][:1]:
         yield from _weak_evidence(reconstruction["evidence"])
     place = summary.get("georeference") or {}
@@ -126,6 +126,24 @@ def is_focal_refined(image: Mapping[str, Any]) -> bool:
         image: entry of the image in ``images.details`` of ``summary.json``.
     """
     return "refined_focal_length_px" in image and "focal_length_reason" not in image
+
+
+def _sum_over_frames(summary: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the verified pairs; all pairs between two frames of a rig are summed to one pair."""
+    pairs: list[Mapping[str, Any]] = summary["pairs"]["all"]
+    reconstructions = summary["reconstructions"]
+    frames = reconstructions[0]["evidence"].get("frames") if reconstructions else None
+    if not frames:
+        return pairs
+    first_of = {name: frame[0] for frame in frames for name in frame}
+    sums: dict[tuple[str, ...], dict[str, Any]] = {}
+    for pair in pairs:
+        if "explained" in pair:
+            names = tuple(sorted(first_of.get(name, name) for name in pair["images"]))
+            total = sums.setdefault(names, {"images": names, "inliers": 0, "explained": 0})
+            total["inliers"] += pair["inliers"]
+            total["explained"] += pair["explained"]
+    return list(sums.values())
 
 
 def _unexplained_pairs(pairs: list[Mapping[str, Any]]) -> Iterator[Doubt]:

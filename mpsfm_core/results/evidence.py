@@ -11,7 +11,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mpsfm_core.data import Float64, Int64, MappingProblem
+from mpsfm_core.data import Bool, Float64, Int64, MappingProblem
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.mapping.scene.reconstruction import (
     Reconstruction,
@@ -45,88 +45,118 @@ def count_explained_matches(
 def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -> dict[str, Any]:
     """Describe the evidence for the poses of a reconstruction as plain data.
 
+    The images of a frame of a rig have one pose, so they count as one image: they have the same
+    evidence, and only points that several frames observe support their pose.
+
     Args:
         reconstruction: reconstruction of some images of the mapping problem.
         problem: mapping problem with images and verified pairs.
 
     Returns:
-        Plain data with the keys ``parts``, ``median_angle_deg`` and ``images``. ``parts`` are the
-        image names of each connected part of the covisibility graph, largest part first.
-        ``median_angle_deg`` is the median over the 3D points of the maximum triangulation angle.
-        ``images`` are the number of 3D points, the share of explained matches and the predicted
-        relative pose error (None without a prediction), by image name.
+        Plain data with the keys ``parts``, ``median_angle_deg``, ``images`` and ``frames``.
+        ``parts`` are the image names of each connected part of the covisibility graph, largest part
+        first. ``median_angle_deg`` is the median over the 3D points of the maximum triangulation
+        angle. ``images`` are the number of 3D points, the share of explained matches and the
+        predicted relative pose error (None without a prediction), by image name. ``frames`` are the
+        image names of each frame with several images.
     """
-    images = reconstruction.confirmed_images
+    frames = _group_by_frame(reconstruction, problem)
+    frame_of = {image.name: number for number, frame in enumerate(frames) for image in frame}
     explained = count_explained_matches(reconstruction, problem)
-    matched = _count_per_image(
-        {
-            (problem.images[pair.image_a].name, problem.images[pair.image_b].name): len(pair)
-            for pair in problem.pairs
-        },
-        explained.keys(),
-    )
-    supported = _count_per_image(explained, explained.keys())
+    matched = {
+        (problem.images[pair.image_a].name, problem.images[pair.image_b].name): len(pair)
+        for pair in problem.pairs
+    }
+    num_matched, num_explained = np.zeros((2, len(frames)), dtype=np.int64)
+    for names, count in explained.items():
+        for name in names:
+            num_matched[frame_of[name]] += matched[names]
+            num_explained[frame_of[name]] += count
+    ratios = num_explained / np.maximum(num_matched, 1)
+    num_frames = _count_frames(frames, len(reconstruction.points))
+    is_shared = num_frames >= (2 if len(frame_of) > len(frames) else 1)
     return {
-        "parts": _connected_parts(images, len(reconstruction.points)),
-        "median_angle_deg": _median_angle_deg(images, reconstruction.points),
+        "parts": _connected_parts(frames, len(reconstruction.points)),
+        "median_angle_deg": _median_angle_deg(frames, reconstruction.points, is_shared),
         "images": {
             image.name: {
-                "points": int((image.point_ids >= 0).sum()),
-                "explained_ratio": round(
-                    supported.get(image.name, 0) / max(matched.get(image.name, 0), 1), 4
-                ),
+                "points": int(is_shared[_rows(frame)].sum()),
+                "explained_ratio": round(float(ratio), 4),
                 "pose_error_deg": None
                 if image.pose_error_deg is None
                 else round(image.pose_error_deg, 3),
             }
-            for image in images
+            for frame, ratio in zip(frames, ratios, strict=True)
+            for image in frame
         },
+        "frames": [[image.name for image in frame] for frame in frames if len(frame) > 1],
     }
 
 
-def _count_per_image(counts: dict[tuple[str, str], int], pairs: Any) -> dict[str, int]:
-    """Sum the counts of image pairs over the pairs of each image."""
-    sums: dict[str, int] = {}
-    for names in pairs:
-        for name in names:
-            sums[name] = sums.get(name, 0) + counts[names]
-    return sums
+_Frame = list[RegisteredImage]
 
 
-def _rows(image: RegisteredImage) -> Int64:
-    """Return the ids of the 3D points that an image observes."""
-    return np.unique(image.point_ids[image.point_ids >= 0])
+def _group_by_frame(reconstruction: Reconstruction, problem: MappingProblem) -> list[_Frame]:
+    """Return the confirmed images of each frame, an image without a rig as its own frame."""
+    images = reconstruction.confirmed_images
+    in_rig = {name for rig in reconstruction.rigs for name in rig.image_names}
+    frame_of = problem.frame_of_images()
+    frames: dict[tuple[bool, int], _Frame] = {}
+    for image in images:
+        is_member = image.name in in_rig
+        key = is_member, int(frame_of[image.index]) if is_member else image.index
+        frames.setdefault(key, []).append(image)
+    return list(frames.values())
 
 
-def _connected_parts(images: tuple[RegisteredImage, ...], num_points: int) -> list[list[str]]:
+def _rows(frame: _Frame) -> Int64:
+    """Return the ids of the 3D points that the images of a frame observe."""
+    point_ids = np.concatenate([image.point_ids for image in frame])
+    return np.unique(point_ids[point_ids >= 0])
+
+
+def _count_frames(frames: list[_Frame], num_points: int) -> Int64:
+    """Return the number of frames (p,) that observe each 3D point."""
+    counts = np.zeros(num_points, dtype=np.int64)
+    for frame in frames:
+        counts[_rows(frame)] += 1
+    return counts
+
+
+def _connected_parts(frames: list[_Frame], num_points: int) -> list[list[str]]:
     """Return the connected components of the covisibility graph, largest component first."""
-    if not images:
+    if not frames:
         return []
-    rows = [_rows(image) for image in images]
+    rows = [_rows(frame) for frame in frames]
     observations = coo_array(
         (
             np.ones(sum(map(len, rows))),
-            (np.repeat(np.arange(len(images)), list(map(len, rows))), np.concatenate(rows)),
+            (np.repeat(np.arange(len(frames)), list(map(len, rows))), np.concatenate(rows)),
         ),
-        shape=(len(images), max(num_points, 1)),
+        shape=(len(frames), max(num_points, 1)),
     ).tocsr()
     shared = (observations @ observations.T) >= MIN_SHARED_POINTS
     _, labels = connected_components(shared, directed=False)
     parts = [
-        [image.name for image, label in zip(images, labels, strict=True) if label == part]
+        [
+            image.name
+            for frame, label in zip(frames, labels, strict=True)
+            if label == part
+            for image in frame
+        ]
         for part in range(labels.max() + 1)
     ]
     return sorted(parts, key=len, reverse=True)
 
 
-def _median_angle_deg(images: tuple[RegisteredImage, ...], points: Float64) -> float | None:
-    """Return the median over the 3D points of the maximum triangulation angle in degrees."""
-    if not len(points) or not images:
+def _median_angle_deg(frames: list[_Frame], points: Float64, is_used: Bool) -> float | None:
+    """Return the median over the used 3D points of the maximum triangulation angle in degrees."""
+    if not is_used.any() or not frames:
         return None
     mean_rays = np.zeros_like(points)
     rays = []
-    for image in images:
-        rows = _rows(image)
+    for image in (image for frame in frames for image in frame):
+        rows = _rows([image])
         ray = points[rows] - camera_center(image.rotation, image.translation)
         ray /= np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-12)
         mean_rays[rows] += ray
@@ -136,5 +166,5 @@ def _median_angle_deg(images: tuple[RegisteredImage, ...], points: Float64) -> f
     cosines = np.ones(len(points))
     for rows, ray in rays:
         cosines[rows] = np.minimum(cosines[rows], (ray * mean_rays[rows]).sum(axis=1))
-    angles = 2 * np.degrees(np.arccos(np.clip(cosines, -1, 1)))
+    angles = 2 * np.degrees(np.arccos(np.clip(cosines[is_used], -1, 1)))
     return round(float(np.median(angles)), 4)

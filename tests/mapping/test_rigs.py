@@ -12,10 +12,12 @@ from mpsfm_core.data.errors import DataError
 from mpsfm_core.geometry import camera_center, compose, invert, rotation_angle_deg
 from mpsfm_core.geometry.similarity import umeyama
 from mpsfm_core.mapping.mapper import reconstruct
+from mpsfm_core.mapping.model_selection import compute_total_score
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, transform_reconstruction
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.results.colmap_model import build_pinhole_model
+from mpsfm_core.results.evidence import describe_evidence
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise
 from mpsfm_core.testing.synthetic.rigs import RigKind, RigProblem, make_rig_problem
 from mpsfm_core.testing.synthetic.scenes import look_at, room_scene
@@ -157,6 +159,22 @@ def test_images_that_do_not_move_as_one_stay_uncalibrated() -> None:
     assert result.report.runs == 1
     assert result.reconstructions[0].rigs == ()
     assert center_errors(result.reconstructions[0], rig_problem.poses)[1].max() < 0.01
+
+
+def test_evidence_of_a_rig_counts_only_matches_between_frames() -> None:
+    problem = make_problem("panorama", 2).problem
+    (model,) = reconstruct(problem).reconstructions
+    within = [p for p in problem.pairs if p.image_a // 8 == p.image_b // 8]
+    between = problem.pairs_between_frames()
+    assert within and len(within) + len(between) == len(problem.pairs)
+    evidence = describe_evidence(model, problem)
+    assert [len(frame) for frame in evidence["frames"]] == [8, 8]
+    images = evidence["images"]
+    for frame in evidence["frames"]:
+        assert len({(images[n]["points"], images[n]["explained_ratio"]) for n in frame}) == 1
+    apart = replace(problem, pairs=tuple(within))
+    assert compute_total_score(apart) == 0.0
+    assert {i["explained_ratio"] for i in describe_evidence(model, apart)["images"].values()} == {0}
 
 
 def test_colmap_model_has_rigs_and_frames() -> None:

@@ -277,7 +277,8 @@ def find_explained_matches(
 ) -> Iterator[tuple[VerifiedPair, Bool]]:
     """Yield each pair of registered images with a mask of its explained matches.
 
-    A match is explained if both keypoints observe the same 3D point.
+    A match is explained if both keypoints observe the same 3D point. Pairs of images of one frame
+    of a rig are left out, because any pose of the frame explains their matches.
 
     Args:
         images: Registered images of a reconstruction.
@@ -287,7 +288,7 @@ def find_explained_matches(
         The image pair, and a (m,) bool mask of its explained matches.
     """
     point_ids = {image.index: image.point_ids for image in images}
-    for pair in problem.pairs:
+    for pair in problem.pairs_between_frames():
         if pair.image_a in point_ids and pair.image_b in point_ids:
             points_a = point_ids[pair.image_a][pair.matches[:, 0]]
             points_b = point_ids[pair.image_b][pair.matches[:, 1]]
