@@ -51,7 +51,7 @@ from mpsfm_core.inputs.masks import (
     resize_mask,
 )
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.inputs.panorama import is_equirectangular
+from mpsfm_core.inputs.panorama import find_projection
 from mpsfm_core.inputs.undistortion import (
     UndistortionMap,
     distort_pixels,
@@ -567,10 +567,7 @@ def _probe(path: Path, options: InputOptions) -> _ProbedImage:
     try:
         reduced = check_decodable(data, path)
         header = read_header(data)
-        projection = None if options.projection == "perspective" else header.projection
-        detects = options.projection == "auto"
-        if projection is None and detects and reduced is not None and is_equirectangular(reduced):
-            projection = "equirectangular, by its pixels"
+        projection = find_projection(header, reduced) if options.projection == "auto" else None
         if projection is not None:
             raise InputError(
                 f"image {path} is a panorama ({projection}); if all images are panoramas of 360 x "

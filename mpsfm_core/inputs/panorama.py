@@ -1,10 +1,11 @@
-"""Detection of equirectangular panoramas by their pixels."""
+"""Detection of panoramas by XMP data, and of equirectangular panoramas by their pixels."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from mpsfm_core.data import UInt8
+from mpsfm_core.inputs.image_header import ImageHeader
 
 _MAX_SEAM_RATIO = 2.0
 """Largest ratio of the difference across the seam to the difference of adjacent columns [ours]."""
@@ -13,6 +14,18 @@ _MAX_POLE_RATIO = 0.5
 _MIN_COLUMN_RATIO = 0.25
 """Smallest ratio of the contrast along the seam to the contrast of the image, which excludes
 objects in front of a uniform background [ours]."""
+
+
+def find_projection(header: ImageHeader, gray: UInt8 | None) -> str | None:
+    """Return the projection of a panorama, or None for other images.
+
+    Args:
+        header: Header of the image.
+        gray: (h, w) uint8 gray image, which may be reduced, or None if unknown.
+    """
+    if header.projection is None and gray is not None and is_equirectangular(gray):
+        return "equirectangular, by its pixels"
+    return header.projection
 
 
 def is_equirectangular(gray: UInt8) -> bool:

@@ -17,8 +17,15 @@ from mpsfm_core.geometry.panorama import (
     make_view_rotations,
     view_pixels_in_panorama,
 )
-from mpsfm_core.inputs.image_decoding import check_size, decode_rgb, read_bytes
+from mpsfm_core.inputs.image_decoding import (
+    check_decodable,
+    check_size,
+    decode_rgb,
+    read_bytes,
+    upright_size,
+)
 from mpsfm_core.inputs.image_header import read_header
+from mpsfm_core.inputs.panorama import find_projection
 from mpsfm_core.support.files import write_file
 
 _JPEG_QUALITY = 95
@@ -35,6 +42,31 @@ class PanoramaViews(NamedTuple):
     rig: Rig
     """Rig of the views of a panorama, whose centers coincide. The pose of a frame is the pose of
     the panorama, with x right, y down and z to the middle of the panorama."""
+
+
+def are_panoramas(folder: Path, names: Sequence[str]) -> bool:
+    """Return True if all images of a folder are equirectangular panoramas of 360 x 180 degrees.
+
+    A panorama is twice as wide as high, and is recognized by XMP data or by its pixels.
+
+    Args:
+        folder: Folder of the images.
+        names: Names of the images below the folder.
+    """
+    return len(names) > 0 and all(_is_panorama(folder / name) for name in names)
+
+
+def _is_panorama(path: Path) -> bool:
+    """Return True if an image is a panorama of 360 x 180 degrees, False if it is unreadable."""
+    try:
+        data = read_bytes(path)
+        header = read_header(data)
+        width, height = upright_size(data, header, path)
+        if abs(width - 2 * height) > 1:
+            return False
+        return find_projection(header, check_decodable(data, path)) is not None
+    except InputError:
+        return False
 
 
 def cut_panorama(panorama: UInt8) -> list[UInt8]:

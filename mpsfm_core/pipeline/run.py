@@ -39,7 +39,7 @@ from mpsfm_core.inputs.matches import (
     matches_from_hloc,
 )
 from mpsfm_core.inputs.models import Poses, describe_name_difference, match_names, read_poses
-from mpsfm_core.inputs.panorama_views import PanoramaViews, cut_panoramas
+from mpsfm_core.inputs.panorama_views import PanoramaViews, are_panoramas, cut_panoramas
 from mpsfm_core.inputs.rigs import read_rigs
 from mpsfm_core.inputs.video import VideoSelection, extract_frames, is_video, read_selection
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
@@ -389,22 +389,31 @@ class _Run:
     def _cut_panoramas(self) -> None:
         """Cut panoramas into perspective views in the output folder, and use these as images."""
         options, source = self._config.inputs, self._source
-        if options.projection != "equirectangular":
+        if options.projection == "perspective":
             return
         others = {"cameras": source.cameras, "poses": source.poses, "rigs": source.rigs}
         given = [name for name, value in others.items() if value is not None]
         given += ["inputs.masks"] if options.masks is not None else []
         given += ["database or hloc"] if source.matches else []
         if given or self._image_folder is None or self._output is None:
+            if options.projection == "auto":
+                return
             what = given[0] if given else "an image set in memory, or no output folder,"
             raise InputError(
                 f"projection equirectangular: {what} cannot be used, because panoramas are files "
                 "that are cut into views with known cameras and rigs in the output folder"
             )
+        names = find_images(self._image_folder, self._output)
+        if source.image_list is not None:
+            names = select_listed_images(source.image_list, names, self._image_folder)
+        if options.projection == "auto":
+            if not are_panoramas(self._image_folder, names):
+                return
+            self._stages.notice(
+                f"all {len(names)} images are panoramas of 360 x 180 degrees, which are cut into "
+                "views; --projection perspective takes them for ordinary photos"
+            )
         with self._stages.stage("panoramas"):
-            names = find_images(self._image_folder, self._output)
-            if source.image_list is not None:
-                names = select_listed_images(source.image_list, names, self._image_folder)
             progress = partial(self._stages.stage_progress, "panoramas")
             self._panorama_views = cut_panoramas(
                 self._image_folder,

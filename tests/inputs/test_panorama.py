@@ -11,6 +11,7 @@ import pytest
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.panorama import is_equirectangular
+from mpsfm_core.inputs.panorama_views import are_panoramas
 from mpsfm_core.testing.synthetic.scenes import room_scene
 
 
@@ -61,3 +62,15 @@ def test_panoramas_without_metadata_are_refused(tmp_path: Path) -> None:
         cv2.imwrite(str(tmp_path / f"{number}.jpg"), large)
     with pytest.raises(InputError, match=r"0\.jpg is a panorama \(equirectangular, by its pixels"):
         load_images(tmp_path)
+
+
+def test_folder_of_panoramas_is_recognized(tmp_path: Path) -> None:
+    large = cv2.resize(panorama(EYES[0]), (2048, 1024), interpolation=cv2.INTER_CUBIC)
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / name), large)
+    cv2.imwrite(str(tmp_path / "wide.png"), large[:, 200:-200])  # less than 360 degrees
+    (tmp_path / "broken.jpg").write_bytes(b"no image")
+    assert are_panoramas(tmp_path, ["a.png", "b.png"])
+    assert not are_panoramas(tmp_path, ["a.png", "wide.png"])
+    assert not are_panoramas(tmp_path, ["a.png", "broken.jpg"])
+    assert not are_panoramas(tmp_path, [])
