@@ -104,7 +104,10 @@ def reconstruct(
     is_complete = bool(runs) and interrupted is None
     pair_weights = None
     distinct = remove_duplicates(problem, options)
-    initial_problem = distinct if initial_models else _calibrate_view_graph(distinct, options)
+    if initial_models:
+        initial_problem = calibrate_rigs(distinct, initial_models) or distinct
+    else:
+        initial_problem = _calibrate_view_graph(distinct, options)
     for run in runs:  # completed mapper runs, oldest first
         initial_problem = _improve_problem(initial_problem, run, options) or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):

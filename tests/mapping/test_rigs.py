@@ -14,6 +14,8 @@ from mpsfm_core.geometry.similarity import umeyama
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.model_selection import compute_total_score
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.parts.part_mapping import reconstruct as reconstruct_in_parts
+from mpsfm_core.mapping.parts.part_mapping import select_parts
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, transform_reconstruction
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.results.colmap_model import build_pinhole_model
@@ -23,13 +25,13 @@ from mpsfm_core.testing.synthetic.rigs import RigKind, RigProblem, make_rig_prob
 from mpsfm_core.testing.synthetic.scenes import look_at, room_scene
 
 
-def make_frame_poses(count: int) -> list[Float64]:
+def make_frame_poses(count: int, step_m: float = 0.4) -> list[Float64]:
     """Return poses of frames that move through the room."""
     rng = np.random.default_rng(0)
     return [
         look_at(
-            [-1.5 + 0.4 * k, -0.6 + 0.2 * rng.normal(), 1.4],
-            [2.0 + 0.4 * k, 0.3 * rng.normal(), 1.2],
+            [-1.5 + step_m * k, -0.6 + 0.2 * rng.normal(), 1.4],
+            [2.0 + step_m * k, 0.3 * rng.normal(), 1.2],
         )
         for k in range(count)
     ]
@@ -137,6 +139,19 @@ def test_unknown_relative_poses_are_calibrated(kind: RigKind, max_angle_deg: flo
         error = rotation @ first.T @ (true_rotation @ true_first.T).T
         assert rotation_angle_deg(error) < max_angle_deg
     assert center_errors(model, rig_problem.poses)[1].max() < 0.01
+
+
+@pytest.mark.parametrize("known", [True, False], ids=["known", "unknown"])
+def test_rig_of_parts_gives_rigid_frames(known: bool) -> None:
+    rig_problem = make_problem("stereo", 14, make_frame_poses(14, 0.15))
+    problem = rig_problem.problem if known else hide_sensor_poses(rig_problem.problem)
+    options = MapperOptions(parts=20)
+    assert len(select_parts(problem, options)) > 1
+    model = reconstruct_in_parts(problem, options).reconstructions[0]
+    assert len(model.images) == 28
+    assert len(model.rigs) == 1
+    assert_rigid_frames(model)
+    assert center_errors(model, rig_problem.poses)[1].max() < 0.02
 
 
 def test_rig_without_common_frame_stays_uncalibrated() -> None:
