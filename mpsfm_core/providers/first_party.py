@@ -60,7 +60,7 @@ PLUGIN_PROVIDERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
 """Providers, as ``kind/name``, that each pip requirement of this project installs."""
 
 EXECUTORS: Mapping[str, str] = MappingProxyType({"dask": "mpsfm-dask", "ray": "mpsfm-ray"})
-"""Pip package of each executor, which distributes feature extraction, by the executor's name."""
+"""Pip package of each executor, which distributes extraction and mapping, by executor name."""
 
 VIEWERS: Mapping[str, str] = MappingProxyType({"viser": "mpsfm-viser", "rerun": "mpsfm-rerun"})
 """Pip package that contains a live viewer, by the name of the viewer."""

@@ -85,7 +85,7 @@ class ProviderContext:
 
 
 class Executor(Protocol):
-    """Executor that runs feature extraction on workers in other processes or on other machines."""
+    """Executor that runs extraction and mapping in other processes or on other machines."""
 
     def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
         """Call ``step(item)`` for each item on one of the workers.

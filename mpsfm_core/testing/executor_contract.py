@@ -17,13 +17,19 @@ import cv2
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.errors import ConfigError, DataError, ProviderRunError
+from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.events import NullExtractionEvents
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.parts import part_mapping
+from mpsfm_core.pipeline.parts import PartMapper
+from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers import Executor
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.contract_case import describe_difference
+from mpsfm_core.testing.synthetic.halls import make_hall_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 _CAMERA = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
@@ -101,6 +107,27 @@ def check_errors(executor: Executor) -> None:
     else:
         raise AssertionError("the exception of the step did not reach the caller")
     assert sum(1 for _ in executor.run(_fail_on_two, [0, 1])) == 2
+
+
+def check_mapping_in_parts(name: str, options: dict[str, Any], folder: Path) -> None:
+    """Require that mapping in parts is bitwise equal on the executor and in this process.
+
+    Args:
+        name: Value of ``runtime.executor``.
+        options: Value of ``runtime.executor_options``.
+        folder: Folder that the check creates and that the workers can access.
+    """
+    problem = make_hall_problem(36, map_width=48, points_per_view=40).problem
+    settings = MapperOptions(parts=20)
+    runtime = RuntimeOptions(cache_dir=folder, workers=1, executor=name, executor_options=options)
+    part_mapper = PartMapper(runtime, Registry.discover(), Stages(Registry()))
+    local = part_mapping.reconstruct(problem, settings)
+    remote = part_mapping.reconstruct(problem, settings, map_parts=part_mapper)
+    part_mapper.forget()
+    expected, actual = ([digest(m) for m in r.reconstructions] for r in (local, remote))
+    assert actual == expected, "mapping on the executor gives another result"
+    remaining = [path for path in folder.rglob("*") if path.is_file()]
+    assert not remaining, f"files of parts remain: {remaining}"
 
 
 def check_extraction(name: str, options: dict[str, Any], folder: Path) -> None:

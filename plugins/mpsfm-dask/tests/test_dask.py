@@ -39,6 +39,12 @@ def test_extraction(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("workers", [1, 3])
+def test_mapping_in_parts(tmp_path: Path, workers: int) -> None:
+    executor_contract.check_mapping_in_parts("dask", {"workers": workers}, tmp_path)
+
+
+@pytest.mark.slow
 def test_a_failing_provider(tmp_path: Path) -> None:
     executor_contract.check_failing_provider("dask", {"workers": 2}, tmp_path)
 

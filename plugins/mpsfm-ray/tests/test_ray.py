@@ -40,6 +40,11 @@ def test_extraction(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow  # starts clusters
+def test_mapping_in_parts(tmp_path: Path) -> None:
+    executor_contract.check_mapping_in_parts("ray", {"workers": 2}, tmp_path)
+
+
+@pytest.mark.slow  # starts clusters
 def test_a_failing_provider(tmp_path: Path) -> None:
     executor_contract.check_failing_provider("ray", {"workers": 2}, tmp_path)
 
