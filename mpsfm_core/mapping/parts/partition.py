@@ -20,8 +20,9 @@ from scipy.sparse.linalg import eigsh
 from mpsfm_core.data import Bool, Float64, Int64, MappingProblem
 from mpsfm_core.mapping.scene.rig_frames import RigFrames
 
-OVERLAP = 0.2
-"""Number of images that extend a cluster, relative to the size of the cluster. [ours]"""
+OVERLAP = 0.1
+"""Number of images that extend a cluster, relative to the size of the cluster. [COLMAP
+image_overlap / leaf_max_num_images]"""
 MIN_COMMON_FRAMES = 5
 """Number of frames that a cluster takes from each adjacent cluster, if so many match. [ours]"""
 MIN_BALANCE = 1 / 3
