@@ -212,24 +212,91 @@ def find_contradicted_cuts(
     contradicting = contradicting[np.ix_(images, images)]
     costs = np.where(explained > 0, 1.0 / np.maximum(explained, 1), 0)
     edges = np.argwhere(minimum_spanning_tree(csr_array(costs)).toarray() > 0)
+    a, b = np.nonzero(np.triu(explained + contradicting))
+    against, support = contradicting[a, b], explained[a, b]
+    counts = [against, support, against**2 + support**2, support > 0, against > 0]
+    sums = sum_across_tree_cuts(edges, np.stack([a, b], axis=1), np.stack(counts, 1), len(images))
+    margins, stds = sums[:, 0] - sums[:, 1], np.sqrt(sums[:, 2])
     cuts = []
-    for row, (node, _) in enumerate(edges):
+    for row in np.flatnonzero(margins > min_significance * stds):
         others = np.delete(edges, row, axis=0)
         forest = csr_array((np.ones(len(others)), others.T), shape=explained.shape)
         part_of = connected_components(forest, directed=False)[1]
-        inside = part_of == part_of[node]
+        inside = part_of == part_of[edges[row, 0]]
         if 2 * inside.sum() > len(images):
             inside = ~inside
-        across = np.ix_(inside, ~inside)
-        margin = int(contradicting[across].sum() - explained[across].sum())
-        std = np.sqrt((contradicting[across] ** 2 + explained[across] ** 2).sum())
-        if margin > min_significance * std:
-            smaller_part = np.zeros_like(registered)
-            smaller_part[images[inside]] = True
-            num_supporting = int(np.count_nonzero(explained[across]))
-            num_contradicting = int(np.count_nonzero(contradicting[across]))
-            cuts.append(ContradictedCut(smaller_part, margin, num_supporting, num_contradicting))
+        smaller_part = np.zeros_like(registered)
+        smaller_part[images[inside]] = True
+        num_supporting, num_contradicting = map(int, sums[row, 3:])
+        cuts.append(
+            ContradictedCut(smaller_part, int(margins[row]), num_supporting, num_contradicting)
+        )
     return cuts
+
+
+def sum_across_tree_cuts(edges: Int64, pairs: Int64, values: Int64, num_nodes: int) -> Int64:
+    """Sum the values of the pairs of nodes that each edge of a forest separates.
+
+    Removing an edge separates the part with its first node from all other nodes. The sums over the
+    pairs across the cut follow from sums over the subtrees of rooted trees, in linear time.
+
+    Args:
+        edges: (e, 2) edges of the forest.
+        pairs: (p, 2) pairs of different nodes.
+        values: (p, k) values of the pairs.
+        num_nodes: Number of nodes.
+
+    Returns:
+        (e, k) sums for each edge.
+    """
+    forest = csr_array((np.ones(len(edges)), edges.T), shape=(num_nodes, num_nodes))
+    parent, root = np.full(num_nodes, -1), np.full(num_nodes, -1)
+    order = np.zeros(0, dtype=np.int64)
+    for first in range(num_nodes):
+        if root[first] < 0:
+            nodes, parents = breadth_first_order(forest, first, directed=False)
+            parent[nodes[1:]], root[nodes] = parents[nodes[1:]], first
+            order = np.concatenate([order, nodes])
+    depth = np.zeros(num_nodes, dtype=np.int64)
+    for node in order:
+        if parent[node] >= 0:
+            depth[node] = depth[parent[node]] + 1
+    is_inner = root[pairs[:, 0]] == root[pairs[:, 1]]
+    ancestor = _find_common_ancestors(pairs[is_inner], parent, depth)
+    # sums over subtrees of: the pairs of each node, those within its tree, and pairs in the subtree
+    ends = np.zeros((3, num_nodes, values.shape[1]), dtype=np.int64)
+    for column in range(2):
+        np.add.at(ends[0], pairs[:, column], values)
+        np.add.at(ends[1], pairs[is_inner, column], values[is_inner])
+    np.add.at(ends[2], ancestor, values[is_inner])
+    for node in order[::-1]:
+        if parent[node] >= 0:
+            ends[:, parent[node]] += ends[:, node]
+    all_ends, tree_ends, within = ends
+    is_child = parent[edges[:, 0]] == edges[:, 1]
+    child = np.where(is_child, edges[:, 0], edges[:, 1])
+    top = root[child]
+    below = all_ends[child] - 2 * within[child]
+    across_edge = tree_ends[child] - 2 * within[child]
+    within_above = within[top] - within[child] - across_edge
+    above = all_ends[top] - all_ends[child] - 2 * within_above
+    sums: Int64 = np.where(is_child[:, None], below, above)
+    return sums
+
+
+def _find_common_ancestors(pairs: Int64, parent: Int64, depth: Int64) -> Int64:
+    """Return the lowest common ancestor (p,) of each pair (p, 2) of nodes of the same tree."""
+    a: Int64 = pairs[:, 0].copy()
+    b: Int64 = pairs[:, 1].copy()
+    active = np.flatnonzero(a != b)
+    while len(active):
+        a_active, b_active = a[active], b[active]
+        a_moves = depth[a_active] >= depth[b_active]
+        b_moves = depth[b_active] >= depth[a_active]
+        a[active] = np.where(a_moves, parent[a_active], a_active)
+        b[active] = np.where(b_moves, parent[b_active], b_active)
+        active = active[a[active] != b[active]]
+    return a
 
 
 def _count_separating_matches(registered: Bool, contradicting: Int64) -> Int64:

@@ -7,6 +7,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 
 from mpsfm_core.data import Bool, Int64, PinholeCamera
 from mpsfm_core.geometry import rotation_angle_deg
@@ -18,6 +20,7 @@ from mpsfm_core.mapping.consistency.misregistration import (
     count_pair_matches,
     detect_misregistrations,
     find_contradicted_cuts,
+    sum_across_tree_cuts,
 )
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
@@ -99,6 +102,26 @@ def test_contradicted_cut_at_the_only_supporting_pair_is_found() -> None:
     assert np.flatnonzero(cut.inside).tolist() == [3, 4]
     assert cut.margin == 280 - 140
     assert (cut.num_supporting_pairs, cut.num_contradicting_pairs) == (1, 3)
+
+
+@pytest.mark.parametrize("num_trees", [1, 3])
+def test_sums_across_tree_cuts_equal_sums_over_all_pairs(num_trees: int) -> None:
+    rng = np.random.default_rng(num_trees)
+    n = 40
+    edges = np.array(
+        [rng.permutation([child, rng.integers(0, child)]) for child in range(num_trees, n)]
+    )
+    pairs = np.stack(np.triu_indices(n, 1), axis=1)
+    pairs = pairs[rng.permutation(len(pairs))[:300]]
+    values = rng.integers(0, 100, (300, 2))
+    sums = sum_across_tree_cuts(edges, pairs, values, n)
+    for row, (node, _) in enumerate(edges):
+        others = np.delete(edges, row, axis=0)
+        forest = csr_array((np.ones(len(others)), others.T), shape=(n, n))
+        part_of = connected_components(forest, directed=False)[1]
+        inside = part_of == part_of[node]
+        is_across = inside[pairs[:, 0]] != inside[pairs[:, 1]]
+        assert np.array_equal(sums[row], values[is_across].sum(axis=0))
 
 
 def test_cut_with_more_supporting_matches_is_ignored() -> None:
