@@ -39,7 +39,7 @@ from mpsfm_core.inputs.models import reconstruction_poses
 
 OVERRIDES = ("inputs.projection=equirectangular", "dense.enabled=false", "results.report=false")
 MAX_ANGLE_DEG, MAX_DISTANCE_M = 5.0, 0.5
-TEXTURE_FACTOR = 5.0
+TEXTURE_FACTOR = 12.0
 """Factor on the size of textures, with which floors and walls do not repeat in other rooms."""
 World = tuple[Any, Any, Any]
 _SIDES = np.radians([0.0, 90.0, 180.0, 270.0])
