@@ -31,9 +31,10 @@ from mpsfm_core.mapping.initialization.refined_focal_lengths import (
 from mpsfm_core.mapping.refinement.self_calibration import PRINCIPAL_POINT_PRIOR_STD
 from mpsfm_core.mapping.registration.pose_hypotheses import sample_focal_lengths
 
-MAX_PAIRS, MAX_MATCHES = 20, 100
-"""Number of image pairs with most matches, and approximate number of matches of each pair, that
-estimate a focal length; the run time is proportional to both. [ours]"""
+MAX_PAIRS, MAX_MATCHES = 30, 100
+"""Number of image pairs with the largest total displacement of matches, and approximate number of
+matches of each pair, that estimate a focal length; the run time is proportional to both.
+[tuned: benchmarks.walks]"""
 MAX_EVIDENCE = 10.0
 """Largest difference of log-likelihoods of an image pair, because the matches of a pair with a
 wrong relative pose prefer a wrong focal length. [tuned: benchmarks.distortion --buckets]"""
@@ -129,14 +130,15 @@ def estimate_shared_lens(
 
     Args:
         problem: Mapping problem with verified relative poses.
-        pairs: Image pairs of one camera; the ``MAX_PAIRS`` pairs with most matches are used.
+        pairs: Image pairs of one camera; the ``MAX_PAIRS`` pairs with the largest
+            :func:`_total_displacement` are used.
         refine_distortion: Estimate the distortion if the camera model has distortion.
 
     Returns:
         Maxima of the posteriors of focal length and distortion. A guess whose log-posterior is
         smaller by less than ``MIN_EVIDENCE`` is kept.
     """
-    pairs = sorted(pairs, key=lambda pair: -len(pair.matches))[:MAX_PAIRS]
+    pairs = sorted(pairs, key=lambda pair: -_total_displacement(problem, pair))[:MAX_PAIRS]
     image = problem.images[pairs[0].image_a]
     matches = _collect_matches(problem, pairs)
     log_focals = np.log(sample_focal_lengths(image))
@@ -161,6 +163,17 @@ def estimate_shared_lens(
         retrace=False,
     )
     return LensEstimate(focal_px, _convert_division(division or 0.0, focal_px / matches.radius))
+
+
+def _total_displacement(problem: MappingProblem, pair: VerifiedPair) -> float:
+    """Return the number of matches times the median distance of matched keypoints in pixels.
+
+    Neighboring frames of a video have the most matches, but their motion is too small to constrain
+    the focal length.
+    """
+    xy_a = problem.images[pair.image_a].keypoints[pair.matches[:, 0]]
+    xy_b = problem.images[pair.image_b].keypoints[pair.matches[:, 1]]
+    return len(pair.matches) * float(np.median(np.linalg.norm(xy_b - xy_a, axis=1)))
 
 
 def _convert_division(division: float, focal_ratio: float) -> float:

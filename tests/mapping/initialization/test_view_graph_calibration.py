@@ -11,6 +11,7 @@ import pytest
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.camera_models import CameraModel
 from mpsfm_core.mapping.initialization.view_graph_calibration import (
+    MAX_PAIRS,
     calibrate_view_graph,
     estimate_shared_lens,
 )
@@ -20,11 +21,17 @@ from mpsfm_core.testing.synthetic.scenes import room_scene
 from tests.mapping.focal_scenes import CAMERA, POSES, distort, scale_focal
 
 
-def make_problem(distance_changes: Sequence[float]) -> MappingProblem:
-    """Return images of an orbit around a room, with changes of the distances to the center."""
+def make_problem(distance_changes: Sequence[float], burst_size: int = 0) -> MappingProblem:
+    """Return images of an orbit around a room, with changes of the distances to the center.
+
+    Additional images of a burst are 1 mm apart, close to the first image.
+    """
     poses = [pose.copy() for pose in POSES]
     for pose, change in zip(poses, distance_changes, strict=True):
         pose[2, 3] += change
+    for number in range(1, burst_size + 1):
+        poses.append(poses[0].copy())
+        poses[-1][0, 3] += 1e-3 * number
     noise = SyntheticNoise(keypoints_px=0.5)
     return make_mapping_problem(
         room_scene(), CAMERA, poses, points_per_view=60, map_width=40, noise=noise
@@ -51,6 +58,16 @@ def test_estimate_shared_lens_finds_the_focal_length_of_distorted_images(
     lens = estimate_shared_lens(problem, problem.pairs)
     assert lens.focal_px == pytest.approx(CAMERA.fx, rel=0.04)
     assert lens.k1 == pytest.approx(k1, abs=0.03)
+
+
+def test_estimate_shared_lens_of_a_burst_and_an_orbit_uses_pairs_with_motion() -> None:
+    problem = guess_focal(make_problem([0.0, 0.3, -0.3, 0.4, -0.2], burst_size=9), 1.6)
+    is_burst = [{pair.image_a, pair.image_b} <= {0, *range(5, 14)} for pair in problem.pairs]
+    num_matches = [len(pair.matches) for pair in problem.pairs]
+    most = np.argsort(num_matches)[-MAX_PAIRS:]
+    assert np.array(is_burst)[most].all()
+    lens = estimate_shared_lens(problem, problem.pairs)
+    assert lens == (pytest.approx(CAMERA.fx, rel=0.04), 0.0)
 
 
 def test_estimate_shared_lens_excludes_zoomed_images(room: MappingProblem) -> None:
