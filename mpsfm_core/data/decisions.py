@@ -101,6 +101,17 @@ class ProviderReason(ReasonCode):
     NO_WEIGHTS = ("no-weights", "detail")
 
 
+class HookReason(ReasonCode):
+    """Reasons why a run ignores a plugin's hook or distrusts the hook's return value."""
+
+    LEFT_OUT = ("hook-left-out", "plugin", "hook", "detail")
+    """The hook raises an exception or returns an unusable value, and is not called again."""
+    PAIRS_IGNORED = ("pairs-ignored", "plugin", "hook", "detail")
+    """A pair filter selects pairs that are no candidates, which the run ignores."""
+    NO_PAIRS = ("no-pairs-selected", "plugin", "hook", "detail")
+    """A pair filter selects none of the candidate pairs."""
+
+
 class ChoiceReason(ReasonCode):
     """Reasons why the configuration selects a network for a kind of prior."""
 

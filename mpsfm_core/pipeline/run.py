@@ -743,6 +743,7 @@ class _Run:
             "status": status,
             "warnings": list(stages.warnings),
             "doubts": [doubt.to_json() for doubt in self._doubts],
+            "hooks": [reason.to_json() for reason in self._registry.hook_reasons],
             "stages": {
                 name: {"seconds": record.seconds, "peak_memory_mb": record.peak_memory_mb}
                 for name, record in stages.report().items()

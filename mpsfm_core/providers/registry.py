@@ -19,6 +19,7 @@ from typing import Any
 
 import pluggy
 
+from mpsfm_core.data.decisions import HookReason, Reason
 from mpsfm_core.data.errors import InputError, MpsfmError, ProviderError, did_you_mean
 from mpsfm_core.data.options import Options, SettingPath, parse_settings
 from mpsfm_core.providers import KINDS, Kind, ProviderContext, ProviderSpec, WeightsFile
@@ -55,7 +56,8 @@ _HOOK_VALIDATORS: Mapping[str, Callable[..., Any]] = MappingProxyType(
     {"mpsfm_filter_pairs": validate_filtered_pairs}
 )
 """Functions that validate the return value of a plugin hook, by the name of the hook. A validator
-receives the return value and the arguments of the hook."""
+receives the return value and the arguments of the hook. The validator returns the validated value,
+and a sentence for each :class:`HookReason` to distrust the value."""
 
 Calibration = DepthCalibration | NormalCalibration
 
@@ -114,7 +116,7 @@ class Registry:
         self._entries: list[_Entry] = []
         self._plugins: list[ProviderStatus] = []
         self._manager = create_plugin_manager()
-        self._muted: set[tuple[str, str]] = set()
+        self._hook_reasons: dict[tuple[str, str, HookReason], Reason] = {}
 
     @classmethod
     def discover(
@@ -432,7 +434,7 @@ class Registry:
 
         If a plugin's hook raises an exception or returns an invalid value, a warning is logged and
         this hook of the plugin is not called again. An error in a viewer or logger plugin must not
-        end a run.
+        end a run. :attr:`hook_reasons` lists the hooks that are left out.
 
         Args:
             name: Name of the plugin hook to call.
@@ -443,22 +445,37 @@ class Registry:
         """
         answers = []
         for implementation in reversed(getattr(self.hook, name).get_hookimpls()):
-            if (implementation.plugin_name, name) in self._muted:
+            plugin = implementation.plugin_name
+            if (plugin, name, HookReason.LEFT_OUT) in self._hook_reasons:
                 continue
             given = {key: arguments[key] for key in implementation.argnames}
+            doubts: dict[HookReason, str] = {}
             try:
                 answer = implementation.function(**given)
                 if answer is not None and name in _HOOK_VALIDATORS:
-                    answer = _HOOK_VALIDATORS[name](answer, **arguments)
+                    answer, doubts = _HOOK_VALIDATORS[name](answer, **arguments)
             except Exception as error:
-                self._muted.add((implementation.plugin_name, name))
-                text = f"plugin {implementation.plugin_name!r} failed in {name} and is left out"
-                _log.warning("%s: %s: %s", text, type(error).__name__, error)
-                _log.debug("%s", text, exc_info=True)
-                continue
+                answer = None
+                doubts = {HookReason.LEFT_OUT: f"{type(error).__name__}: {error}"}
+                _log.debug("plugin %r failed in %s", plugin, name, exc_info=True)
+            for code, detail in doubts.items():
+                self._warn_of_hook(code, plugin, name, detail)
             if answer is not None:
                 answers.append(answer)
         return answers
+
+    @property
+    def hook_reasons(self) -> list[Reason]:
+        """Reasons why hooks of plugins were left out or distrusted, each reported once."""
+        return list(self._hook_reasons.values())
+
+    def _warn_of_hook(self, code: HookReason, plugin: str, hook: str, detail: str) -> None:
+        """Log a warning about a plugin's hook and record its reason, unless it is recorded."""
+        if (plugin, hook, code) not in self._hook_reasons:
+            reason = code.because(plugin=plugin, hook=hook, detail=detail)
+            self._hook_reasons[plugin, hook, code] = reason
+            text = "failed in %s and is left out" if code is HookReason.LEFT_OUT else "%s"
+            _log.warning(f"plugin %r {text}: %s", plugin, hook, detail)
 
     def _add_environments(self) -> None:
         remotes = [r for environment in all_environments() for r in remote_providers(environment)]

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Float64, PinholeCamera
+from mpsfm_core.data.decisions import HookReason
 from mpsfm_core.data.errors import DataError, MpsfmError, ProviderOutputError, ProviderRunError
 from mpsfm_core.providers.protocols import ProviderSpec
 
@@ -32,7 +33,7 @@ Checked = TypeVar("Checked", bound="DataclassInstance")
 
 def validate_filtered_pairs(
     answer: object, pairs: Sequence[tuple[str, str]]
-) -> list[tuple[str, str]]:
+) -> tuple[list[tuple[str, str]], dict[HookReason, str]]:
     """Validate the image pairs that a plugin's hook ``mpsfm_filter_pairs`` selects.
 
     Args:
@@ -40,8 +41,8 @@ def validate_filtered_pairs(
         pairs: Candidate pairs of image names that the plugin received.
 
     Returns:
-        Selected pairs of image names as a list. The list may contain pairs that are no candidates,
-        which the caller ignores.
+        Selected pairs of image names, and a sentence for each reason to distrust the selection. The
+        selected pairs may contain pairs that are no candidates, which the caller ignores.
 
     Raises:
         TypeError: The hook's return value is not an iterable of pairs of image names.
@@ -59,12 +60,22 @@ def validate_filtered_pairs(
             raise TypeError(f"the hook must return pairs of image names, got {pair!r}")
         filtered.append((first, second))
     candidates = {frozenset(pair) for pair in pairs}
-    if filtered and not any(frozenset(pair) in candidates for pair in filtered):
-        raise ValueError(
-            f"the hook returns no candidate pair, for example {filtered[0]!r}: image names have "
-            f"their folder and extension, such as {pairs[0] if pairs else ('a.jpg', 'b.jpg')!r}"
-        )
-    return filtered
+    ignored = [pair for pair in filtered if frozenset(pair) not in candidates]
+    example = (
+        f"for example {ignored[0]!r}: image names have their folder and extension, such as "
+        f"{pairs[0] if pairs else ('a.jpg', 'b.jpg')!r}"
+        if ignored
+        else ""
+    )
+    if filtered and len(ignored) == len(filtered):
+        raise ValueError(f"the hook returns no candidate pair, {example}")
+    doubts = {}
+    if ignored:
+        count = f"{len(ignored)} of {len(filtered)} selected pairs are no candidates"
+        doubts[HookReason.PAIRS_IGNORED] = f"{count} and are ignored, {example}"
+    if pairs and not filtered:
+        doubts[HookReason.NO_PAIRS] = f"the hook selects none of {len(pairs)} candidate pairs"
+    return filtered, doubts
 
 
 @contextmanager

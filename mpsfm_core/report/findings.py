@@ -11,6 +11,7 @@ from mpsfm_core.data.decisions import DoubtReason, ImageReason
 from mpsfm_core.report.reasons import (
     explain,
     explain_camera,
+    explain_hook,
     explain_image,
     explain_pair,
     explain_provider,
@@ -53,6 +54,7 @@ def findings(summary: Mapping[str, Any]) -> list[Finding]:
     collected = [
         *_failure(summary),
         *_doubts(summary),
+        *_hooks(summary),
         *_left_out(summary),
         *_missing(summary),
         *_unconfirmed(summary),
@@ -99,6 +101,14 @@ def _failure(summary: Mapping[str, Any]) -> Iterator[Finding]:
         "network (mpsfm config show default lists them), or give --intrinsics. More "
         "photos of the same place help in any case.",
     )
+
+
+def _hooks(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield one finding for each plugin hook that was left out or returned doubtful values."""
+    for stored in summary.get("hooks", ()):
+        explained = explain_hook(stored)
+        title = f"{explained.title[:1].upper()}{explained.title[1:]}"
+        yield Finding("warning", title, explained.text, explained.remedy)
 
 
 def _doubts(summary: Mapping[str, Any]) -> Iterator[Finding]:

@@ -16,6 +16,7 @@ from mpsfm_core.data.decisions import (
     DoubtReason,
     FrameReason,
     GpsReason,
+    HookReason,
     ImageReason,
     KeyframeReason,
     PairReason,
@@ -37,6 +38,7 @@ _CHECK_MATCHES = (
     "Look at its matches below. If they lie on moving or repeated objects, add a photo from "
     "nearby. If they look right, give the true focal length with --intrinsics."
 )
+_CHECK_HOOK = "Test the plugin with mpsfm plugins check {plugin}."
 _NO_REMEDY = ""
 
 
@@ -190,6 +192,21 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
     ProviderReason.UNAVAILABLE: ("provider unavailable", "{detail}", "Run mpsfm doctor."),
     ProviderReason.INCOMPATIBLE: ("provider incompatible", "{detail}", "Run mpsfm doctor."),
     ProviderReason.NO_WEIGHTS: ("weights missing", "{detail}", "Run mpsfm doctor."),
+    HookReason.LEFT_OUT: (
+        "plugin hook left out",
+        "The hook {hook} of the plugin {plugin} fails and is left out: {detail}.",
+        _CHECK_HOOK,
+    ),
+    HookReason.PAIRS_IGNORED: (
+        "selected pairs ignored",
+        "The pair filter of the plugin {plugin}: {detail}.",
+        _CHECK_HOOK,
+    ),
+    HookReason.NO_PAIRS: (
+        "no pairs selected",
+        "The pair filter of the plugin {plugin}: {detail}.",
+        _CHECK_HOOK,
+    ),
     ChoiceReason.CONFIGURED: ("configured", "as configured", _NO_REMEDY),
     ChoiceReason.FIRST_CHOICE: ("first choice", "the first choice", _NO_REMEDY),
     ChoiceReason.FALLBACK: ("fallback", "a fallback", _NO_REMEDY),
@@ -399,6 +416,11 @@ def explain_camera(stored: Mapping[str, Any]) -> Explanation:
 def explain_provider(stored: Mapping[str, Any]) -> Explanation:
     """Explain why a provider was not used, from the reason stored in ``summary.json``."""
     return explain(reason_from_json(ProviderReason, stored))
+
+
+def explain_hook(stored: Mapping[str, Any]) -> Explanation:
+    """Explain why a plugin's hook is doubtful, from the reason stored in ``summary.json``."""
+    return explain(reason_from_json(HookReason, stored))
 
 
 def explain_gps(stored: Mapping[str, Any]) -> Explanation:

@@ -121,6 +121,8 @@ class RunSummary(TypedDict):
     warnings: list[str]
     doubts: list[dict[str, Value]]
     """Reasons (``DoubtReason``) to doubt the output of a provider for all images or pairs."""
+    hooks: list[dict[str, Value]]
+    """Reasons (``HookReason``) why hooks of plugins were left out or their values are doubtful."""
     stages: dict[str, StageSummary]
     providers: list[ProviderSummary]
     config: dict[str, Any]

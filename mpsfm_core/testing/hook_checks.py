@@ -405,7 +405,7 @@ class _CountedHooks(Registry):
 def _filter(case: HookCase, pairs: list[tuple[str, str]]) -> list[tuple[str, str]] | None:
     answer = case.call("mpsfm_filter_pairs", pairs=pairs)
     try:
-        return None if answer is None else validate_filtered_pairs(answer, pairs)
+        return None if answer is None else validate_filtered_pairs(answer, pairs)[0]
     except (TypeError, ValueError) as error:
         raise CheckFailed(f"mpsfm_filter_pairs: {error}") from error
 

@@ -12,6 +12,7 @@ from mpsfm_core.data.decisions import (
     CameraReason,
     DoubtReason,
     GpsReason,
+    HookReason,
     ImageReason,
     PairReason,
     ProviderReason,
@@ -246,6 +247,13 @@ def test_verdict_doubts_wrong_providers() -> None:
     assert judge(report).level == "doubtful" and doubts(report) == [doubt.code]
     (finding,) = findings(report)
     assert "matcher mine" in finding.text and "plugins check mine" in finding.remedy
+
+
+def test_unusable_pair_filter_is_a_finding() -> None:
+    reason = HookReason.LEFT_OUT.because(plugin="mine", hook="mpsfm_filter_pairs", detail="fault")
+    (finding,) = findings(summary(hooks=[reason.to_json()]))
+    assert finding.level == "warning"
+    assert "plugin mine" in finding.text and "plugins check mine" in finding.remedy
 
 
 def test_verdict_doubts_pairs_that_share_no_points() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 from pathlib import Path
 
@@ -381,3 +382,53 @@ def test_python_api_raises_if_reconstruction_fails(
             overrides=[f"depth.options.directory={unrelated}"],
         )
     assert raised.value.summary["status"] == "failed"
+
+
+@pytest.mark.parametrize(
+    ("answer", "code", "detail"),
+    [
+        ("list(range(len(pairs)))", "hook-left-out", "must return pairs of image names, got 0"),
+        (
+            "[(a.split('.')[0], b.split('.')[0]) for a, b in pairs]",
+            "hook-left-out",
+            "no candidate pair, for example ('0', '1')",
+        ),
+        (
+            "[*pairs, ('photos/0.png', '1.png')]",
+            "pairs-ignored",
+            "1 of 11 selected pairs are no candidates",
+        ),
+        ("[]", "no-pairs-selected", "selects none of 10 candidate pairs"),
+    ],
+)
+def test_unusable_pair_filter_is_named_in_the_summary(
+    answer: str, code: str, detail: str, photo_scene, install_plugin, tmp_path: Path
+) -> None:
+    install_plugin(
+        "mpsfm-filter",
+        f"""
+        from mpsfm_core import hookimpl
+
+        @hookimpl
+        def mpsfm_filter_pairs(pairs):
+            return {answer}
+        """,
+    )
+    overrides = ["runtime.on_error=skip", f"runtime.cache_dir={tmp_path / 'cache'}"]
+    overrides += ["dense.enabled=false", "results.report=false"]
+    with contextlib.suppress(ReconstructionError):
+        mpsfm_core.reconstruct(
+            photo_scene.images,
+            tmp_path / "out",
+            photo_scene.config,
+            intrinsics=photo_scene.intrinsics,
+            overrides=overrides,
+        )
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    (reason,) = summary["hooks"]
+    assert reason["code"] == code
+    assert reason["plugin"].startswith("mpsfm-filter")
+    assert reason["hook"] == "mpsfm_filter_pairs" and detail in reason["detail"]
+    assert any("mpsfm-filter" in text and detail in text for text in summary["warnings"])
+    selected_pairs = 0 if code == "no-pairs-selected" else 10
+    assert summary["pairs"]["matched"] == selected_pairs
