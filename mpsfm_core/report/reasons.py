@@ -199,12 +199,12 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
     ),
     HookReason.PAIRS_IGNORED: (
         "selected pairs ignored",
-        "The pair filter of the plugin {plugin}: {detail}.",
+        "The hook {hook} of the plugin {plugin}: {detail}.",
         _CHECK_HOOK,
     ),
     HookReason.NO_PAIRS: (
         "no pairs selected",
-        "The pair filter of the plugin {plugin}: {detail}.",
+        "The hook {hook} of the plugin {plugin}: {detail}.",
         _CHECK_HOOK,
     ),
     ChoiceReason.CONFIGURED: ("configured", "as configured", _NO_REMEDY),

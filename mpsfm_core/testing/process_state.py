@@ -70,6 +70,7 @@ def read_process_settings() -> ProcessSettings:
             "the recursion limit": sys.getrecursionlimit(),
             "the working directory": str(Path.cwd()),
             "the level of the root logger": root.level,
+            "the disabled levels of logging": logging.root.manager.disable,
             "the handlers of the root logger": list(map(id, root.handlers)),
             "the warning filters": [f for f in warnings.filters if _is_blanket(f)],
             "the gradient mode of torch": torch.is_grad_enabled() if is_loaded else True,

@@ -132,7 +132,7 @@ def check_depth_validity(case: ContractCase) -> str:
 def check_depth_flip(case: ContractCase) -> str:
     """Require the mirrored depth for the mirrored view.
 
-    If the ground truth is unknown, the check of mirrored depth applies with a larger tolerance.
+    Without ground truth, a larger difference is accepted.
     """
     prior, mirrored = _run(case), first_depth(case.run(case.example.mirror()))
     if prior.shape != mirrored.shape:
@@ -228,7 +228,7 @@ def check_depth_calibration(case: ContractCase) -> None:
 
 
 def check_depth_range(case: ContractCase) -> str:
-    """Require the usual accuracy for near and distant surfaces, from 0.3 to 75 m.
+    """Require accurate output for near and distant surfaces, from 0.3 to 75 m.
 
     The check ``depth-range`` detects clipped, saturated and quantized depth. Colors of views encode
     depth up to 10 m only, so ``depth-range`` does not apply to ``truth_source="painted"``.
@@ -254,7 +254,7 @@ def check_depth_range(case: ContractCase) -> str:
 
 
 def check_depth_joint(case: ContractCase) -> str:
-    """Require that ``predict_joint`` returns the depth of ``predict`` and true normals."""
+    """Require that ``predict_joint`` returns the depth of ``predict`` and correct normals."""
     if not case.declares("joint-normals"):
         raise CheckSkipped("the provider does not declare 'joint-normals'")
     case.prepare(case.example)

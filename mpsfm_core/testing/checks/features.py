@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,6 +31,12 @@ _MIN_INSIDE_RATIO = 0.8
 of the textured part because detectors respond to its border."""
 _MIN_LARGE_RATIO = 0.1
 """Smallest accepted ratio of keypoints in each textured corner of the large view."""
+_MAX_SCALING_SHIFT_PX = 1.0
+"""Largest accepted shift, to the same side in x and y, of the keypoints of the large view against
+those of a view of a quarter of the size. Integer pixel centers that are scaled from 1024 to 4096
+pixels shift keypoints by 1.5 pixels, but the shift is at most 0.6 pixels for tested detectors."""
+_SCALING_RADIUS_PX = 6.0
+"""Largest distance in pixels of the large view between a keypoint and its repetition."""
 _MIN_COVERING = 40
 """Minimum number of keypoints for which the coverage of a view is checked."""
 _MIN_COVERED_CELLS = 7
@@ -53,11 +60,11 @@ shuffled descriptors."""
 
 
 def check_features_axes(case: ContractCase) -> str:
-    """Require keypoints (x, y) in the textured part of landscape, portrait and odd-sized views.
+    """Require keypoints (x, y) inside the textured part of views of four sizes.
 
-    The textured part is a wide area in the upper right or lower left corner, so that keypoints with
-    swapped x and y are outside. Keypoints of a resized, padded, cropped or rotated image that are
-    not mapped back are outside of the textured part as well.
+    The textured part is a wide rectangle in one corner of a landscape, portrait or odd-sized view.
+    Keypoints with swapped x and y are outside of the rectangle. Keypoints of a resized, padded,
+    cropped or rotated image that are not mapped back to the view are outside as well.
     """
     case.require_truth("image", "prepared")
     width, height = case.example.camera.size
@@ -210,8 +217,10 @@ def check_features_pixel_convention(case: ContractCase) -> str:
 def check_features_large_view(case: ContractCase) -> str:
     """Require keypoints in pixels of a large view, even if the provider reduces the image.
 
-    Only two opposite corners of the view of 4096 x 256 pixels have texture. Keypoints of a reduced
-    image that are not scaled back, or of the first tiles only, miss one of the corners.
+    Only two opposite corners of the view of 4096 x 256 pixels have texture. Both corners contain
+    few keypoints if keypoints of a reduced image are not scaled back. All keypoints are shifted if
+    they are scaled back with integer pixel centers. The shift is measured against the keypoints of
+    a view of a quarter of the size.
     """
     case.require_truth("image")
     import cv2  # The import is local, because pytest loads this module when it collects tests.
@@ -238,6 +247,9 @@ def check_features_large_view(case: ContractCase) -> str:
             f"{ratios[1]:.0%} of the keypoints, the largest are x = {x:.0f}, y = {y:.0f}: scale "
             f"the keypoints of a reduced image back"
         )
+    small = 4 * case.run(case.example).keypoints
+    corner = np.array([width - tile.shape[1], height - tile.shape[0]])
+    _require_no_scaling_shift(keypoints, (small, small + corner))
     return f"{sum(ratios):.0%} of {len(features)} keypoints are on the textured corners"
 
 
@@ -294,6 +306,25 @@ def _require_same_points(case: ContractCase, other: Example) -> str:
     if right.mean() < _MIN_CORRECT_RATIO:
         raise CheckFailed(f"only {right.mean():.0%} of the nearest descriptors are the same point")
     return f"{right.mean():.0%} of the nearest descriptors are the same point"
+
+
+def _require_no_scaling_shift(keypoints: Float64, expected: Sequence[Float64]) -> None:
+    """Require that keypoints are not shifted to one side against expected positions.
+
+    Args:
+        keypoints: (n, 2) keypoints of a large view in pixels.
+        expected: (m, 2) positions of keypoints in each part of the large view, from a small view.
+    """
+    offsets = [_offsets_to_nearest(keypoints, part, _SCALING_RADIUS_PX) for part in expected]
+    if min(map(len, offsets)) < _MIN_COUNT:
+        return
+    shifts = np.array([np.median(part, axis=0) for part in offsets])
+    if max(shifts.min(), -shifts.max()) > _MAX_SCALING_SHIFT_PX:
+        x, y = shifts.mean(axis=0)
+        raise CheckFailed(
+            f"keypoints of a large view are shifted by ({x:+.1f}, {y:+.1f}) px: scale positions "
+            "for which the center of the first pixel is (0.5, 0.5)"
+        )
 
 
 def _blank_outside(view: View, *, upper_right: bool) -> tuple[View, tuple[int, int, int, int]]:

@@ -84,7 +84,7 @@ def check_multiview_one_unit(case: ContractCase) -> str:
 
 
 def check_multiview_poses(case: ContractCase) -> str:
-    """Require predicted ``cam_from_group`` poses of cameras that look along z with y down."""
+    """Require correct poses ``cam_from_group`` in camera frames with x right, y down, z forward."""
     poses, examples = _predict_poses(case)
     worst = 0.0
     for index in range(1, len(examples)):
@@ -125,7 +125,7 @@ def check_multiview_pose_unit(case: ContractCase) -> str:
 def check_multiview_intrinsics(case: ContractCase) -> str:
     """Require predicted intrinsics in pixels of each view.
 
-    The check ``multiview-intrinsics`` detects intrinsics in pixels of the network's input grid or
+    The check ``multiview-intrinsics`` detects intrinsics in pixels of the network's input image or
     of another view.
     """
     if not case.declares("proposes-intrinsics"):
@@ -150,7 +150,7 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
 
 
 def check_multiview_group_sizes(case: ContractCase) -> str:
-    """Require the usual accuracy for groups of 2, 5 and 9 views of different sizes.
+    """Require accurate output for groups of 2, 5 and 9 views of different sizes.
 
     A group in a reconstruction is an image with the images that overlap it.
     """
@@ -189,7 +189,7 @@ def check_multiview_alone(case: ContractCase) -> None:
 
 
 def check_multiview_sizes(case: ContractCase) -> str:
-    """Require the usual accuracy for a group of landscape and portrait views."""
+    """Require accurate output for a group of landscape and portrait views."""
     width, height = case.example.camera.size
     examples = (
         case.example,

@@ -78,8 +78,8 @@ def check_normals_pixel_convention(case: ContractCase) -> str:
 def check_normals_validity(case: ContractCase) -> str:
     """Require that normals are valid at pixels with a surface and invalid at pixels of the sky.
 
-    The check of the validity needs ``truth_source="prepared"``, because views whose colors encode
-    normals have a normal at every pixel.
+    The check requires ``truth_source="prepared"``, because painted views encode a normal at every
+    pixel.
     """
     case.require_truth("prepared")
     prior = _run(case)
@@ -89,7 +89,7 @@ def check_normals_validity(case: ContractCase) -> str:
 def check_normals_flip(case: ContractCase) -> str:
     """Require mirrored normals with negated x for the mirrored view.
 
-    If the ground truth is unknown, the check of mirrored normals applies with a larger tolerance.
+    Without ground truth, a larger difference is accepted.
     """
     prior, mirrored = _run(case), case.run(case.example.mirror())
     if prior.shape != mirrored.shape:

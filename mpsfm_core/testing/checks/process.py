@@ -67,9 +67,9 @@ def check_second_process(case: ContractCase) -> str:
 def check_global_state(case: ContractCase) -> None:
     """Require that a provider does not change the global state of the process.
 
-    The global state includes the random numbers of Python, numpy and torch, environment variables,
-    the working directory, threads, warning filters and error handling of numpy. Other providers in
-    the process depend on the global state.
+    Other providers in the process use the same global state. The global state includes the random
+    numbers of Python, numpy and torch, environment variables, the working directory, threads,
+    logging, warning filters and error handling of numpy.
     """
     case.run(case.example)  # imports the provider's libraries
     imported = case.process_before.changes(read_process_settings())

@@ -34,12 +34,16 @@ def check_wrapper_keeps_variance(case: ContractCase) -> None:
 
 
 def check_wrapper_without_variance(case: ContractCase) -> None:
-    """Require valid output of the wrapper if the wrapped provider returns no variance."""
-    case.run(case.example, case.create_provider(variance=False))
+    """Require valid output of the wrapper if the wrapped provider returns no variance.
+
+    Pixels where the wrapped provider has no value have to be invalid.
+    """
+    answer = case.run(case.example, case.create_provider(variance=False))
+    _require_same_holes(_run_inner(case), answer)
 
 
 def check_wrapper_keeps_unit(case: ContractCase) -> None:
-    """Require that the wrapper keeps the flag ``metric`` of the wrapped provider's depth."""
+    """Require the same flag ``metric`` in the depth of the wrapper and of the wrapped provider."""
     if case.kind != "depth":
         raise CheckSkipped("the check applies to depth only")
     for metric in (True, False):
@@ -69,9 +73,9 @@ def check_wrapper_uses_the_provider(case: ContractCase) -> str:
 
 
 def check_wrapper_hands_on_depth(case: ContractCase) -> None:
-    """Require that a wrapper of normals passes on the depth prior.
+    """Require that a wrapper passes its depth prior to the wrapped normals provider.
 
-    The wrapped normals provider may need the depth prior, which it declares with ``needs-depth``.
+    A normals provider that declares ``needs-depth`` requires the depth prior.
     """
     if case.kind != "normals":
         raise CheckSkipped("the check applies to normals only")
@@ -104,21 +108,18 @@ def check_wrapper_variance(case: ContractCase) -> str:
 
 
 def check_wrapper_low_resolution(case: ContractCase) -> str:
-    """Require the usual accuracy if the wrapped provider returns maps of half the size."""
+    """Require accurate output if the wrapped provider returns maps of half the size."""
     return compare_with_truth(
         case, case.example, case.run(case.example, case.create_provider(reduction=2))
     )
 
 
 def check_wrapper_validity(case: ContractCase) -> str:
-    """Require that a wrapper returns invalid pixels where the wrapped provider has no value."""
+    """Require invalid pixels in the wrapper's map where the wrapped provider has no value."""
     inner, answer = _run_inner(case), case.run(case.example)
     if answer.shape != inner.shape:
         raise CheckSkipped("the map of the wrapper has another size")
-    wrong = float(answer.valid[~inner.valid].mean())
-    if wrong > _MAX_FILLED_RATIO:
-        raise CheckFailed(f"{wrong:.0%} of the invalid pixels of the wrapped provider are valid")
-    return f"{wrong:.1%} of the invalid pixels are valid"
+    return _require_same_holes(inner, answer)
 
 
 def check_wrapper_inputs(case: ContractCase) -> None:
@@ -145,6 +146,16 @@ CHECKS = (
     check_wrapper_validity,
     check_wrapper_inputs,
 )
+
+
+def _require_same_holes(inner: Any, answer: Any) -> str:
+    """Require that pixels without a value in the wrapped provider's map stay invalid."""
+    if answer.shape != inner.shape:
+        return ""
+    wrong = float(answer.valid[~inner.valid].mean())
+    if wrong > _MAX_FILLED_RATIO:
+        raise CheckFailed(f"{wrong:.0%} of the invalid pixels of the wrapped provider are valid")
+    return f"{wrong:.1%} of the invalid pixels are valid"
 
 
 def _run_inner(case: ContractCase) -> Any:
