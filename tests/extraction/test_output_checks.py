@@ -71,15 +71,20 @@ def test_find_meaningless_scores_of_inverted_scores_names_matcher() -> None:
     assert "mpsfm plugins check my-matcher" in explained.remedy
 
 
+def test_find_meaningless_scores_pools_the_few_outliers_of_good_pairs() -> None:
+    pairs = [(scores[:92], inlier[:92]) for scores, inlier in scored_pairs(-0.2, count=6)]
+    assert find_meaningless_scores(pairs, "my-matcher") is not None
+
+
 @pytest.mark.parametrize(
     "pairs",
     [
         scored_pairs(0.1),
-        scored_pairs(-0.2, count=2),
+        scored_pairs(-0.2, count=1),
         [(np.ones_like(scores), inlier) for scores, inlier in scored_pairs(0.0)],
-        [(scores[:100], inlier[:100]) for scores, inlier in scored_pairs(-0.2)],
+        [(scores[:90], inlier[:90]) for scores, inlier in scored_pairs(-0.2)],
     ],
-    ids=["good", "two pairs", "constant", "few outliers"],
+    ids=["good", "one pair", "constant", "few outliers"],
 )
 def test_find_meaningless_scores_of_usual_scores_is_silent(pairs: list) -> None:
     assert find_meaningless_scores(pairs, "nearest") is None
