@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 _CHECKING = "MPSFM_CHECKING"
 """Environment variable that marks the subprocess of ``mpsfm plugins check``."""
+_AFTER_CRASH = "after-crash"
+"""Value of the environment variable in a subprocess that leaves out the plugins that crash."""
 
 app = typer.Typer(no_args_is_help=True, help="Installed plugins and their providers.")
 
@@ -86,7 +89,10 @@ def check(
     )
     from mpsfm_core.testing.hook_checks import HOOK_CHECKS, has_hooks, run_hook_checks
 
-    registry = Registry.discover(without=probe_plugins().crashing)
+    # Importing libraries creates many objects, which garbage collection would visit many times.
+    gc.set_threshold(100_000, 20, 100)
+    is_after_crash = os.environ[_CHECKING] == _AFTER_CRASH
+    registry = Registry.discover(without=probe_plugins().crashing if is_after_crash else set())
     plugin = find_plugin(registry, name)
     has_providers = plugin is None or not plugin.available
     check_ids = None if only is None else parse_check_ids(only, HOOK_CHECKS)
@@ -157,13 +163,40 @@ def new(
 
 
 def _check_in_subprocess(name: str, arguments: list[str]) -> int:
-    """Run the contract checks in a subprocess, which may crash; return its exit code."""
-    command = [sys.executable, "-m", "mpsfm_core"]
-    environment = {**subprocess_environment(), _CHECKING: "1"}
+    """Run the contract checks in a subprocess, which may crash; return its exit code.
+
+    If the subprocess crashes before it lists a check, a plugin may have crashed it. A second
+    subprocess then leaves out the plugins that crash.
+    """
+    code, errors, has_output = _run_checking(arguments, "1")
+    if code < 0 and not has_output:
+        code, errors, _ = _run_checking(arguments, _AFTER_CRASH)
+    typer.echo(errors, nl=False, err=True)
+    if code >= 0:
+        return code
+    from mpsfm_core.data.errors import ProviderError
+
+    signal_name = signal.Signals(-code).name
+    raise ProviderError(
+        f"{name}: the check after the last listed check crashed the process ({signal_name})"
+    )
+
+
+def _run_checking(arguments: list[str], mark: str) -> tuple[int, str, bool]:
+    """Run ``mpsfm plugins check`` in a subprocess and print its output line by line.
+
+    Args:
+        arguments: Arguments of ``mpsfm plugins check``.
+        mark: Value of the environment variable that marks the subprocess.
+
+    Returns:
+        Exit code, text on standard error, and whether the subprocess printed a line.
+    """
+    has_output = False
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
-            [*command, "plugins", "check", *arguments],
-            env=environment,
+            [sys.executable, "-m", "mpsfm_core", "plugins", "check", *arguments],
+            env={**subprocess_environment(), _CHECKING: mark},
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
@@ -171,17 +204,10 @@ def _check_in_subprocess(name: str, arguments: list[str]) -> int:
         assert process.stdout is not None
         with process:
             for line in process.stdout:
+                has_output = True
                 typer.echo(line, nl=False)
         errors.seek(0)
-        typer.echo(errors.read(), nl=False, err=True)
-    if process.returncode >= 0:
-        return process.returncode
-    from mpsfm_core.data.errors import ProviderError
-
-    signal_name = signal.Signals(-process.returncode).name
-    raise ProviderError(
-        f"{name}: the check after the last listed check crashed the process ({signal_name})"
-    )
+        return process.returncode, errors.read(), has_output
 
 
 def _print_result(result: CheckResult) -> None:

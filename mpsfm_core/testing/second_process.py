@@ -131,7 +131,9 @@ def _stop(process: subprocess.Popen[str], errors: IO[str]) -> None:
 
 
 _SCRIPT = """
-import importlib, json, os, pathlib, pickle, sys, time
+import gc, importlib, json, os, pathlib, pickle, sys, time
+# Importing libraries creates many objects, which garbage collection would visit again and again.
+gc.set_threshold(100_000, 20, 100)
 # A provider may print, so the messages to the first process have a file of their own.
 messages = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)
