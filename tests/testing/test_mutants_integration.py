@@ -436,6 +436,15 @@ class FilledHoles(Wrapper):
         return DepthPrior.from_arrays(filled, (0.05 * filled) ** 2, metric=prior.metric)
 
 
+class FillsHolesWithoutVariance(Wrapper):
+    """Fault: rebuilds the depth prior with small positive depth at invalid pixels."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        prior = super().predict(view, depth)
+        filled = np.maximum(prior.depth, np.float32(1e-3))
+        return DepthPrior.from_arrays(filled, prior.variance, metric=prior.metric)
+
+
 class CenteredMirror(Wrapper):
     """Fault: mirrors the image, but not the principal point."""
 
@@ -462,6 +471,7 @@ class DepthNotMirrored(Wrapper):
         (MeanVariance, "wrapper-variance", "belongs to other pixels or is averaged", "depth"),
         (SizeOfView, "wrapper-low-resolution", "broadcast", "depth"),
         (FilledHoles, "wrapper-validity", "invalid pixels .* are valid", "depth"),
+        (FillsHolesWithoutVariance, "wrapper-without-variance", "pixels .* are valid", "depth"),
         (CenteredMirror, "wrapper-inputs", "the camera of 'mirrored/", "depth"),
         (DepthNotMirrored, "wrapper-inputs", "the depth of another view", "normals"),
     ],

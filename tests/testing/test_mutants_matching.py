@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+import logging
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -349,9 +350,38 @@ class NotScaledBack(Sift):
         return replace(features, keypoints=factor * features.keypoints)
 
 
+class ScaledFromPixelCenters(Sift):
+    """Fault: scales keypoints of a reduced image back as if pixel centers were integers."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(SiftOptions(resize=1024), context)
+
+    def extract(self, view: View) -> Features:
+        features = super().extract(view)
+        shift = 0.5 * (1 - max(1.0, max(view.camera.size) / 1024))
+        return replace(features, keypoints=np.maximum(features.keypoints + shift, 0))
+
+
+class DisablesLogging(Detector):
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(options, context)
+        logging.disable(logging.WARNING)
+
+
+@pytest.fixture
+def enable_logging() -> Iterator[None]:
+    yield
+    logging.disable(logging.NOTSET)
+
+
+@pytest.mark.usefixtures("enable_logging")
 @pytest.mark.parametrize(
     ("factory", "check", "message"),
-    [(NotScaledBack, "features-large-view", "of a reduced image back")],
+    [
+        (NotScaledBack, "features-large-view", "of a reduced image back"),
+        (ScaledFromPixelCenters, "features-large-view", r"shifted by \(-1.5, -1.5\) px"),
+        (DisablesLogging, "global-state", "the disabled levels of logging"),
+    ],
 )
 def test_features_of_large_views(
     caught: Callable[..., None], factory: type, check: str, message: str
@@ -359,17 +389,19 @@ def test_features_of_large_views(
     caught("features", factory, check, message)
 
 
-class LimitedMatcher(MutualNearest):
+class GivenFeatures(MutualNearest):
     def __init__(self, options: Any, context: ProviderContext) -> None:
         super().__init__(MutualNearestOptions(), context)
 
+
+class LimitedMatcher(GivenFeatures):
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
         if max(len(fa), len(fb)) > 2048:
             raise ValueError("index 2048 is out of bounds")
         return super().match(a, b, fa, fb)
 
 
-class UnlocksDescriptors(LimitedMatcher):
+class UnlocksDescriptors(GivenFeatures):
     """Fault: makes the descriptors of the given features writable, and normalizes them in place."""
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
@@ -379,9 +411,48 @@ class UnlocksDescriptors(LimitedMatcher):
         return super().match(a, b, fa, fb)
 
 
+class IndexesBestFeatures(GivenFeatures):
+    """Fault: returns indices into the 1024 features with the best scores."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        return super().match(a, b, _select_best(fa), _select_best(fb))
+
+
+def _select_best(features: Features) -> Features:
+    if len(features) <= 1024 or features.scores is None:
+        return features
+    rows = np.argsort(-features.scores)[:1024]
+    return Features(features.keypoints[rows], features.descriptors[rows])
+
+
+class ReversesScores(GivenFeatures):
+    """Fault: reverses the scores if the names of the views are not in alphabetical order."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        found = super().match(a, b, fa, fb)
+        assert found.sparse is not None
+        scores = found.sparse.scores[::-1] if a.name > b.name else found.sparse.scores
+        return PairMatches(sparse=SparseMatches(found.sparse.indices, scores.copy()))
+
+
+class DropsRightSide(GivenFeatures):
+    """Fault: normalizes x by the height, and drops matches outside of the unit square."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        found = super().match(a, b, fa, fb)
+        assert found.sparse is not None
+        inside = fa.keypoints[found.sparse.indices[:, 0], 0] < a.camera.height
+        return PairMatches(
+            sparse=SparseMatches(found.sparse.indices[inside], found.sparse.scores[inside])
+        )
+
+
 @pytest.mark.parametrize(
     ("factory", "check", "message"),
     [
+        (IndexesBestFeatures, "matcher-many-features", "matches of many features are correct"),
+        (ReversesScores, "name-does-not-matter", "of a renamed view differs"),
+        (DropsRightSide, "matcher-coverage", "in the outer quarter of one side"),
         (LimitedMatcher, "matcher-many-features", "out of bounds"),
         (UnlocksDescriptors, "inputs-unchanged", "descriptors differs"),
     ],

@@ -79,6 +79,7 @@ def check_wrapper_hands_on_depth(case: ContractCase) -> None:
     """
     if case.kind != "normals":
         raise CheckSkipped("the check applies to normals only")
+    case.received_depth().clear()
     case.run(case.example, case.create_provider())
     given = case.received_depth()
     if not (given and all(given)):
