@@ -52,6 +52,17 @@ def test_parts_are_joined_as_accurately_as_in_one_piece(
     assert lengths.min() >= 2
 
 
+def test_focal_length_is_refined_over_all_parts(hall: HallProblem) -> None:
+    camera = hall.problem.images[0].camera
+    guess = replace(camera, fx=1.08 * camera.fx, fy=1.08 * camera.fy)
+    images = tuple(replace(i, camera=guess, focal_known=False) for i in hall.problem.images)
+    problem = replace(hall.problem, images=images)
+    whole, parts = (reconstruct(problem, o) for o in (MapperOptions(), OPTIONS))
+    (focal_px,) = {image.camera.fx for image in parts.reconstructions[0].images}
+    assert focal_px == pytest.approx(whole.reconstructions[0].images[0].camera.fx, rel=1e-3)
+    assert measure_auc(parts, hall)[1] > measure_auc(whole, hall)[1] - 0.003
+
+
 def test_result_does_not_depend_on_the_order_in_which_parts_are_mapped(
     hall: HallProblem, in_parts: MappingResult
 ) -> None:
