@@ -59,6 +59,9 @@ _MATCH_STD_PX = 0.5
 """Assumed std of a stereo match in pixels, for the tolerance of the consistency check [ours]."""
 _MAX_COST = 0.9
 """Maximum matching cost of a pixel with valid stereo depth [ours]."""
+_MIN_COST_GAIN = 0.1
+"""Minimum cost gain of a pixel whose depth is known, see :class:`StereoDepth`
+[tuned: benchmarks.street]."""
 _MAX_SPLAT_STDS = 1.5
 """Maximum log depth difference between projected neighbor depth and input depth, in stds [ours].
 
@@ -208,8 +211,10 @@ class _DensifySteps:
             if self._checkpoints:
                 self._checkpoints.save(name, stereo)
         supported = view.usable & (stereo.cost < _MAX_COST)
+        explained = stereo.cost_gain > _MIN_COST_GAIN
         store = self._store_array
-        return _MatchedImage(view.grid, store(stereo.log_depth), stereo.parallax, store(supported))
+        maps = store(stereo.log_depth), stereo.parallax, store(supported), store(explained)
+        return _MatchedImage(view.grid, *maps)
 
     def check_image(self, row: int) -> tuple[GeometricConsistency, ScaleConstraints | None]:
         """Check stereo depth against neighboring views, and measure constraints of the scale."""
@@ -236,7 +241,12 @@ class _DensifySteps:
         return _store_consistency(consistency, self._store_array), constraints
 
     def fuse_image(self, row: int) -> tuple[RegisteredImage, Bool]:
-        """Fuse stereo depth with input depth, and return the mask of pixels with stereo depth."""
+        """Fuse stereo depth with input depth, and return the mask of pixels with stereo depth.
+
+        If nothing in the source views matches a pixel near its depth, the pixel shows sky or a
+        moving object, or is next to a depth edge or occluded. The std of its depth is then unknown,
+        and the pixel contributes to no cloud or mesh.
+        """
         view = self._views[row]
         known = LogDepthMap(view.log_depth, view.log_std)
         stereo = _merge_stereo_depth(
@@ -244,6 +254,7 @@ class _DensifySteps:
         )
         measured = fuse_known_depth(stereo, known)
         posterior = compute_depth_posterior(known, measured, self._options.correlation_px)
+        posterior = posterior.with_min_std(~self.matched[row].explained, UNKNOWN_LOG_STD)
         scale_std = self.scale_stds.get(row, 0.0)
         image = _replace_depth(self._images[row], view, posterior, scale_std, self._store_array)
         return image, self._store_array(measured.known)
@@ -283,6 +294,8 @@ class _MatchedImage(NamedTuple):
     """:attr:`StereoDepth.parallax`."""
     supported: Bool
     """(h, w) bool, True at pixels with low matching cost that the user does not mask."""
+    explained: Bool
+    """(h, w) bool, True at pixels that match better at their depth than at infinite depth."""
 
     def log_std(self, std_px: float | Float32) -> Float32:
         """Convert the std of a match in pixels to the std of log depth (h, w)."""

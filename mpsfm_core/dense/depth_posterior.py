@@ -51,6 +51,11 @@ class LogDepthMap(NamedTuple):
         """(h, w) mask of pixels with depth, whose std is finite."""
         return np.isfinite(self.log_std)
 
+    def with_min_std(self, mask: Bool, log_std: float) -> LogDepthMap:
+        """Raise the std of log depth at the pixels of a mask (h, w) to a minimum."""
+        raised = np.maximum(self.log_std, np.float32(log_std))
+        return LogDepthMap(self.log_depth, np.where(mask, raised, self.log_std))
+
 
 def fuse_known_depth(measured: LogDepthMap, known: LogDepthMap) -> LogDepthMap:
     """Fuse stereo depth with input depth at the same pixels.

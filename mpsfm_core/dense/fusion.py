@@ -73,8 +73,8 @@ def fuse_depth_maps(
 ) -> FusedPointCloud:
     """Fuse depth maps into one point cloud; the point with the lowest std replaces duplicates.
 
-    The point cloud omits pixels with large depth std, inconsistent pixels, held-out images and
-    images without confirmed pose.
+    The point cloud omits pixels with large depth std, such as sky, inconsistent pixels, held-out
+    images and images without confirmed pose.
 
     Args:
         reconstruction: Posed images with depth maps.

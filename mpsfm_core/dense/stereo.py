@@ -52,6 +52,13 @@ _FINE_LABELS = 5
 _UNSEEN_COST = 0.6
 """Matching cost of a depth that projects outside all source views, similar to a wrong match
 [ours]."""
+_UNRELATED_COST = 0.8
+"""Matching cost of windows of different surfaces, the median on textured surfaces
+[tuned: benchmarks.street]."""
+_INFINITE_DEPTH_RATIO = 1e4
+"""Ratio of a depth that counts as infinite to the largest input depth."""
+_GAIN_RADIUS = 7
+"""Radius in pixels of the window in which the cost gain is averaged [tuned: benchmarks.street]."""
 _GRAY_EDGE = 10 / 255
 """Difference of gray values that halves the penalty P2 of a depth step [ours]."""
 _MAX_PRIOR = 9.0
@@ -70,6 +77,9 @@ class StereoDepth:
     """(h, w) natural log of the stereo depth in world units."""
     cost: Float32
     """(h, w) matching cost: mean of ``1 - NCC`` over the best views, in [0, 1]."""
+    cost_gain: Float32
+    """(h, w) cost of unrelated windows or of infinite depth, whichever is lower, minus the cost of
+    the stereo depth, averaged over a window. Sky and pixels without a match have a low gain."""
     parallax: Float32
     """(8, 8) motion in pixels of a point's projection in the source views per unit of log depth."""
 
@@ -91,7 +101,16 @@ def match_stereo_depth(view: DenseView, sources: Sequence[DenseView]) -> StereoD
             log_depth = resize_map(cv2.medianBlur(log_depth, 3), *level_view.camera.size)
             offsets = (np.arange(-_FINE_LABELS, _FINE_LABELS + 1) * step).astype(np.float64)
         log_depth, cost = _sweep(level_view, level_sources, log_depth, offsets)
-    return StereoDepth(log_depth, cost, parallax)
+    return StereoDepth(log_depth, cost, _measure_cost_gain(view, sources, cost), parallax)
+
+
+def _measure_cost_gain(view: DenseView, sources: Sequence[DenseView], cost: Float32) -> Float32:
+    """Compute how much better stereo depth matches than infinite depth and unrelated windows."""
+    infinite = np.full_like(cost, _INFINITE_DEPTH_RATIO * np.exp(view.log_depth.max()))
+    infinite_cost = _match_costs(view, sources, infinite, np.zeros(1), _UNRELATED_COST)[..., 0]
+    gain = np.minimum(infinite_cost, np.float32(_UNRELATED_COST)) - cost
+    window = 2 * _GAIN_RADIUS + 1
+    return np.asarray(cv2.blur(gain, (window, window)), np.float32)
 
 
 def _sweep(
@@ -112,6 +131,32 @@ def _sweep(
         Natural log of depth, and matching cost, both (h, w).
     """
     base = np.where(view.usable, np.exp(surface), np.float32(0))
+    merged = _match_costs(view, sources, base, offsets, _UNSEEN_COST)
+    change = (surface - view.log_depth)[..., None] + offsets.astype(np.float32)
+    deviation = change / view.log_std[..., None]
+    unary = merged + np.float32(_PRIOR_WEIGHT) * np.minimum(deviation**2, _MAX_PRIOR)
+    reach = _search_range(view)[..., None] + (offsets[1] - offsets[0])
+    unary[np.abs(change) > reach] = _OUT_OF_RANGE_COST
+    total = np.zeros_like(merged)
+    penalties = _SMALL_STEP_PENALTY, _LARGE_STEP_PENALTY
+    aggregate_costs(unary.astype(np.float32), view.gray, *penalties, _GRAY_EDGE, total)
+    offset, cost = np.empty_like(base), np.empty_like(base)
+    select_labels(total, merged, offsets, offset, cost)
+    return surface + offset, cost
+
+
+def _match_costs(
+    view: DenseView,
+    sources: Sequence[DenseView],
+    base: Float32,
+    offsets: Float64,
+    unseen_cost: float,
+) -> Float32:
+    """Compute the matching costs (h, w, k) of k log depth offsets from a depth map (h, w).
+
+    The costs are averaged over the best source views; pixels outside all source views have the cost
+    ``unseen_cost``.
+    """
     costs = np.empty((len(sources), len(offsets), *base.shape), np.uint8)
     noise_variance = (_GRAY_NOISE / 255) ** 2
     for source, source_costs in zip(sources, costs, strict=True):
@@ -126,18 +171,8 @@ def _sweep(
             source_costs,
         )
     merged = np.empty((*base.shape, len(offsets)), np.float32)
-    merge_view_costs(costs, _MERGED_VIEW_RATIO, _UNSEEN_COST, merged)
-    change = (surface - view.log_depth)[..., None] + offsets.astype(np.float32)
-    deviation = change / view.log_std[..., None]
-    unary = merged + np.float32(_PRIOR_WEIGHT) * np.minimum(deviation**2, _MAX_PRIOR)
-    reach = _search_range(view)[..., None] + (offsets[1] - offsets[0])
-    unary[np.abs(change) > reach] = _OUT_OF_RANGE_COST
-    total = np.zeros_like(merged)
-    penalties = _SMALL_STEP_PENALTY, _LARGE_STEP_PENALTY
-    aggregate_costs(unary.astype(np.float32), view.gray, *penalties, _GRAY_EDGE, total)
-    offset, cost = np.empty_like(base), np.empty_like(base)
-    select_labels(total, merged, offsets, offset, cost)
-    return surface + offset, cost
+    merge_view_costs(costs, _MERGED_VIEW_RATIO, unseen_cost, merged)
+    return merged
 
 
 def _search_range(view: DenseView) -> Float32:

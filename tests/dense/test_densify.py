@@ -14,9 +14,11 @@ from mpsfm_core.data import DepthPrior, View
 from mpsfm_core.data.errors import OutputError
 from mpsfm_core.dense.dense_view import DenseView
 from mpsfm_core.dense.densify import densify
+from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.dense.stereo import StereoDepth
 from mpsfm_core.extraction.cache import Cache
+from mpsfm_core.geometry import project, transform
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints
 from mpsfm_core.support.disk_arrays import DiskArrays
 
@@ -112,6 +114,27 @@ def test_densify_unrelated_images_measure_nothing(room) -> None:
     for image, before in zip(dense.images, room.reconstruction.images, strict=True):
         assert report.confirmed[image.name] == 0 and not report.measured[image.name].any()
         np.testing.assert_allclose(image.depth.depth, before.depth.depth, rtol=1e-5)
+
+
+def test_densify_pixels_without_match_have_unknown_std(room) -> None:
+    noise = np.random.default_rng(0).integers(0, 256, (60, 60, 3), np.uint8)
+
+    def covered(index: int, image: np.ndarray) -> np.ndarray:
+        image = image.copy()
+        if index == 0:
+            image[40:100, 50:110] = noise
+        return image
+
+    dense, _ = densify(room.reconstruction, changed(room, covered), OPTIONS)
+    image = dense.images[0]
+    depth = image.depth
+    log_std = np.sqrt(depth.variance) / depth.depth
+    assert np.median(log_std[50:90, 60:100]) > 0.99
+    assert np.median(log_std[:, :40]) < 0.1
+    points = fuse_depth_maps(replace(dense, images=dense.images[:1]), room.views.__getitem__).points
+    xy = project(image.camera, transform(image.rotation, image.translation, points))
+    in_noise = (np.abs(xy - (80, 70)) < 20).all(axis=1)
+    assert len(points) > 5000 and in_noise.mean() < 0.02
 
 
 def test_densify_is_invariant_to_exposure(room) -> None:
