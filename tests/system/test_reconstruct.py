@@ -220,11 +220,11 @@ def test_runtime_seed_is_passed_to_mapper(
     monkeypatch.setenv("MPSFM_CACHE", str(cache))
     seeds = []
 
-    def observed(problem, options, events, checkpoints):
+    def observed(problem, options, events, checkpoints, map_parts):
         seeds.append(options.seed)
         return MappingResult((), MappingReport())
 
-    monkeypatch.setattr("mpsfm_core.pipeline.run.mapper.reconstruct", observed)
+    monkeypatch.setattr("mpsfm_core.pipeline.run.part_mapping.reconstruct", observed)
     with pytest.raises(ReconstructionError):
         mpsfm_core.reconstruct(
             photo_scene.images, config=photo_scene.config, overrides=["runtime.seed=11"]
