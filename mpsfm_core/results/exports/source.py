@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import DepthPrior, Float64, NormalPrior, PinholeCamera, UInt8
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.data.result_layout import DENSE, DEPTH, SUMMARY
+from mpsfm_core.data.result_layout import DENSE, DEPTH, SUMMARY, TRAJECTORY
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.inputs.image_search import find_images
 from mpsfm_core.inputs.images import ImageSet, load_images
@@ -206,6 +207,22 @@ class ExportSource:
         points, colors = read_ply(path)
         moved: Float64 = self.world_from_model * points
         return moved, colors
+
+    def trajectory(self) -> tuple[Float64, Float64, Float64] | None:
+        """Read the poses of the frames of a video, None if the folder has no trajectory.
+
+        Returns:
+            Time stamps (n,) in seconds, camera centers (n, 3) in the exported world, and rotations
+            (n, 3, 3) ``world_from_cam``.
+        """
+        path = self.folder / TRAJECTORY
+        if not path.is_file():
+            return None
+        table = np.loadtxt(path, ndmin=2).reshape(-1, 8)
+        centers: Float64 = self.world_from_model * table[:, 1:4]
+        turn = self.world_from_model.rotation.matrix()
+        rotations = turn @ Rotation.from_quat(table[:, 4:]).as_matrix()
+        return table[:, 0], centers, rotations
 
     def maps(self, name: str) -> ExportMaps | None:
         """Read depth and normals of an image, None if the folder has no depth map.

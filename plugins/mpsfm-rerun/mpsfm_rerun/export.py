@@ -17,7 +17,7 @@ from mpsfm_rerun.viewer import RerunViewer
 
 
 def write(source: ExportSource, folder: Path) -> None:
-    """Write the recording ``scene.rrd``, with images and depth maps if they are available."""
+    """Write the recording ``scene.rrd``, with images, depth maps and video if available."""
     scene, _ = scene_from_model(source.model)
     images = tuple(_with_depth(source, image) for image in scene.images)
     if source.summary or source.photos is None:
@@ -26,6 +26,9 @@ def write(source: ExportSource, folder: Path) -> None:
         pictures = pictures_from_photos(source.photos)
     viewer = RerunViewer(folder, pictures, z_is_up=source.z_is_up)
     viewer.show(SceneState(images, scene.points), ColoredPoints(*source.dense_points()))
+    trajectory = source.trajectory()
+    if trajectory is not None and images:
+        viewer.show_trajectory(*trajectory, images[0].camera)
     viewer.finish()
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import rerun
 
 from mpsfm_core import hookimpl
-from mpsfm_core.data import DepthPrior, PosedImage, SceneState
+from mpsfm_core.data import DepthPrior, Float64, PinholeCamera, PosedImage, SceneState
 from mpsfm_core.report.viewing import (
     ColoredPoints,
     Pictures,
@@ -19,13 +19,16 @@ from mpsfm_core.report.viewing import (
 
 RECORDING = "scene.rrd"
 TIMELINE = "step"
+VIDEO_TIMELINE = "time"
+VIDEO_CAMERA = "world/video_camera"
 _DEPTH = "world/depth"
 
 
 class RerunViewer:
     """Viewer that writes the recording ``OUTPUT/scene.rrd``.
 
-    Each recorded scene is a step of rerun's timeline ``step``. If ``z_is_up`` is True, the z axis
+    Each recorded scene is a step of rerun's timeline ``step``; the camera of a video moves along
+    the timeline ``time``. If ``z_is_up`` is True, the z axis
     of the recorded world points up. If ``z_is_up`` is False, the y axis of the recorded world
     points down, as in the camera frame.
     """
@@ -73,6 +76,31 @@ class RerunViewer:
         if cloud is not None:
             self._recording.log("world/dense", rerun.Points3D(cloud.xyz, colors=cloud.rgb))
         self._shown = names
+
+    def show_trajectory(
+        self, times: Float64, centers: Float64, rotations: Float64, camera: PinholeCamera
+    ) -> None:
+        """Record the path of a video, and its camera at each time of rerun's timeline ``time``.
+
+        Args:
+            times: (n,) time stamps in seconds.
+            centers: (n, 3) camera centers in the world.
+            rotations: (n, 3, 3) rotations ``world_from_cam``.
+            camera: Camera of the video.
+        """
+        path = rerun.LineStrips3D([centers])
+        self._recording.log("world/trajectory", path, static=True)
+        pinhole = rerun.Pinhole(
+            image_from_camera=camera.matrix,
+            resolution=camera.size,
+            camera_xyz=rerun.ViewCoordinates.RDF,
+        )
+        self._recording.log(VIDEO_CAMERA, pinhole, static=True)
+        self._recording.send_columns(
+            VIDEO_CAMERA,
+            indexes=[rerun.TimeColumn(VIDEO_TIMELINE, duration=times)],
+            columns=rerun.Transform3D.columns(translation=centers, mat3x3=rotations),
+        )
 
     def finish(self) -> str:
         """Close the file."""

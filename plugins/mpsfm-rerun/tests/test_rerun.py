@@ -142,6 +142,10 @@ def test_exported_model_has_images_and_depth_maps(tmp_path: Path) -> None:
         valid=np.arange(48).reshape(6, 8) != 47,
         camera=[9.0, 9.0, 4.0, 3.0],
     )
+    half = np.sqrt(0.5)
+    (tmp_path / "trajectory.txt").write_text(
+        f"# timestamp tx ty tz qx qy qz qw\n0.5 0 0 0 0 0 0 1\n1.0 1 2 3 0 0 {half} {half}\n"
+    )
     described = export(tmp_path, "rerun")
     assert described["orientation"].startswith("z is up")
     recording = tmp_path / "exports" / "rerun" / RECORDING
@@ -152,6 +156,22 @@ def test_exported_model_has_images_and_depth_maps(tmp_path: Path) -> None:
     world_from_model = np.array(described["world_from_model"])
     points = np.array([model.points3D[i].xyz for i in sorted(model.points3D)])
     turned = points @ world_from_model[:, :3].T + world_from_model[:, 3]
+    (video,) = (
+        chunk.to_record_batch()
+        for chunk in RrdReader(str(recording)).stream()
+        if str(chunk.entity_path) == "/world/video_camera" and not chunk.is_static
+    )
+    assert [time.total_seconds() for time in video["time"].to_pylist()] == [0.5, 1.0]
+    moved = np.array([[0, 0, 0], [1, 2, 3]]) @ world_from_model[:, :3].T + world_from_model[:, 3]
+    centers = np.array([c[0] for c in video["Transform3D:translation"].to_pylist()])
+    np.testing.assert_allclose(centers, moved, atol=1e-5)
+    scale = np.cbrt(np.linalg.det(world_from_model[:, :3]))
+    quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    for column, turn in zip(
+        video["Transform3D:mat3x3"].to_pylist(), (np.eye(3), quarter), strict=True
+    ):
+        rotation = np.reshape(column[0], (3, 3)).T  # columns first
+        np.testing.assert_allclose(rotation, world_from_model[:, :3] / scale @ turn, atol=1e-5)
     shown = values_of(recording, "/world/dense")
     np.testing.assert_allclose(shown["Points3D:positions"], turned, atol=1e-5)
     kept = values_of(recording, f"/depth/{names[0]}")
