@@ -185,6 +185,9 @@ def _check_in_subprocess(name: str, arguments: list[str]) -> int:
 def _run_checking(arguments: list[str], mark: str) -> tuple[int, str, bool]:
     """Run ``mpsfm plugins check`` in a subprocess and print its output line by line.
 
+    OpenBLAS gets one thread by default, because the arrays of the checks are small and waiting
+    threads cost CPU time.
+
     Args:
         arguments: Arguments of ``mpsfm plugins check``.
         mark: Value of the environment variable that marks the subprocess.
@@ -196,7 +199,7 @@ def _run_checking(arguments: list[str], mark: str) -> tuple[int, str, bool]:
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", "mpsfm_core", "plugins", "check", *arguments],
-            env={**subprocess_environment(), _CHECKING: mark},
+            env={"OPENBLAS_NUM_THREADS": "1", **subprocess_environment(), _CHECKING: mark},
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
