@@ -39,9 +39,9 @@ class InputOptions(Options):
     projection: Literal["auto", "perspective", "equirectangular"] = "auto"
     """Projection of the images. With ``equirectangular``, panoramas of 360 x 180 degrees are cut
     into eight perspective images, which form a rig with one center [COLMAP panorama_sfm]. With
-    ``auto``, panoramas are recognized by XMP data or by their pixels. They are cut if all images
-    are panoramas of 360 x 180 degrees, and left out otherwise. With ``perspective``, no image is
-    taken for a panorama."""
+    ``auto``, panoramas are recognized by XMP data or by their pixels. All images are cut if they
+    are twice as wide as high and most are recognized; otherwise, panoramas are left out. With
+    ``perspective``, no image is taken for a panorama."""
     max_pixels: int = expert(250_000_000, ge=1024)
     """Maximum number of pixels of an image or mask. Larger images are rejected before decoding,
     because a small file can decode to gigabytes [above all cameras on the market]."""

@@ -45,28 +45,28 @@ class PanoramaViews(NamedTuple):
 
 
 def are_panoramas(folder: Path, names: Sequence[str]) -> bool:
-    """Return True if all images of a folder are equirectangular panoramas of 360 x 180 degrees.
+    """Return True if the images of a folder are equirectangular panoramas of 360 x 180 degrees.
 
-    A panorama is twice as wide as high, and is recognized by XMP data or by its pixels.
+    All images must be twice as wide as high, and more than half of them must be recognized as
+    panoramas by XMP data or by their pixels, because pixels do not show every panorama.
 
     Args:
         folder: Folder of the images.
         names: Names of the images below the folder.
     """
-    return len(names) > 0 and all(_is_panorama(folder / name) for name in names)
-
-
-def _is_panorama(path: Path) -> bool:
-    """Return True if an image is a panorama of 360 x 180 degrees, False if it is unreadable."""
-    try:
-        data = read_bytes(path)
-        header = read_header(data)
-        width, height = upright_size(data, header, path)
-        if abs(width - 2 * height) > 1:
+    num_recognized = 0
+    for name in names:
+        path = folder / name
+        try:
+            data = read_bytes(path)
+            header = read_header(data)
+            width, height = upright_size(data, header, path)
+            if abs(width - 2 * height) > 1:
+                return False
+            num_recognized += find_projection(header, check_decodable(data, path)) is not None
+        except InputError:
             return False
-        return find_projection(header, check_decodable(data, path)) is not None
-    except InputError:
-        return False
+    return 2 * num_recognized > len(names)
 
 
 def cut_panorama(panorama: UInt8) -> list[UInt8]:

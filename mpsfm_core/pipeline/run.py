@@ -410,7 +410,7 @@ class _Run:
             if not are_panoramas(self._image_folder, names):
                 return
             self._stages.notice(
-                f"all {len(names)} images are panoramas of 360 x 180 degrees, which are cut into "
+                f"the {len(names)} images are panoramas of 360 x 180 degrees, which are cut into "
                 "views; --projection perspective takes them for ordinary photos"
             )
         with self._stages.stage("panoramas"):

@@ -69,7 +69,10 @@ def test_folder_of_panoramas_is_recognized(tmp_path: Path) -> None:
     for name in ("a.png", "b.png"):
         cv2.imwrite(str(tmp_path / name), large)
     cv2.imwrite(str(tmp_path / "wide.png"), large[:, 200:-200])  # less than 360 degrees
+    cv2.imwrite(str(tmp_path / "upside.png"), np.roll(large, 300, axis=0))  # poles in the middle
     (tmp_path / "broken.jpg").write_bytes(b"no image")
+    assert are_panoramas(tmp_path, ["a.png", "b.png", "upside.png"])
+    assert not are_panoramas(tmp_path, ["a.png", "upside.png"])
     assert are_panoramas(tmp_path, ["a.png", "b.png"])
     assert not are_panoramas(tmp_path, ["a.png", "wide.png"])
     assert not are_panoramas(tmp_path, ["a.png", "broken.jpg"])
