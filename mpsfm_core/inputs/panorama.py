@@ -28,6 +28,11 @@ def find_projection(header: ImageHeader, gray: UInt8 | None) -> str | None:
     return header.projection
 
 
+def has_panorama_size(width: int, height: int) -> bool:
+    """Return True if an image is twice as wide as high, up to one pixel."""
+    return abs(width - 2 * height) <= 1
+
+
 def is_equirectangular(gray: UInt8) -> bool:
     """Return True if an image is an equirectangular panorama of 360 x 180 degrees.
 
@@ -38,7 +43,7 @@ def is_equirectangular(gray: UInt8) -> bool:
         gray: (h, w) uint8 gray image, which may be reduced.
     """
     height, width = gray.shape
-    if height < 8 or abs(width - 2 * height) > 1:
+    if height < 8 or not has_panorama_size(width, height):
         return False
     pixels = gray.astype(np.float64)
     inner = np.mean(np.abs(np.diff(pixels[:, [0, 1, -2, -1]], axis=1)[:, [0, 2]]))

@@ -25,7 +25,7 @@ from mpsfm_core.inputs.image_decoding import (
     upright_size,
 )
 from mpsfm_core.inputs.image_header import read_header
-from mpsfm_core.inputs.panorama import find_projection
+from mpsfm_core.inputs.panorama import find_projection, has_panorama_size
 from mpsfm_core.support.files import write_file
 
 _JPEG_QUALITY = 95
@@ -60,8 +60,7 @@ def are_panoramas(folder: Path, names: Sequence[str]) -> bool:
         try:
             data = read_bytes(path)
             header = read_header(data)
-            width, height = upright_size(data, header, path)
-            if abs(width - 2 * height) > 1:
+            if not has_panorama_size(*upright_size(data, header, path)):
                 return False
             num_recognized += find_projection(header, check_decodable(data, path)) is not None
         except InputError:
@@ -119,7 +118,7 @@ def cut_panoramas(
         check_size(data, path, max_pixels)
         panorama = decode_rgb(data, read_header(data), path)
         height, width = panorama.shape[:2]
-        if abs(width - 2 * height) > 1:
+        if not has_panorama_size(width, height):
             raise InputError(
                 f"image {path} has {width} x {height} pixels, but an equirectangular panorama is "
                 "twice as wide as high; remove the image or use --projection perspective"

@@ -5,6 +5,7 @@ The evidence is written into ``summary.json`` and judged by :mod:`mpsfm_core.rep
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -98,14 +99,10 @@ _Frame = list[RegisteredImage]
 
 def _group_by_frame(reconstruction: Reconstruction, problem: MappingProblem) -> list[_Frame]:
     """Return the confirmed images of each frame, an image without a rig as its own frame."""
-    images = reconstruction.confirmed_images
-    in_rig = {name for rig in reconstruction.rigs for name in rig.image_names}
-    frame_of = problem.frame_of_images()
-    frames: dict[tuple[bool, int], _Frame] = {}
-    for image in images:
-        is_member = image.name in in_rig
-        key = is_member, int(frame_of[image.index]) if is_member else image.index
-        frames.setdefault(key, []).append(image)
+    frame_of = replace(problem, rigs=reconstruction.rigs).frame_of_images()
+    frames: dict[int, _Frame] = {}
+    for image in reconstruction.confirmed_images:
+        frames.setdefault(int(frame_of[image.index]), []).append(image)
     return list(frames.values())
 
 

@@ -31,20 +31,19 @@ class RigFrames:
 
     def __init__(self, problem: MappingProblem) -> None:
         count = len(problem.images)
+        self._rigs = tuple(rig for rig in problem.rigs if rig.is_calibrated)
         row_of = {image.name: row for row, image in enumerate(problem.images)}
-        self.frame_of: Int64 = np.arange(count, dtype=np.int64)
+        self.frame_of: Int64 = replace(problem, rigs=self._rigs).frame_of_images()
         self.rotations: Float64 = np.tile(np.eye(3), (count, 1, 1))
         self.translations: Float64 = np.zeros((count, 3))
         self.scale = 1.0
         self.scale_std = np.inf
         self.variable_sensor: Int64 = np.full(count, -1, dtype=np.int64)
-        self._rigs = tuple(rig for rig in problem.rigs if rig.is_calibrated)
         num_variable = 0
         for rig in self._rigs:
             for frame in rig.frames:
                 sensors = [(row_of[name], s) for s, name in enumerate(frame) if name in row_of]
                 for row, sensor in sensors:
-                    self.frame_of[row] = sensors[0][0]
                     self.rotations[row], self.translations[row] = rig.sensor_poses[sensor]
                     if rig.is_estimated and sensor > 0:
                         self.variable_sensor[row] = num_variable + sensor - 1
