@@ -9,8 +9,8 @@ random positions in each room. MP-SfM reconstructs them with SIFT, and depth of 
 true depth. COLMAP extracts and matches SIFT features of the same perspective views, and maps them
 with a known rig (the recipe of its script ``panorama_sfm.py``).
 
-A pair of adjacent rooms is joined rightly if the relative poses of all their panoramas are wrong by
-less than 5 degrees, and by less than 0.5 m after a scale that fits all distances.
+Two adjacent rooms are correctly joined if the relative poses between their panoramas have errors
+below 5 degrees and 0.5 m. One scale factor is fitted to all distances first.
 """
 
 from __future__ import annotations
@@ -40,9 +40,8 @@ from mpsfm_core.inputs.models import reconstruction_poses
 OVERRIDES = ("inputs.projection=equirectangular", "dense.enabled=false", "results.report=false")
 MAX_ANGLE_DEG, MAX_DISTANCE_M = 5.0, 0.5
 TEXTURE_FACTOR = 12.0
-"""Factor on the size of textures, with which floors and walls do not repeat in other rooms."""
+"""Factor that enlarges textures, so that no part of a texture appears in two rooms."""
 World = tuple[Any, Any, Any]
-_SIDES = np.radians([0.0, 90.0, 180.0, 270.0])
 
 
 def place_panoramas(count: int, rng: np.random.Generator) -> dict[str, Pose]:
@@ -73,7 +72,7 @@ def draw_square(world: World, pose: Pose, side: int) -> tuple[Float64, Float64, 
 
 
 def render_panorama(world: World, pose: Pose, width: int, rng: np.random.Generator) -> UInt8:
-    """Render an equirectangular RGB panorama from the faces of a cube, with noise."""
+    """Render six cube faces, resample them to an equirectangular RGB panorama, and add noise."""
     side = width // 3
     size = width, width // 2
     columns, rows = np.meshgrid(np.arange(width) + 0.5, np.arange(width // 2) + 0.5)
@@ -111,7 +110,7 @@ class TrueDepth:
         self._world, self._poses = world, poses
 
     def predict(self, view: View) -> DepthPrior:
-        """Render the depth of a view, with a declared std of 2 %."""
+        """Render the true depth of a view, and declare a relative standard deviation of 2 %."""
         folder, name = view.name.split("/")
         rotation = make_view_rotations()[int(folder.removeprefix("camera"))]
         pose = compose((rotation, np.zeros(3)), self._poses[Path(name).stem])
@@ -247,8 +246,8 @@ def _compare(folder: Path, count: int, seed: int, width: int) -> None:
     photos = folder / "photos"
     photos.mkdir(parents=True, exist_ok=True)
     for name, pose in truth.items():
-        pixels = render_panorama(world, pose, width, rng)
         if not (photos / f"{name}.jpg").is_file():
+            pixels = render_panorama(world, pose, width, rng)
             cv2.imwrite(str(photos / f"{name}.jpg"), pixels[:, :, ::-1])
     for mapper in ("compact", "true depth", "colmap"):
         stored = folder / f"{mapper.replace(' ', '-')}.json"

@@ -1,4 +1,4 @@
-"""Compare the mapper with COLMAP's incremental mapper on generated rigs.
+"""Compare MP-SfM's mapper with COLMAP's incremental mapper on synthetic camera rigs.
 
 Both mappers use the same keypoints, verified matches, cameras and relative poses. The frames move
 through a furnished room; keypoints have noise of 0.5 px, and depth maps have scale errors of 10 %.

@@ -116,7 +116,7 @@ def add_look_alike_pairs(hall: HallProblem, seed: int = 0) -> MappingProblem:
 
 
 def _measure(views: int, method: str, part_images: int, folder: Path) -> dict[str, Any]:
-    """Run a method on a hall in a new process, or load the stored result."""
+    """Map a synthetic hall with one mapper in a new process, or load its stored result."""
     name = f"{views}-{method}" + (f"-{part_images}" if method.startswith(IN_PARTS) else "")
     path = folder / f"{name.replace(' ', '_')}.json"
     if not path.exists():
@@ -218,7 +218,14 @@ def _table(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _count_joins(num_rooms: int) -> str:
-    """Join true and false parts of twin rooms, and format the numbers of made joins."""
+    """Count the accepted true joins and the refused false joins of rooms that look alike.
+
+    Args:
+        num_rooms: Number of scenes with two rooms that look alike.
+
+    Returns:
+        Table in Markdown.
+    """
     lines = ["| depth priors | true joins made | false joins refused |", "|---|---|---|"]
     for name, errors in (("exact", None), ("5 % + 5 % scale", DepthErrors())):
         made, refused = 0, 0
@@ -254,7 +261,7 @@ def _false_parts(case: SymmetricProblem, num_common: int) -> tuple[Poses, Poses]
 
 
 def _joins(case: SymmetricProblem, first: Poses, second: Poses) -> bool:
-    """Map both parts at the given poses, and return whether they are joined."""
+    """Map two parts with fixed poses, and return True if the reconstructions are joined."""
     models = [_map_at_poses(case.problem, poses) for poses in (first, second)]
     return join_pair(case.problem, *models, MapperOptions()) is not None
 

@@ -195,7 +195,7 @@ def test_adjust_bundle_with_rig_has_same_optimum_as_ceres(dense_poses: int) -> N
 
 
 def free_sensors(problem: BundleProblem) -> RigConstraint:
-    """Return the rig of a problem with estimated poses of all sensors except the first."""
+    """Return the rig of a problem, with variable poses of all sensors except the first."""
     assert problem.rig is not None
     sensors = np.tile(np.arange(SENSORS), len(problem.rotations) // SENSORS) - 1
     return replace(problem.rig, variable_sensor=sensors)

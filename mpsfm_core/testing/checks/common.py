@@ -255,7 +255,7 @@ def check_offline(case: ContractCase) -> None:
 
 
 def check_odd_size(case: ContractCase) -> str:
-    """Require accurate output for a view of 149 x 107 pixels.
+    """Require accurate output for a view with odd width and height (149 x 107 pixels).
 
     Both sizes are prime numbers, so that the stride of no network divides the image size.
     """
@@ -269,7 +269,7 @@ def check_portrait(case: ContractCase) -> str:
 
 
 def check_large_view(case: ContractCase) -> str:
-    """Require accurate output for a view of 2.2 megapixels, or of 12.2 for masks.
+    """Require accurate output for a view of 12.2 megapixels (masks) or 2.2 megapixels (others).
 
     Photos of users are usually larger than the input of a network. The large view repeats the
     pixels of a small view, so that the ground truth is known.

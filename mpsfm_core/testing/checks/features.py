@@ -36,7 +36,8 @@ _MAX_SCALING_SHIFT_PX = 1.0
 those of a view of a quarter of the size. Integer pixel centers that are scaled from 1024 to 4096
 pixels shift keypoints by 1.5 pixels, but the shift is at most 0.6 pixels for tested detectors."""
 _SCALING_RADIUS_PX = 6.0
-"""Largest distance in pixels of the large view between a keypoint and its repetition."""
+"""Largest distance between keypoints of the large and of the small view that count as the same
+keypoint, in pixels of the large view."""
 _MIN_COVERING = 40
 """Minimum number of keypoints for which the coverage of a view is checked."""
 _MIN_COVERED_CELLS = 7
