@@ -54,7 +54,8 @@ def import_dataset(
     kind: Annotated[
         str,
         typer.Argument(
-            help="Dataset: eth3d, smerf, tanks-and-temples, realestate10k, 7-scenes or scannet."
+            help="Dataset: eth3d, smerf, tanks-and-temples, realestate10k, 7-scenes, scannet, "
+            "tum-rgbd, eth3d-slam, euroc or lamar."
         ),
     ],
     source: Annotated[Path, typer.Argument(metavar="SRC", help="One scene as distributed.")],

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pycolmap
+from scipy.spatial.transform import Rotation, Slerp
 
 from mpsfm_core.data import Float64, Int64, Pose
 from mpsfm_core.data.errors import InputError
@@ -45,6 +46,35 @@ class Trajectory:
     """(n,) time stamps in seconds."""
     poses: tuple[Pose, ...]
     """Poses ``cam_from_world`` as rotation (3, 3) and translation (3,)."""
+
+    def interpolate(self, times: Float64, max_gap_s: float) -> list[Pose | None]:
+        """Interpolate poses at time stamps, linearly in position and by slerp in rotation.
+
+        Args:
+            times: (m,) time stamps in seconds.
+            max_gap_s: Maximum distance of the two neighboring poses in seconds.
+
+        Returns:
+            Pose ``cam_from_world`` of each time stamp, or None where the neighboring poses are
+            missing or farther apart than ``max_gap_s``.
+        """
+        unique = np.append(True, np.diff(self.times) > 0)
+        known = self.times[unique]
+        if len(known) < 2:
+            return [None] * len(times)
+        poses = [pose for pose, keep in zip(self.poses, unique, strict=True) if keep]
+        rotations = Rotation.from_matrix([rotation.T for rotation, _ in poses])
+        centers = np.array([camera_center(*pose) for pose in poses])
+        after = np.clip(np.searchsorted(known, times), 1, len(known) - 1)
+        usable = known[after] - known[after - 1] <= max_gap_s
+        usable &= (times >= known[0]) & (times <= known[-1])
+        clipped = np.clip(times, known[0], known[-1])
+        turned = Slerp(known, rotations)(clipped).inv().as_matrix()
+        positions = np.column_stack([np.interp(clipped, known, axis) for axis in centers.T])
+        return [
+            (rotation, -rotation @ position) if is_usable else None
+            for rotation, position, is_usable in zip(turned, positions, usable, strict=True)
+        ]
 
 
 def find_trajectory(path: Path) -> Path | None:

@@ -265,6 +265,169 @@ def test_scannet_import_has_true_cameras_poses_and_depth(tmp_path: Path) -> None
     assert known.min() in (16, 17, 18) and (depth[48, known] == 2).all()
 
 
+def quaternions(order: str) -> list[list[float]]:
+    """Return the unit quaternions of ``world_from_cam``, scalar last (xyzw) or first (wxyz)."""
+    xyzw = Rotation.from_matrix([pose[:3, :3] for pose in WORLD_FROM_CAM]).as_quat()
+    return (xyzw if order == "xyzw" else xyzw[:, [3, 0, 1, 2]]).tolist()
+
+
+def tum_rgbd(source: Path, size: tuple[int, int] = (640, 480)) -> None:
+    """Write images between true poses, so that a pose has to be interpolated."""
+    lines = []
+    for number, (pose, quaternion) in enumerate(
+        zip(WORLD_FROM_CAM, quaternions("xyzw"), strict=True)
+    ):
+        # The true pose is constant around the time of each image.
+        for time in (10 * number + 0.98, 10 * number + 1.03):
+            lines.append(" ".join(map(str, [time, *pose[:3, 3], *quaternion])))
+        photo(source / "rgb" / f"{10 * number + 1}.png", size)
+        (source / "depth").mkdir(exist_ok=True)
+        stored = DEPTH_MM.astype(np.uint32) * 5  # 5000 units per meter
+        cv2.imwrite(str(source / "depth" / f"{number}.png"), stored.astype(np.uint16))
+    photo(source / "rgb" / "15.png", size)  # no true pose within 0.1 s
+    (source / "rgb.txt").write_text(
+        "# color images\n15 rgb/15.png\n1 rgb/1.png\n11 rgb/11.png\n21 rgb/21.png\n"
+    )
+    (source / "depth.txt").write_text("1.01 depth/0.png\n11.5 depth/1.png\n20.99 depth/2.png\n")
+    (source / "groundtruth.txt").write_text("\n".join(lines) + "\n")
+
+
+def test_tum_rgbd_import_interpolates_poses_and_reads_depth(tmp_path: Path) -> None:
+    source = tmp_path / "rgbd_dataset_freiburg3_desk"
+    tum_rgbd(source)
+    scene = import_scene("tum-rgbd", source, tmp_path / "out")
+    check_poses(scene, ["rgb/1.png", "rgb/11.png", "rgb/21.png"])
+    assert cameras(scene)[0] == [535.4, 539.2, 320.6, 248.1]
+    depth = read_depth(scene.path / "gt_depth" / "rgb" / "21.png")
+    assert (depth[:, 8:] == 2).all() and not depth[:, :8].any()
+    # The depth image nearest in time to the second image is half a second late.
+    assert not (scene.path / "gt_depth" / "rgb" / "11.png").exists()
+
+
+def test_tum_rgbd_cameras_have_distortion(tmp_path: Path) -> None:
+    source = tmp_path / "rgbd_dataset_freiburg1_desk"
+    tum_rgbd(source)
+    scene = import_scene("tum-rgbd", source, tmp_path / "out")
+    camera = next(iter(pycolmap.Reconstruction(str(scene.path / "gt")).cameras.values()))
+    matrix = np.array([[517.3, 0, 318.6], [0, 516.5, 255.3], [0, 0, 1]])
+    points = np.array([[0.2, -0.1, 1.0], [-0.3, 0.2, 1.0]])
+    distortion = np.array([0.2624, -0.9531, -0.0054, 0.0026, 1.1633])
+    expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), matrix, distortion)
+    # OpenCV's center of the first pixel is (0, 0), COLMAP's (0.5, 0.5).
+    np.testing.assert_allclose(camera.img_from_cam(points), expected[:, 0] + 0.5, atol=1e-6)
+
+
+def test_eth3d_slam_import_reads_the_calibration(tmp_path: Path) -> None:
+    source = tmp_path / "plant_1"
+    tum_rgbd(source, (64, 48))
+    with pytest.raises(InputError, match=r"write fx fy cx cy to calibration\.txt"):
+        import_scene("eth3d-slam", source, tmp_path / "other")
+    (source / "calibration.txt").write_text("60 61 31.5 23.5\n")
+    scene = import_scene("eth3d-slam", source, tmp_path / "out")
+    check_poses(scene, ["rgb/1.png", "rgb/11.png", "rgb/21.png"])
+    assert cameras(scene)[0] == [60, 61, 32, 24]
+
+
+BODY_FROM_CAM = np.block(
+    [
+        [Rotation.from_euler("z", 90, degrees=True).as_matrix(), np.array([[0.1], [0.2], [0.3]])],
+        [np.zeros((1, 3)), np.ones((1, 1))],
+    ]
+)
+
+
+@pytest.mark.parametrize("truth", ["state_groundtruth_estimate0", "mocap0"])
+def test_euroc_import_converts_poses_of_the_body(tmp_path: Path, truth: str) -> None:
+    root = tmp_path / "MH_01_easy" / "mav0"
+    lines, images = ["#timestamp [ns],..."], ["#timestamp [ns],filename"]
+    for number, pose in enumerate(WORLD_FROM_CAM):
+        body = pose @ np.linalg.inv(BODY_FROM_CAM)
+        x, y, z, w = Rotation.from_matrix(body[:3, :3]).as_quat()
+        time = 1403636579763555584 + number * 10**9
+        for shift in (-20_000_000, 20_000_000):
+            values = [*body[:3, 3], w, x, y, z, 0, 0, 0]
+            lines.append(",".join(map(str, [time + shift, *values])))
+        images.append(f"{time},{time}.png")
+        photo(root / "cam0" / "data" / f"{time}.png")
+    (root / "cam0" / "data.csv").write_text("\n".join(images) + "\n")
+    (root / truth).mkdir()
+    (root / truth / "data.csv").write_text("\n".join(lines) + "\n")
+    model = "radial-tangential" if truth.startswith("state") else "equidistant"
+    (root / "cam0" / "sensor.yaml").write_text(
+        "sensor_type: camera\n"
+        "T_BS:\n  cols: 4\n  rows: 4\n"
+        f"  data: {BODY_FROM_CAM.ravel().tolist()}\n"
+        "resolution: [64, 48]\ncamera_model: pinhole\nintrinsics: [60, 61, 31.5, 23.5]\n"
+        f"distortion_model: {model}\ndistortion_coefficients: [-0.28, 0.07, 0.0002, 1.8e-05]\n"
+    )
+    scene = import_scene("euroc", root.parent, tmp_path / "out")
+    check_poses(scene, [name.partition(",")[2] for name in images[1:]])
+    camera = next(iter(pycolmap.Reconstruction(str(scene.path / "gt")).cameras.values()))
+    assert camera.model_name == ("OPENCV" if model == "radial-tangential" else "OPENCV_FISHEYE")
+    np.testing.assert_allclose(camera.params, [60, 61, 32, 24, -0.28, 0.07, 0.0002, 1.8e-05])
+    (root / "cam0" / "sensor.yaml").write_text("T_BS: 1\n")
+    with pytest.raises(InputError, match="calibration cannot be read"):
+        import_scene("euroc", root.parent, tmp_path / "other")
+
+
+def test_lamar_import_has_poses_of_devices_and_of_rigs(tmp_path: Path) -> None:
+    source = tmp_path / "hl_2022-01-01"
+    rig_from_cam = BODY_FROM_CAM
+    rig_pose = WORLD_FROM_CAM[1] @ np.linalg.inv(rig_from_cam)
+
+    def line(*values: object) -> str:
+        return ", ".join(map(str, values))
+
+    def pose_line(first: object, second: object, pose: np.ndarray) -> str:
+        x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat()
+        return line(first, second, w, x, y, z, *pose[:3, 3])
+
+    for time in (1, 2, 3, 4):
+        photo(source / "raw_data" / "images" / f"{time}.jpg")
+    (source / "raw_data" / "depths").mkdir()
+    cv2.imwrite(str(source / "raw_data" / "depths" / "1.png"), DEPTH_MM)
+    covariance = ["0.1"] * 36
+    files = {
+        "sensors.txt": [
+            "# sensor_id, name, sensor_type, [sensor_params]+",
+            line("a", "first", "camera", "PINHOLE", 64, 48, 60, 61, 32, 24),
+            line("b", "second", "camera", "SIMPLE_PINHOLE", 64, 48, 55, 32, 24),
+            line("w", "", "wifi"),
+        ],
+        "images.txt": [
+            "# timestamp, sensor_id, image_path",
+            *(line(time, sensor, f"images/{time}.jpg") for time, sensor in
+              ((1, "a"), (2, "b"), (3, "a"), (4, "a"))),
+        ],
+        "depths.txt": [line(1, "a", "depths/1.png")],
+        "rigs.txt": [pose_line("rig", "b", rig_from_cam)],
+        "trajectories.txt": [
+            line(pose_line(1, "a", WORLD_FROM_CAM[0]), *covariance),
+            pose_line(2, "rig", rig_pose),
+            pose_line(3, "a", WORLD_FROM_CAM[2]),
+        ],
+    }  # fmt: skip
+    for name, lines in files.items():
+        (source / name).write_text("\n".join(lines) + "\n")
+    scene = import_scene("lamar", source, tmp_path / "out")
+    # The image without a pose, 4.jpg, is left out.
+    check_poses(scene, ["images/1.jpg", "images/2.jpg", "images/3.jpg"])
+    truth = pycolmap.Reconstruction(str(scene.path / "gt"))
+    focals = {image.name: image.camera.params[0] for image in truth.images.values()}
+    assert focals["images/1.jpg"] == 60 and focals["images/2.jpg"] == 55
+    depth = read_depth(scene.path / "gt_depth" / "images" / "1.png")
+    assert (depth[:, 8:] == 2).all()
+    # Poses relative to the scan take precedence.
+    (source / "proc").mkdir()
+    shifted = [WORLD_FROM_CAM[n] + [[0, 0, 0, 5], [0] * 4, [0] * 4, [0] * 4] for n in (0, 2)]
+    (source / "proc" / "alignment_trajectories.txt").write_text(
+        "\n".join([pose_line(1, "a", shifted[0]), pose_line(3, "a", shifted[1])]) + "\n"
+    )
+    aligned = import_scene("lamar", source, tmp_path / "aligned")
+    rotation, translation = aligned.truth["images/1.jpg"]
+    np.testing.assert_allclose(-rotation.T @ translation, shifted[0][:3, 3], atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("kind", "message"),
     [
@@ -274,6 +437,9 @@ def test_scannet_import_has_true_cameras_poses_and_depth(tmp_path: Path) -> None
         ("realestate10k", "no text file"),
         ("7-scenes", "0 usable images"),
         ("scannet", "folder of photos is missing"),
+        ("tum-rgbd", "list of color images is missing"),
+        ("euroc", "folder of the first camera is missing"),
+        ("lamar", "list of sensors is missing"),
         ("colmap", "no dataset 'colmap'"),
     ],
 )

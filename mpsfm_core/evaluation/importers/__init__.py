@@ -12,11 +12,14 @@ from types import MappingProxyType
 from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.evaluation.importers import (
     eth3d,
+    euroc,
+    lamar,
     realestate10k,
     scannet,
     seven_scenes,
     smerf,
     tanks_and_temples,
+    tum_rgbd,
 )
 from mpsfm_core.evaluation.importers.frames import Frame, write_frames
 from mpsfm_core.evaluation.scene_folder import SceneFolder, read_scene
@@ -29,6 +32,10 @@ IMPORTERS: Mapping[str, Callable[[Path], list[Frame]]] = MappingProxyType(
         "realestate10k": realestate10k.read_frames,
         "7-scenes": seven_scenes.read_frames,
         "scannet": scannet.read_frames,
+        "tum-rgbd": tum_rgbd.read_frames,
+        "eth3d-slam": tum_rgbd.read_frames,
+        "euroc": euroc.read_frames,
+        "lamar": lamar.read_frames,
     }
 )
 """Function that reads the frames of a scene, by name of the dataset."""

@@ -17,6 +17,7 @@ from mpsfm_core.evaluation.prior_quality import write_depth
 from mpsfm_core.geometry import inside, pixel_centers, sample_nearest
 from mpsfm_core.geometry.pycolmap_conversion import camera_key
 from mpsfm_core.inputs.image_header import read_header
+from mpsfm_core.inputs.text_files import read_text_file
 
 PHOTOS = (".jpg", ".jpeg", ".png")
 """Suffixes of image files that importers accept."""
@@ -102,6 +103,35 @@ def photo_size(path: Path) -> tuple[int, int]:
     if size is None:
         raise InputError(f"{path}: no photo")
     return size
+
+
+def read_image_list(
+    path: Path, separator: str | None = None, unit_s: float = 1.0
+) -> tuple[Float64, list[str]]:
+    """Read a text file with a time stamp and a path of an image in each line.
+
+    Args:
+        path: Text file; lines that start with ``#`` are comments.
+        separator: Text between time stamp and path, or None for white space.
+        unit_s: Unit of the time stamps in seconds.
+
+    Returns:
+        Time stamps (n,) in seconds and paths, in ascending order of time.
+
+    Raises:
+        InputError: A line has no time stamp or no path.
+    """
+    rows = []
+    for number, line in enumerate(read_text_file(path).splitlines(), start=1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        words = [word.strip() for word in line.split(separator, 1)]
+        try:
+            rows.append((float(words[0]) * unit_s, words[1]))
+        except (IndexError, ValueError) as error:
+            raise InputError(f"{path}, line {number}: expected a time stamp and a path") from error
+    rows.sort()
+    return np.array([time for time, _ in rows]), [name for _, name in rows]
 
 
 def require_path(path: Path, what: str) -> Path:
