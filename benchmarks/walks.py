@@ -302,12 +302,14 @@ def run_walk(
         "seconds": time.monotonic() - start,
         "cpu_seconds": usage.ru_utime - before.ru_utime,
         "memory_mb": usage.ru_maxrss / 1024,
-        "video": summary["video"],
+        "video": summary["videos"][0],
         "stages": {name: stage["seconds"] for name, stage in summary["stages"].items()},
     }
     if summary["status"] == "success":
         found = read_trajectory(output / "trajectory.txt")
-        record["mpsfm"] = evaluate_trajectory(found, truth, count_frames_outside_largest(output))
+        record["mpsfm"] = evaluate_trajectory(
+            found, truth, count_frames_outside_largest(output / "trajectory.txt")
+        )
         record["keyframes"] = _evaluate_model(output / "sparse", poses)
     start = time.process_time()
     database, mapped = output / "colmap.db", output / "colmap"

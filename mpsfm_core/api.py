@@ -47,10 +47,11 @@ from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.features import FeatureSet, FeatureSource, FeatureTable, GivenFeatures
 from mpsfm_core.extraction.match_graph import MatchGraph, NamePair, Priors
 from mpsfm_core.inputs import images as image_inputs
+from mpsfm_core.inputs.image_search import find_videos
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.models import read_poses
-from mpsfm_core.inputs.video import extract_frames, is_video
+from mpsfm_core.inputs.video import extract_frames
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts import part_mapping
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
@@ -117,12 +118,12 @@ def load_images(
             raise TypeError("arrays have cameras, not intrinsics or image_list")
         return image_inputs.images_from_arrays(images, cameras, config.inputs)
     folder, stages = Path(images), Stages(registry, on_event)
-    if is_video(folder):
+    if videos := find_videos(folder, None if output is None else Path(output)):
         if output is None:
             raise InputError(f"{folder}: the frames of a video need an output folder")
         with stages.stage("video"):
             progress = partial(stages.stage_progress, "video")
-            folder = extract_frames(folder, Path(output), config.inputs.video, progress)
+            folder = extract_frames(videos, Path(output), config.inputs.video, progress)
     names_file = None if image_list is None else Path(image_list)
     with stages.stage("inputs"):
         return image_inputs.load_images(folder, given, names_file, config.inputs)

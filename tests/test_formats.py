@@ -100,7 +100,7 @@ def frames(folder: Path) -> Any:
         json.loads((folder / "frames" / "frames.json").read_text())["options"]
     )
     try:
-        return video.extract_frames(folder / "clip.avi", folder, options).name
+        return video.extract_frames({"": folder / "clip.avi"}, folder, options).name
     except InputError:
         return "looked into"
 

@@ -7,7 +7,9 @@ from typing import Annotated, Any, TypeAlias
 
 import typer
 
-PhotosOrVideo: TypeAlias = Annotated[Path, typer.Argument(help="Folder of photos, or a video.")]
+PhotosOrVideo: TypeAlias = Annotated[
+    Path, typer.Argument(help="Folder of photos or of videos, or a video.")
+]
 ImageList: TypeAlias = Annotated[
     Path | None, typer.Option(metavar="FILE", help="Use only these photos, one name per line.")
 ]

@@ -82,6 +82,7 @@ def evaluate(
     import json
 
     from mpsfm_core.data.errors import InputError, did_you_mean
+    from mpsfm_core.data.result_layout import TRAJECTORIES
     from mpsfm_core.evaluation import CONVENTIONS, evaluate, read_poses
     from mpsfm_core.evaluation.result_folder import find_photos
     from mpsfm_core.evaluation.trajectories import (
@@ -109,9 +110,12 @@ def evaluate(
     if truth.is_file() and (trajectory := find_trajectory(truth)) is not None:
         found = find_trajectory(model)
         if found is None:
-            raise InputError(f"{model}: the folder has no trajectory.txt to compare with {truth}")
+            raise InputError(
+                f"{model}: the folder has no trajectory.txt to compare with {truth}; for a result "
+                f"of several videos, give one file of {model / TRAJECTORIES}"
+            )
         compared = read_trajectory(found), read_trajectory(trajectory)
-        report |= evaluate_trajectory(*compared, count_frames_outside_largest(model))
+        report |= evaluate_trajectory(*compared, count_frames_outside_largest(found))
         typer.echo(json.dumps(report, indent=2))
         return
     photos = photos or find_photos(model)

@@ -212,17 +212,20 @@ def _print_outcome(result: ReconstructionResult, output: Path) -> None:
         _row("missing", f"a provider failed: {name}: {fault}")
     for name, reason in images["unregistered"].items():
         _row("missing", f"not registered: {name}: {explain_image(reason).text}")
-    if video := result.summary["video"]:
-        _row("video", _describe_video(video))
+    videos = result.summary["videos"]
+    for video in videos:
+        _row("video", _describe_video(video, is_single=len(videos) == 1))
     if (output / "report.html").is_file():
         _row("open", f"{output}/report.html")
     seconds = sum(stage["seconds"] for stage in result.summary["stages"].values())
     _row("time", f"written to {output} in {seconds:.0f} s")
 
 
-def _describe_video(video: Mapping[str, Any]) -> str:
+def _describe_video(video: Mapping[str, Any], *, is_single: bool) -> str:
     """Describe keyframes, cuts and localized frames of a video."""
     texts = [f"{video['keyframes']} keyframes of {video['frames']} frames"]
+    if not is_single:
+        texts[0] = f"{Path(video['file']).name}: {texts[0]}"
     if video["cuts_s"]:
         times = ", ".join(f"{time:.1f}" for time in video["cuts_s"])
         texts.append(f"cuts at {times} s")
@@ -230,7 +233,7 @@ def _describe_video(video: Mapping[str, Any]) -> str:
         sources = trajectory["sources"]
         names = {"none": "without pose"}
         counts = ", ".join(f"{n} {names.get(source, source)}" for source, n in sources.items())
-        texts.append(f"poses in trajectory.txt: {counts}")
+        texts.append(f"poses in {trajectory['file']}: {counts}")
     return "; ".join(texts)
 
 

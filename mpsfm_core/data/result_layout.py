@@ -41,6 +41,8 @@ TRAJECTORY = "trajectory.txt"
 """Poses of the frames of a video in the format of TUM, ``timestamp tx ty tz qx qy qz qw``."""
 FRAME_TABLE = "trajectory.csv"
 """Source, standard deviation and number of inliers of each frame of a video."""
+TRAJECTORIES = "trajectories"
+"""Folder of the same two files for each of several videos, ``NAME.txt`` and ``NAME.csv``."""
 VIEWS = "views"
 """Thumbnails, priors and matches that the HTML report displays."""
 REPORT = "report.html"
@@ -57,6 +59,7 @@ ENTRIES = (
     TRANSFORMS,
     TRAJECTORY,
     FRAME_TABLE,
+    TRAJECTORIES,
     VIEWS,
     REPORT,
     SUMMARY,

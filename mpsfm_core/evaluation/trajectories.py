@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from mpsfm_core.data import Float64, Int64, Pose
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.data.result_layout import FRAME_TABLE, TRAJECTORY
+from mpsfm_core.data.result_layout import TRAJECTORY
 from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.pose_auc import interpolated_area
 from mpsfm_core.geometry import camera_center
@@ -186,10 +186,15 @@ def evaluate_trajectory(
     }
 
 
-def count_frames_outside_largest(folder: Path) -> int:
-    """Count the frames of a video that have no pose in the largest component."""
-    table = folder / FRAME_TABLE
-    if not table.is_file():
+def count_frames_outside_largest(trajectory: Path) -> int:
+    """Count the frames of a video that have no pose in the largest component.
+
+    Args:
+        trajectory: Trajectory file of a result folder. The table of all frames has the same name
+            with the extension ``.csv``; without a table, the count is 0.
+    """
+    table = trajectory.with_suffix(".csv")
+    if table == trajectory or not table.is_file():
         return 0
     rows = read_text_file(table).splitlines()[1:]
     return sum(row.split(",")[3] != "0" for row in rows)

@@ -15,6 +15,7 @@ from mpsfm_core.inputs.captures.convert import find_format
 from mpsfm_core.inputs.image_decoding import EXTENSIONS
 from mpsfm_core.inputs.text_files import read_text_file
 from mpsfm_core.inputs.video import EXTENSIONS as VIDEO_EXTENSIONS
+from mpsfm_core.inputs.video import is_video
 
 _log = logging.getLogger(__name__)
 
@@ -79,9 +80,42 @@ def check_images_folder(folder: Path, without: Path | None = None) -> None:
     require_two_images(folder, _search_folder(folder, without).images, folder)
 
 
-def find_videos(folder: Path) -> list[str]:
-    """Find all videos below a folder; return relative paths in natural order."""
-    names = _walk_input_files(folder, None)
+def find_videos(path: Path, without: Path | None = None) -> dict[str, Path]:
+    """Find the videos to reconstruct: a single video, or all videos of a folder without images.
+
+    A folder with images is a folder of photos, also if it has videos; phones store a short video
+    with each photo.
+
+    Args:
+        path: Video or folder.
+        without: Subfolder that is skipped.
+
+    Returns:
+        Paths of the videos in natural order. The key is the path of a video relative to the folder
+        without its extension, and empty for a single video. Empty if there are no videos.
+
+    Raises:
+        InputError: the folder does not exist, or two videos differ only in their extensions.
+    """
+    if is_video(path):
+        return {"": path}
+    if _search_folder(path, without).images:
+        return {}
+    names = _list_videos(path, without)
+    if len(names) == 1:
+        return {"": path / names[0]}
+    videos: dict[str, Path] = {}
+    for name in names:
+        stem = PurePosixPath(name).with_suffix("").as_posix()
+        if stem in videos:
+            raise InputError(f"{path}: two videos have the name {stem!r}; rename one of them")
+        videos[stem] = path / name
+    return videos
+
+
+def _list_videos(folder: Path, without: Path | None) -> list[str]:
+    """List the videos below a folder by relative path, in natural order."""
+    names = _walk_input_files(folder, without)
     videos = [name for name in names if PurePosixPath(name).suffix.lower() in VIDEO_EXTENSIONS]
     return sorted(videos, key=_natural_sort_key)
 
@@ -97,11 +131,10 @@ def require_two_images(folder: Path, names: list[str], source: Path) -> None:
     if len(names) >= 2:
         return
     content = f"only one image, {names[0]!r}" if names else "no images"
-    videos = find_videos(folder)
-    if videos:
+    if videos := _list_videos(folder, None):
         raise InputError(
             f"{source} has {content}, but {_count(len(videos), 'video', 'videos')}, such as "
-            f"{videos[0]!r}. Give one video instead of the folder: "
+            f"{videos[0]!r}. Give one video instead, or a folder that has only videos: "
             f"mpsfm reconstruct '{folder / videos[0]}'"
         )
     raise InputError(f"{source} has {content}: a reconstruction needs two or more images")

@@ -6,6 +6,7 @@ import heapq
 import json
 import logging
 import os
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,7 +21,7 @@ from mpsfm_core.data.decisions import KeyframeReason, Reason, reason_from_json
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.geometry.optical_flow import track_points
 from mpsfm_core.inputs.options import VideoOptions
-from mpsfm_core.inputs.telemetry import read_telemetry
+from mpsfm_core.inputs.telemetry import Telemetry, read_telemetry
 from mpsfm_core.providers.weights import file_sha256
 from mpsfm_core.support.files import replace_entries
 from mpsfm_core.support.format_versions import VERSION, check_version
@@ -139,53 +140,82 @@ class VideoSelection:
 
 
 def extract_frames(
-    video: Path, output: Path, options: VideoOptions, progress: Progress | None = None
+    videos: Mapping[str, Path],
+    output: Path,
+    options: VideoOptions,
+    progress: Progress | None = None,
 ) -> Path:
-    """Select frames of a video and write them as JPEG files into ``output/frames``.
+    """Select frames of videos and write them as JPEG files into ``output/frames``.
 
     The name of a JPEG file contains the frame number. EXIF of the JPEG file has the GPS position if
     a drone or action camera recorded positions (see :func:`read_telemetry`). Existing frames of the
     same video and options are reused.
 
     Args:
-        video: video file.
+        videos: video files by the subfolder of their frames, which is empty for a single video.
         output: output folder.
         options: options of the frame selection.
-        progress: callback during decoding of the video.
+        progress: callback during decoding of each video.
 
     Returns:
-        Path of the folder with the JPEG files.
+        Path of the folder with the JPEG files or the subfolders.
 
     Raises:
-        InputError: the file is not a video or is damaged, or the camera does not move.
+        InputError: a file is not a video or is damaged, or the camera does not move.
     """
     folder = output / FRAMES
     selected = options.model_dump(mode="json", exclude={"trajectory_every"})
-    telemetry = read_telemetry(video)
-    digest = telemetry.digest if telemetry.points else None
-    origin = dict(zip(_ORIGIN, (_digest(video), selected, digest), strict=True))
-    content = _read_list(folder / _LIST)
-    if content is not None and {key: content.get(key) for key in _ORIGIN} == origin:
+    telemetry = {name: read_telemetry(video) for name, video in videos.items()}
+    origins = {}
+    for name, video in videos.items():
+        digest = telemetry[name].digest if telemetry[name].points else None
+        origins[name] = dict(zip(_ORIGIN, (_digest(video), selected, digest), strict=True))
+    stored = {path.parent.relative_to(folder) for path in folder.rglob(_LIST)}
+    unchanged = {name for name in videos if _read_origin(folder / name) == origins[name]}
+    if unchanged == set(videos) and len(stored) == len(videos):
         return folder
-    selection = choose_frames(video, options, progress)
-    names = {frame.number: frame.name for frame in selection.keyframes}
     with replace_entries(output, (FRAMES,)) as fresh:
-        (fresh / FRAMES).mkdir()
-        for frame in read_frames(video, frozenset(names)):
-            path = fresh / FRAMES / names[frame.number]
-            path.write_bytes(telemetry.add_exif(encode_frame(frame.image), frame.number))
-        content = {
-            VERSION: FORMAT,
-            **origin,
-            **vars(selection),
-            "keyframes": [frame.to_json() for frame in selection.keyframes],
-        }
-        (fresh / FRAMES / _LIST).write_text(json.dumps(content, indent=1), encoding="utf-8")
+        for name, video in videos.items():
+            target = fresh / FRAMES / name
+            target.mkdir(parents=True, exist_ok=True)
+            if name in unchanged:
+                for file in filter(Path.is_file, (folder / name).iterdir()):
+                    shutil.copyfile(file, target / file.name)
+            else:
+                selection = choose_frames(video, options, progress)
+                _write_keyframes(video, target, selection, telemetry[name], origins[name])
     return folder
 
 
+def _write_keyframes(
+    video: Path,
+    folder: Path,
+    selection: VideoSelection,
+    telemetry: Telemetry,
+    origin: Mapping[str, Any],
+) -> None:
+    """Write the keyframes of one video and their list into a folder."""
+    names = {frame.number: frame.name for frame in selection.keyframes}
+    for frame in read_frames(video, frozenset(names)):
+        path = folder / names[frame.number]
+        path.write_bytes(telemetry.add_exif(encode_frame(frame.image), frame.number))
+    content = {
+        VERSION: FORMAT,
+        **origin,
+        **vars(selection),
+        "keyframes": [frame.to_json() for frame in selection.keyframes],
+    }
+    (folder / _LIST).write_text(json.dumps(content, indent=1), encoding="utf-8")
+
+
+def _read_origin(folder: Path) -> dict[str, Any] | None:
+    """Read what identifies the video and the options of the frames in a folder, if any."""
+    content = _read_list(folder / _LIST)
+    return None if content is None else {key: content.get(key) for key in _ORIGIN}
+
+
 def read_selection(folder: Path) -> VideoSelection:
-    """Read the keyframes from ``frames.json`` in the folder that :func:`extract_frames` wrote.
+    """Read the keyframes of one video from ``frames.json`` in the folder of its frames.
 
     Raises:
         InputError: the file is missing or damaged.

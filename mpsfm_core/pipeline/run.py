@@ -29,6 +29,7 @@ from mpsfm_core.inputs.image_search import (
     check_images_folder,
     check_output_folder,
     find_images,
+    find_videos,
     select_listed_images,
 )
 from mpsfm_core.inputs.images import ImageSet, load_images
@@ -41,7 +42,7 @@ from mpsfm_core.inputs.matches import (
 from mpsfm_core.inputs.models import Poses, describe_name_difference, match_names, read_poses
 from mpsfm_core.inputs.panorama_views import PanoramaViews, are_panoramas, cut_panoramas
 from mpsfm_core.inputs.rigs import read_rigs
-from mpsfm_core.inputs.video import VideoSelection, extract_frames, is_video, read_selection
+from mpsfm_core.inputs.video import VideoSelection, extract_frames, read_selection
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.rig_calibration import calibrate_rigs
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
@@ -141,8 +142,8 @@ def reconstruct(
     :func:`mpsfm_core.extract_features` and :func:`mpsfm_core.run_mapper`.
 
     Args:
-        images: Folder of photos with its subfolders, a video, or the result of
-            :func:`mpsfm_core.load_images`. Keyframes of a video are selected by ``inputs.video``
+        images: Folder of photos or of videos with its subfolders, a video, or the result of
+            :func:`mpsfm_core.load_images`. Keyframes of videos are selected by ``inputs.video``
             and written into ``frames/`` of the output.
         output: Result folder, used by one run at a time, or None to write nothing.
         config: Name of a shipped configuration, a YAML file, or a loaded configuration.
@@ -238,7 +239,7 @@ class _Source:
     """Input files and objects of a run."""
 
     images: Path | ImageSet
-    """Folder of photos, path of a video, or loaded images."""
+    """Folder of photos or videos, path of a video, or loaded images."""
     cameras: Path | Cameras | None
     image_list: Path | None
     poses: Path | Poses | None
@@ -252,17 +253,9 @@ class _Source:
         return None if isinstance(self.poses, Mapping) else self.poses
 
     @property
-    def video(self) -> Path | None:
-        """Path of the video, or None if the input is a folder or images in memory."""
-        images = self.images
-        return images if isinstance(images, Path) and is_video(images) else None
-
-    @property
     def folder(self) -> Path | None:
-        """Folder of the photos, or None for a video or images in memory."""
-        if isinstance(self.images, ImageSet):
-            return self.images.folder
-        return self.images if self.video is None else None
+        """Folder of the photos, or None for images in memory."""
+        return self.images.folder if isinstance(self.images, ImageSet) else self.images
 
 
 class _Run:
@@ -291,8 +284,9 @@ class _Run:
         self._georeference_report: dict[str, object] | None = None
         self._dense_reports: list[dict[str, Any]] | None = None
         self._doubts: tuple[Reason, ...] = ()
-        self._selection: VideoSelection | None = None
-        self._trajectory: list[TrajectoryFrame] = []
+        self._videos: dict[str, Path] = {}
+        self._selections: dict[str, VideoSelection] = {}
+        self._trajectories: dict[str, list[TrajectoryFrame]] = {}
         self._estimate = resources.ResourceEstimate(0, 0, 0)
         self._children = ChildMemoryMonitor()
         self._checkpoints: list[MappingCheckpoints | DenseCheckpoints | PartMapper] = []
@@ -312,10 +306,6 @@ class _Run:
                 if isinstance(self._source.images, Path):
                     check_output_folder(self._output, self._source.images)
                 stack.enter_context(lock_output_folder(self._output))
-            elif self._source.video is not None:
-                raise InputError(
-                    f"{self._source.video}: the frames of a video need an output folder"
-                )
             stack.enter_context(self._children.watching())
             stack.callback(self._stop_compilation)
             yield
@@ -352,9 +342,15 @@ class _Run:
 
     def _resolve_providers(self) -> None:
         """Choose providers and download their weights before any image is decoded."""
-        if isinstance(self._source.images, Path) and self._source.video is None:
+        if isinstance(self._source.images, Path):
             # A folder without images raises an error before any weights are downloaded.
-            check_images_folder(self._source.images, self._output)
+            self._videos = find_videos(self._source.images, self._output)
+            if not self._videos:
+                check_images_folder(self._source.images, self._output)
+            elif self._output is None:
+                raise InputError(
+                    f"{self._source.images}: the frames of a video need an output folder"
+                )
         with self._stages.stage("providers"):
             for text in self._config.warnings:
                 self._stages.warn(text)
@@ -374,17 +370,18 @@ class _Run:
             )
 
     def _extract_video_frames(self) -> None:
-        """Write keyframes of a video to the output folder, and use the keyframes as images."""
-        video = self._source.video
-        if video is None:
+        """Write keyframes of videos to the output folder, and use the keyframes as images."""
+        if not self._videos:
             return
         assert self._output is not None
         with self._stages.stage("video"):
             progress = partial(self._stages.stage_progress, "video")
             self._image_folder = extract_frames(
-                video, self._output, self._config.inputs.video, progress
+                self._videos, self._output, self._config.inputs.video, progress
             )
-            self._selection = read_selection(self._image_folder)
+            self._selections = {
+                name: read_selection(self._image_folder / name) for name in self._videos
+            }
 
     def _cut_panoramas(self) -> None:
         """Cut panoramas into perspective views in the output folder, and use these as images."""
@@ -635,24 +632,37 @@ class _Run:
         return replace(mapping, reconstructions=tuple(dense_parts))
 
     def _localize_frames(self, mapping: MappingResult, originals: OriginalImages) -> None:
-        """Estimate the poses of the frames of a video between its keyframes."""
-        every, video = self._config.inputs.video.trajectory_every, self._source.video
-        if video is None or self._selection is None or not every:
+        """Estimate the poses of the frames of each video between its keyframes."""
+        every = self._config.inputs.video.trajectory_every
+        if not self._videos or not every:
             return
         if self._panorama_views is not None:
             return  # the frames of a video between keyframes are not cut into views
         with self._stages.stage("trajectory"):
             progress = partial(self._stages.stage_progress, "trajectory")
-            self._trajectory = localize_frames(
-                video, self._selection, mapping.reconstructions, originals, every, progress
-            )
+            for name, video in self._videos.items():
+                self._trajectories[name] = localize_frames(
+                    video,
+                    self._selections[name],
+                    mapping.reconstructions,
+                    originals,
+                    every,
+                    progress,
+                    subfolder=name,
+                )
 
-    def _describe_video(self) -> dict[str, Any] | None:
-        """Describe the keyframes and the trajectory of a video, None for photos."""
-        if self._selection is None:
-            return None
-        trajectory = describe_trajectory(self._trajectory) if self._trajectory else None
-        return {**self._selection.describe(), "trajectory": trajectory}
+    def _describe_videos(self) -> list[dict[str, Any]]:
+        """Describe the keyframes and the trajectory of each video."""
+        return [
+            {
+                "file": str(self._videos[name]),
+                **selection.describe(),
+                "trajectory": describe_trajectory(self._trajectories[name], name)
+                if name in self._trajectories
+                else None,
+            }
+            for name, selection in self._selections.items()
+        ]
 
     def _write_results(
         self,
@@ -681,7 +691,7 @@ class _Run:
                     options,
                     summarize,
                     seed,
-                    self._trajectory,
+                    self._trajectories,
                 )
         return ReconstructionResult(models[0], models[1:], mapping, summary, self._output)
 
@@ -752,7 +762,7 @@ class _Run:
             "config": config.model_dump(mode="json"),
             "versions": describe_versions(),
             "photos": None if self._image_folder is None else str(self._image_folder.resolve()),
-            "video": self._describe_video(),
+            "videos": self._describe_videos(),
             "matches_from": None if self._imported is None else self._imported.source,
             "images": describe_images(images, extraction.report, mapping, originals),
             "pairs": describe_pairs(extraction.report, mapping, extraction.problem),

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import cv2
@@ -68,6 +68,7 @@ def localize_frames(
     originals: OriginalImages,
     every: int = 1,
     progress: Progress | None = None,
+    subfolder: str = "",
 ) -> list[TrajectoryFrame]:
     """Estimate the poses of the frames of a video, which is read frame by frame.
 
@@ -78,11 +79,12 @@ def localize_frames(
         originals: Original images of the keyframes.
         every: Interval of the frames that are localized, in addition to the keyframes.
         progress: Callback with the number of read frames and the number of all frames.
+        subfolder: Folder of the keyframes in the names of the images, empty for a single video.
 
     Returns:
         The localized frames and the frames without pose, ascending by number.
     """
-    localizer = _FrameLocalizer(selection, components, originals)
+    localizer = _FrameLocalizer(selection, components, originals, PurePosixPath(subfolder))
     placed = []
     keyframes = frozenset(selection.numbers)
     for frame in read_frames(video):
@@ -101,7 +103,9 @@ class _FrameLocalizer:
         selection: VideoSelection,
         components: Sequence[Reconstruction],
         originals: OriginalImages,
+        folder: PurePosixPath,
     ) -> None:
+        self._folder = folder
         self._keyframes = selection.keyframes
         self._numbers = np.array(selection.numbers)
         self._originals = originals
@@ -126,7 +130,7 @@ class _FrameLocalizer:
             )
         interpolated = self._interpolate(neighbors, time_s)
         gray = gray_image(frame.image, TRACKED_SIDE)
-        keyframes = [self._read_keyframe(key.name) for key in neighbors.frames]
+        keyframes = [self._read_keyframe(self._image_name(key)) for key in neighbors.frames]
         outcome: FramePose | Reason | None = None
         for predicted in self._predict(neighbors, interpolated):
             outcome = localize_frame(keyframes, gray, predicted)
@@ -144,18 +148,25 @@ class _FrameLocalizer:
         )
         return _LocalizedFrame(placed, (pose, outcome.covariance), shot, outcome.inflation)
 
+    def _image_name(self, keyframe: SelectedFrame) -> str:
+        return (self._folder / keyframe.name).as_posix()
+
+    def _find(self, keyframe: SelectedFrame) -> tuple[int, Reconstruction, RegisteredImage]:
+        """Return a registered keyframe with its component and the number of the component."""
+        return self._registered[self._image_name(keyframe)]
+
     def _find_neighbors(self, frame: VideoFrame, after: int, shot: int) -> _Neighbors | None:
         """Find the nearest registered keyframes of the shot, or only the frame if it is one."""
         before = self._search(range(after - 1, -1, -1), shot)
         following = self._search(range(after, len(self._keyframes)), shot)
         if before is not None and before.number == frame.number:
-            return _Neighbors(self._registered[before.name][0], (before,))
+            return _Neighbors(self._find(before)[0], (before,))
         near = [key for key in (before, following) if key is not None]
         near.sort(key=lambda key: abs(key.time_s - frame.time_s))
         if not near or (len(near) == 1 and abs(near[0].time_s - frame.time_s) > MAX_GAP_S):
             return None
-        component = self._registered[near[0].name][0]
-        same = [key for key in near if self._registered[key.name][0] == component]
+        component = self._find(near[0])[0]
+        same = [key for key in near if self._find(key)[0] == component]
         return _Neighbors(component, tuple(sorted(same, key=lambda key: key.number)))
 
     def _search(self, rows: range, shot: int) -> SelectedFrame | None:
@@ -164,12 +175,12 @@ class _FrameLocalizer:
             keyframe = self._keyframes[row]
             if keyframe.shot != shot:
                 return None
-            if keyframe.name in self._registered:
+            if self._image_name(keyframe) in self._registered:
                 return keyframe
         return None
 
     def _interpolate(self, neighbors: _Neighbors, time_s: float) -> Pose:
-        images = [self._registered[key.name][2] for key in neighbors.frames]
+        images = [self._find(key)[2] for key in neighbors.frames]
         poses = [(image.rotation, image.translation) for image in images]
         if len(poses) == 1:
             return poses[0]

@@ -129,8 +129,8 @@ class RunSummary(TypedDict):
     versions: dict[str, str]
     photos: str | None
     """Absolute path of the images folder, or None for images in memory."""
-    video: dict[str, Any] | None
-    """Keyframes and localized frames of a video, or None for photos."""
+    videos: list[dict[str, Any]]
+    """File, keyframes and localized frames of each video; empty for photos."""
     matches_from: str | None
     """File from which matches were imported, or None if the images were matched."""
     images: ImagesSummary

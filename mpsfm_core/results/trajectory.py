@@ -12,7 +12,7 @@ import pycolmap
 
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.data.decisions import Reason
-from mpsfm_core.data.result_layout import FRAME_TABLE, TRAJECTORY
+from mpsfm_core.data.result_layout import FRAME_TABLE, TRAJECTORIES, TRAJECTORY
 from mpsfm_core.geometry import camera_center
 
 _COLUMNS = "frame,timestamp_s,source,component,num_inliers,position_std,rotation_std_deg,reason"
@@ -41,29 +41,44 @@ class TrajectoryFrame:
     """Reason (``FrameReason``) why the frame has no measured pose."""
 
 
-def write_trajectory(folder: Path, frames: Sequence[TrajectoryFrame]) -> None:
+def trajectory_files(folder: Path, video: str = "") -> tuple[Path, Path]:
+    """Return the paths of the trajectory and of the table of frames of a video.
+
+    Args:
+        folder: Result folder.
+        video: Name of the video, which is empty for a single video.
+    """
+    if not video:
+        return folder / TRAJECTORY, folder / FRAME_TABLE
+    return folder / TRAJECTORIES / f"{video}.txt", folder / TRAJECTORIES / f"{video}.csv"
+
+
+def write_trajectory(folder: Path, frames: Sequence[TrajectoryFrame], video: str = "") -> None:
     """Write the poses of the largest component, and a table of all frames.
 
     Args:
         folder: Result folder.
         frames: All localized frames, and all frames without a pose, ascending by number.
+        video: Name of the video, which is empty for a single video.
     """
+    trajectory, table = trajectory_files(folder, video)
+    trajectory.parent.mkdir(parents=True, exist_ok=True)
     lines = ["# timestamp tx ty tz qx qy qz qw (camera to world)"]
     for frame in frames:
         if frame.component == 0 and frame.pose is not None:
             values = *camera_center(*frame.pose), *_quaternion(frame.pose)
             lines.append(" ".join([f"{frame.time_s:.6f}", *(f"{value:.9g}" for value in values)]))
-    (folder / TRAJECTORY).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    trajectory.write_text("\n".join(lines) + "\n", encoding="utf-8")
     rows = [",".join(map(str, _row(frame))) for frame in frames]
-    table = "\n".join([_COLUMNS, *rows]) + "\n"
-    (folder / FRAME_TABLE).write_text(table, encoding="utf-8")
+    table.write_text("\n".join([_COLUMNS, *rows]) + "\n", encoding="utf-8")
 
 
-def describe_trajectory(frames: Sequence[TrajectoryFrame]) -> dict[str, Any]:
+def describe_trajectory(frames: Sequence[TrajectoryFrame], video: str = "") -> dict[str, Any]:
     """Describe the frames of a video for ``summary.json``."""
     sources = [frame.source for frame in frames]
     codes = [f.reason.code.value for f in frames if f.reason is not None and f.pose is None]
     return {
+        "file": trajectory_files(Path(), video)[0].as_posix(),
         "frames": len(frames),
         "sources": {source: sources.count(source) for source in dict.fromkeys(sources)},
         "reasons": {code: codes.count(code) for code in dict.fromkeys(codes)},

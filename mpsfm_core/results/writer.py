@@ -25,6 +25,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import pycolmap
@@ -98,7 +99,7 @@ def write_results(
     options: ResultOptions,
     summarize: Callable[[], Summary],
     seed: int = 0,
-    trajectory: Sequence[TrajectoryFrame] = (),
+    trajectories: Mapping[str, Sequence[TrajectoryFrame]] = MappingProxyType({}),
 ) -> Summary:
     """Write the results of a successful run.
 
@@ -110,7 +111,7 @@ def write_results(
         summarize: function that returns the content of ``summary.json``, called after all other
             files are written.
         seed: random seed of the selection of pixels for ``dense.ply``.
-        trajectory: localized frames of a video.
+        trajectories: localized frames of each video, whose name is empty for a single video.
 
     Returns:
         Content of the written file ``summary.json``.
@@ -137,8 +138,8 @@ def write_results(
             _write_nerfstudio(folder / TRANSFORMS, output, largest, photos)
         if options.report:
             write_views(folder / VIEWS, photos.problem, photos.view)
-        if trajectory:
-            write_trajectory(folder, trajectory)
+        for video, frames in trajectories.items():
+            write_trajectory(folder, frames, video)
         summary = summarize()
         _write_json(folder / SUMMARY, summary)
     return summary

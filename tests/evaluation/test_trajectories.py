@@ -114,4 +114,4 @@ def test_windowed_error_equals_alignment_of_each_window(tmp_path: Path) -> None:
     exact = np.maximum(0, 1 - np.array(errors) / 0.5).mean()
     assert report["wate_auc"]["10"] == pytest.approx(100 * exact, abs=0.5)
     assert "25" in report["wate_auc"] and "50" not in report["wate_auc"]
-    assert count_frames_outside_largest(tmp_path) == 0
+    assert count_frames_outside_largest(tmp_path / "trajectory.txt") == 0

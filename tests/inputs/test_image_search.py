@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.inputs.image_search import find_images, read_image_list
+from mpsfm_core.inputs.image_search import find_images, find_videos, read_image_list
 from mpsfm_core.inputs.images import load_images
 
 
@@ -111,6 +111,23 @@ def test_folder_of_videos_says_how_to_use_one(tmp_path: Path) -> None:
     write(tmp_path, "a.jpg")
     with pytest.raises(InputError, match=r"only one image, 'a\.jpg', but 2 videos"):
         load_images(tmp_path)
+
+
+def test_videos_of_a_folder_without_images_are_found(tmp_path: Path) -> None:
+    clips = tmp_path / "clips"
+    (clips / "day").mkdir(parents=True)
+    (clips / "b.mp4").touch()
+    assert find_videos(clips / "b.mp4") == {"": clips / "b.mp4"}
+    assert find_videos(clips) == {"": clips / "b.mp4"}
+    (clips / "day" / "a.MOV").touch()
+    (clips / "out").mkdir()
+    write(clips / "out", "frame.jpg")
+    found = find_videos(clips, without=clips / "out")
+    assert found == {"b": clips / "b.mp4", "day/a": clips / "day" / "a.MOV"}
+    assert find_videos(clips) == {}  # a folder with an image is a folder of photos
+    (clips / "b.avi").touch()
+    with pytest.raises(InputError, match="two videos have the name 'b'"):
+        find_videos(clips, without=clips / "out")
 
 
 def test_image_list_with_byte_order_mark(tmp_path: Path) -> None:

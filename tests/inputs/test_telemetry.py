@@ -135,7 +135,7 @@ def add_gopro_track(video: Path, samples: list[bytes], wide: bool = False) -> No
 
 def check_frames(video: Path, output: Path, tolerance: float = 1e-6) -> None:
     """Check the EXIF positions of the extracted frames of a video."""
-    images = load_images(extract_frames(video, output, VideoOptions()))
+    images = load_images(extract_frames({"": video}, output, VideoOptions()))
     assert len(images) >= 3
     for image in images:
         number = int(image.name[len("frame_") : -len(".jpg")])
@@ -170,7 +170,7 @@ def test_old_subtitles_of_dji_have_the_longitude_first_and_no_altitude(video: Pa
 
 def test_subtitles_without_positions_change_nothing(tmp_path: Path, video: Path) -> None:
     video.with_suffix(".srt").write_text("1\n00:00:00,000 --> 00:00:01,000\nHello: world\n")
-    images = load_images(extract_frames(video, tmp_path / "out", VideoOptions()))
+    images = load_images(extract_frames({"": video}, tmp_path / "out", VideoOptions()))
     assert all(image.gps is None and image.focal_source == "default" for image in images)
 
 
@@ -209,7 +209,7 @@ def test_damaged_gopro_track_is_one_warning(video: Path, caplog) -> None:
 
 
 def test_frames_are_extracted_again_if_subtitles_arrive(tmp_path: Path, video: Path) -> None:
-    folder = extract_frames(video, tmp_path / "out", VideoOptions())
+    folder = extract_frames({"": video}, tmp_path / "out", VideoOptions())
     assert load_images(folder)[0].gps is None
     write_subtitles(video.with_suffix(".srt"), "mini 3")
     check_frames(video, tmp_path / "out")

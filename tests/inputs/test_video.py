@@ -99,7 +99,7 @@ def test_cut_starts_a_shot(turn, tmp_path: Path) -> None:
         for pose in arc_poses(10, 2.0)
     ]
     video = write(tmp_path / "v.avi", [*turn[:20], *other])
-    selection = read_selection(extract_frames(video, tmp_path / "out", VideoOptions()))
+    selection = read_selection(extract_frames({"": video}, tmp_path / "out", VideoOptions()))
     shots = {frame.shot: frame for frame in reversed(selection.keyframes)}
     assert sorted(shots) == [0, 1] and shots[1].number in range(20, 24)
     assert shots[1].reason.code is KeyframeReason.CUT
@@ -130,23 +130,43 @@ def test_time_stamps_of_variable_frame_rate_are_those_of_the_container(turn, tmp
 def test_extracted_frames_are_reused(turn, tmp_path: Path) -> None:
     video = write(tmp_path / "v.avi", turn)
     assert is_video(video)
-    folder = extract_frames(video, tmp_path / "out", VideoOptions())
+    folder = extract_frames({"": video}, tmp_path / "out", VideoOptions())
     names = find_images(folder)
     assert names == [f"frame_{n:06d}.jpg" for n in choose_frames(video, VideoOptions()).numbers]
     picture = cv2.imread(str(folder / names[2])).astype(float)
     difference = [np.abs(picture - frame).mean() for frame in turn]
     assert np.argmin(difference) == int(names[2][6:12])
     written = (folder / names[0]).stat().st_mtime_ns
-    assert extract_frames(video, tmp_path / "out", VideoOptions()) == folder
+    assert extract_frames({"": video}, tmp_path / "out", VideoOptions()) == folder
     assert (folder / names[0]).stat().st_mtime_ns == written
-    extract_frames(video, tmp_path / "out", VideoOptions(motion=0.3))
+    extract_frames({"": video}, tmp_path / "out", VideoOptions(motion=0.3))
     assert len(find_images(folder)) < len(names)
+
+
+def test_frames_of_several_videos_are_in_subfolders(turn, tmp_path: Path) -> None:
+    videos = {
+        "a": write(tmp_path / "a.avi", turn),
+        "day/b": write(tmp_path / "b.avi", turn[::-1]),
+    }
+    folder = extract_frames(videos, tmp_path / "out", VideoOptions())
+    parts = {name: read_selection(folder / name) for name in videos}
+    expected = [f"{name}/{frame.name}" for name, part in parts.items() for frame in part.keyframes]
+    assert find_images(folder) == expected
+    first = folder / "a" / parts["a"].keyframes[0].name
+    content = first.read_bytes()
+    # Only the second video has changed, and a removed video leaves no frames.
+    write(tmp_path / "b.avi", turn[10:])
+    extract_frames(videos, tmp_path / "out", VideoOptions())
+    assert first.read_bytes() == content
+    assert read_selection(folder / "day/b").num_frames == len(turn) - 10
+    extract_frames({"day/b": videos["day/b"]}, tmp_path / "out", VideoOptions())
+    assert not (folder / "a").exists() and len(find_images(folder)) >= 2
 
 
 def test_video_of_static_camera_raises(turn, tmp_path: Path) -> None:
     video = write(tmp_path / "v.avi", [turn[0]] * 30)
     with pytest.raises(InputError, match="camera hardly moves"):
-        extract_frames(video, tmp_path / "out", VideoOptions())
+        extract_frames({"": video}, tmp_path / "out", VideoOptions())
     assert not (tmp_path / "out").exists()
 
 
@@ -174,7 +194,7 @@ def test_portrait_video_gives_upright_frames(turn, tmp_path: Path) -> None:
     clockwise = (0, one, 0, -one, 0, 0, SIZE[1] * one, 0, least)
     data[matrix : matrix + 36] = struct.pack(">9i", *clockwise)
     video.write_bytes(data)
-    frames = sorted(extract_frames(video, tmp_path, VideoOptions()).glob("*.jpg"))
+    frames = sorted(extract_frames({"": video}, tmp_path, VideoOptions()).glob("*.jpg"))
     assert len(frames) >= 5
     for path in frames:
         seen, stored = cv2.imread(str(path)), turn[int(path.stem[6:])]
