@@ -7,7 +7,8 @@ checks the consistency of neighboring stereo depth maps
 (:mod:`~mpsfm_core.dense.geometric_consistency`). The fourth stage estimates the uncertainty of
 poses and depth scales (:mod:`~mpsfm_core.dense.epipolar_error`,
 :mod:`~mpsfm_core.dense.scale_uncertainty`). The fifth stage fuses stereo depth with input depth
-(:mod:`~mpsfm_core.dense.depth_posterior`).
+(:mod:`~mpsfm_core.dense.depth_posterior`), and raises the std next to depth edges
+(:mod:`~mpsfm_core.dense.depth_edges`).
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, View
 from mpsfm_core.dense.dense_view import DenseView, PosedGrid
+from mpsfm_core.dense.depth_edges import add_edge_variance
 from mpsfm_core.dense.depth_posterior import (
     MIN_STD,
     UNKNOWN_LOG_STD,
@@ -45,7 +47,7 @@ from mpsfm_core.dense.scale_uncertainty import (
     estimate_scale_stds,
     measure_scale_constraints,
 )
-from mpsfm_core.dense.stereo import StereoDepth, match_stereo_depth
+from mpsfm_core.dense.stereo import WINDOW_RADIUS, StereoDepth, match_stereo_depth
 from mpsfm_core.dense.view_selection import select_source_views
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
@@ -244,8 +246,8 @@ class _DensifySteps:
         """Fuse stereo depth with input depth, and return the mask of pixels with stereo depth.
 
         If nothing in the source views matches a pixel near its depth, the pixel shows sky or a
-        moving object, or is next to a depth edge or occluded. The std of its depth is then unknown,
-        and the pixel contributes to no cloud or mesh.
+        moving object, or is occluded. The std of its depth is then unknown, and the pixel
+        contributes to no cloud or mesh.
         """
         view = self._views[row]
         known = LogDepthMap(view.log_depth, view.log_std)
@@ -254,6 +256,7 @@ class _DensifySteps:
         )
         measured = fuse_known_depth(stereo, known)
         posterior = compute_depth_posterior(known, measured, self._options.correlation_px)
+        posterior = add_edge_variance(posterior, self.consistency[row].views, WINDOW_RADIUS)
         posterior = posterior.with_min_std(~self.matched[row].explained, UNKNOWN_LOG_STD)
         scale_std = self.scale_stds.get(row, 0.0)
         image = _replace_depth(self._images[row], view, posterior, scale_std, self._store_array)

@@ -29,7 +29,7 @@ _RANGE_STDS = 2.0
 """Half width of the depth search range in stds of the input depth [ours]."""
 _MAX_LABELS = 96
 """Maximum number of depth hypotheses per pixel on the coarse level; bounds the memory [ours]."""
-_WINDOW_RADIUS = 3
+WINDOW_RADIUS = 3
 """Radius of the NCC window in pixels of the pyramid level [ours]."""
 _GRAY_NOISE = 2.0
 """Std of image noise in gray levels of 255. Raising the noise std treats more texture as noise
@@ -166,7 +166,7 @@ def _match_costs(
             offsets,
             source.gray,
             *source.pixels_from(view),
-            _WINDOW_RADIUS,
+            WINDOW_RADIUS,
             noise_variance,
             source_costs,
         )
