@@ -60,5 +60,5 @@ def _depth_steps(log_depth: Float32, radius: int) -> Float32:
                 (radius * (1 - down), radius * (1 - right)),
             )
         ]
-        step = np.maximum(step, np.abs(changes[0] - changes[1]))
-    return step / inverse
+        np.maximum(step, np.abs(changes[0] - changes[1]), out=step)
+    return np.asarray(step / inverse, np.float32)
