@@ -32,7 +32,7 @@ from benchmarks.walks import HEIGHT, ROOM, build_rooms
 from mpsfm_core import reconstruct
 from mpsfm_core.data import DepthPrior, Float64, Pose, UInt8, View
 from mpsfm_core.data.errors import MpsfmError
-from mpsfm_core.data.result_layout import VIEWS_OF_PANORAMAS
+from mpsfm_core.data.result_layout import CUT_VIEWS
 from mpsfm_core.geometry import camera_center, compose, invert, rotation_angle_deg
 from mpsfm_core.geometry.panorama import make_view_rotations
 from mpsfm_core.inputs.models import reconstruction_poses
@@ -273,7 +273,7 @@ def _run(
     """Return ``panorama_from_world`` of the largest model of a mapper."""
     output = folder / mapper.replace(" ", "-")
     if mapper == "colmap":
-        models = run_colmap(folder / "compact" / VIEWS_OF_PANORAMAS)
+        models = run_colmap(folder / "compact" / CUT_VIEWS)
         return view_to_panorama(models[0]) if models else {}
     depth = TrueDepth(world, truth) if mapper == "true depth" else None
     try:

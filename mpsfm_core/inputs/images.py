@@ -385,6 +385,25 @@ def load_images(
     return ImageSet(images, options, left_out)
 
 
+def find_known_cameras(
+    folder: Path, names: Sequence[str], cameras: Path | Cameras, options: InputOptions
+) -> dict[str, pycolmap.Camera]:
+    """Return the known camera of each image that can be decoded, after EXIF rotation.
+
+    Args:
+        folder: Folder of the images.
+        names: Names of the images below the folder.
+        cameras: File or objects of the cameras, see :func:`load_images`.
+        options: Options with the maximum number of pixels.
+
+    Raises:
+        InputError: A camera is missing, or is for another image size.
+    """
+    given = _read_cameras(cameras, names, folder, "cameras")
+    files = {name: _probe(folder / name, options) for name in names}
+    return _known_cameras({n: file for n, file in files.items() if not file.fault}, given, None)
+
+
 def images_from_arrays(
     pixels: Mapping[str, NDArray[Any]],
     cameras: Cameras | None = None,

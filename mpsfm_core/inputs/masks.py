@@ -63,7 +63,8 @@ def find_masks(folder: Path, names: Sequence[str], images_folder: Path) -> dict[
 
     The mask of image ``X.jpg`` is ``X.png``, ``X.jpg.png``, ``X.jpg`` or ``X_mask.png`` (or
     similar) in any image format. Case is ignored. The masks folder has the subfolders of the images
-    folder or no subfolders, and may be the images folder itself.
+    folder or no subfolders, and may be the images folder itself. If ``folder`` is a file, the file
+    is the mask of all images.
 
     Returns:
         Paths of mask files by image name; images without a mask cause a warning.
@@ -71,6 +72,8 @@ def find_masks(folder: Path, names: Sequence[str], images_folder: Path) -> dict[
     Raises:
         InputError: the masks folder does not exist, or contains no mask of an image.
     """
+    if folder.is_file():
+        return dict.fromkeys(names, folder)
     if not folder.is_dir():
         raise InputError(f"masks folder {folder} does not exist")
     files = [n for n in walk_files(folder) if PurePosixPath(n).suffix.lower() in EXTENSIONS]

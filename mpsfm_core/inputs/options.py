@@ -48,10 +48,14 @@ class InputOptions(Options):
     strict: bool = False
     """If true, a damaged image ends the run. If false, damaged images are left out with a warning,
     unless more than half of the images are damaged."""
+    nadir_angle_deg: float = Field(0.0, ge=0, lt=180)
+    """Angle from the downward direction up to which the pixels of panoramas and fisheye images that
+    are cut into views are ignored, such as the operator of a 360-degree camera. A larger angle
+    hides more. The views of a panorama end at 45 degrees, so smaller angles change nothing."""
     masks: Path | None = None
     """Folder of masks of the original images, named ``X.jpg.png``, ``X.png``, ``X_mask.png`` or
-    ``X.jpg`` for the image ``X.jpg``. Pixels that are black in the mask are ignored [COLMAP
-    mask_path]."""
+    ``X.jpg`` for the image ``X.jpg``, or one mask file of all images. Pixels that are black in the
+    mask are ignored [COLMAP mask_path]."""
     mask_orientation: MapOrientation = expert("auto")
     """Orientation of masks whose size fits the image before and after EXIF rotation, either
     ``stored`` (before) or ``upright`` (after). With ``auto``, masks that fit both orientations get

@@ -19,7 +19,7 @@ from mpsfm_core.data import MappingProblem, Pose, Rig
 from mpsfm_core.data.decisions import Reason
 from mpsfm_core.data.errors import ConfigError, InputError, ReconstructionError
 from mpsfm_core.data.events import EventCallback
-from mpsfm_core.data.result_layout import IMAGES, SUMMARY, VIEWS_OF_PANORAMAS
+from mpsfm_core.data.result_layout import CUT_VIEWS, IMAGES, MASKS_OF_VIEWS, SUMMARY
 from mpsfm_core.dense.densify import densify
 from mpsfm_core.extraction.active_provider import thread_count, worker_count
 from mpsfm_core.extraction.cache import cache_folder
@@ -40,9 +40,15 @@ from mpsfm_core.inputs.matches import (
     matches_from_hloc,
 )
 from mpsfm_core.inputs.models import Poses, describe_name_difference, match_names, read_poses
-from mpsfm_core.inputs.panorama_views import PanoramaViews, are_panoramas, cut_panoramas
 from mpsfm_core.inputs.rigs import read_rigs
 from mpsfm_core.inputs.video import VideoSelection, extract_frames, read_selection
+from mpsfm_core.inputs.view_cutting import (
+    MAX_FIELD_OF_VIEW_DEG,
+    CutImages,
+    are_panoramas,
+    cut_images,
+    find_wide_cameras,
+)
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.rig_calibration import calibrate_rigs
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
@@ -280,7 +286,7 @@ class _Run:
         self._imported: ImportedMatches | None = None
         self._known_poses: dict[str, Pose] = {}
         self._rigs: tuple[Rig, ...] = ()
-        self._panorama_views: PanoramaViews | None = None
+        self._cut: CutImages | None = None
         self._georeference_report: dict[str, object] | None = None
         self._dense_reports: list[dict[str, Any]] | None = None
         self._doubts: tuple[Reason, ...] = ()
@@ -314,7 +320,7 @@ class _Run:
         """Run all stages of the reconstruction and return the result."""
         self._resolve_providers()
         self._extract_video_frames()
-        self._cut_panoramas()
+        self._cut_wide_images()
         self._start_compilation()
         images = self._load_inputs()
         images, extraction = self._extract(images)
@@ -383,43 +389,61 @@ class _Run:
                 name: read_selection(self._image_folder / name) for name in self._videos
             }
 
-    def _cut_panoramas(self) -> None:
-        """Cut panoramas into perspective views in the output folder, and use these as images."""
+    def _cut_wide_images(self) -> None:
+        """Cut panoramas and wide fisheye images into views, and use the views as images."""
         options, source = self._config.inputs, self._source
-        if options.projection == "perspective":
-            return
         others = {"cameras": source.cameras, "poses": source.poses, "rigs": source.rigs}
         given = [name for name, value in others.items() if value is not None]
-        given += ["inputs.masks"] if options.masks is not None else []
         given += ["database or hloc"] if source.matches else []
-        if given or self._image_folder is None or self._output is None:
-            if options.projection == "auto":
-                return
+        if options.projection == "equirectangular" and (
+            given or self._image_folder is None or self._output is None
+        ):
             what = given[0] if given else "an image set in memory, or no output folder,"
             raise InputError(
                 f"projection equirectangular: {what} cannot be used, because panoramas are files "
                 "that are cut into views with known cameras and rigs in the output folder"
             )
-        names = find_images(self._image_folder, self._output)
+        if self._image_folder is None or self._output is None:
+            return
+        folder = self._image_folder
+        names = find_images(folder, self._output)
         if source.image_list is not None:
-            names = select_listed_images(source.image_list, names, self._image_folder)
-        if options.projection == "auto":
-            if not are_panoramas(self._image_folder, names):
-                return
-            self._stages.notice(
+            names = select_listed_images(source.image_list, names, folder)
+        cameras: dict[str, pycolmap.Camera] | None = None
+        rigs: tuple[Rig, ...] = ()
+        if options.projection == "equirectangular":
+            notice = ""
+        elif options.projection == "auto" and not given and are_panoramas(folder, names):
+            notice = (
                 f"the {len(names)} images are panoramas of 360 x 180 degrees, which are cut into "
                 "views; --projection perspective takes them for ordinary photos"
             )
-        with self._stages.stage("panoramas"):
-            progress = partial(self._stages.stage_progress, "panoramas")
-            self._panorama_views = cut_panoramas(
-                self._image_folder,
-                names,
-                self._output / VIEWS_OF_PANORAMAS,
-                options.max_pixels,
-                progress,
+        elif source.cameras is not None and not source.poses and not source.matches:
+            cameras = find_wide_cameras(folder, names, source.cameras, options)
+            if not cameras:
+                return
+            notice = (
+                f"images with a field of view above {MAX_FIELD_OF_VIEW_DEG:g} degrees are cut into "
+                "views"
             )
-            self._image_folder = self._panorama_views.folder
+            names = [name for name in names if name in cameras]
+            rigs = self._read_given_rigs(names)
+        else:
+            return
+        if notice:
+            self._stages.notice(notice)
+        with self._stages.stage("views"):
+            self._cut = cut_images(
+                folder,
+                names,
+                self._output / CUT_VIEWS,
+                self._output / MASKS_OF_VIEWS,
+                options,
+                cameras=cameras,
+                rigs=rigs,
+                progress=partial(self._stages.stage_progress, "views"),
+            )
+            self._image_folder = self._cut.folder
 
     def _load_inputs(self) -> ImageSet:
         """Read image headers, intrinsics, poses and imported matches; check memory and disk."""
@@ -432,12 +456,14 @@ class _Run:
                     images = images.written_to(self._image_folder)
             else:
                 assert self._image_folder is not None
-                views = self._panorama_views
+                cut, options = self._cut, self._config.inputs
+                if cut is not None:
+                    options = options.model_copy(update={"masks": cut.masks})
                 images = load_images(
                     self._image_folder,
-                    source.cameras if views is None else views.cameras,
-                    source.image_list if views is None else None,
-                    self._config.inputs,
+                    source.cameras if cut is None else cut.cameras,
+                    source.image_list if cut is None else None,
+                    options,
                     model=source.camera_model,
                     without=self._output,
                 )
@@ -450,12 +476,11 @@ class _Run:
 
     def _read_rigs(self, images: ImageSet) -> tuple[Rig, ...]:
         """Return the rigs of the images, by default those of other COLMAP input files."""
-        source, rigs = self._source, self._source.rigs
-        if self._panorama_views is not None:
-            return (self._panorama_views.rig,)
-        if isinstance(rigs, Path):
-            rigs = read_rigs(rigs, images.names, self._image_folder)
-        elif rigs is None:
+        source = self._source
+        if self._cut is not None:
+            return self._cut.rigs
+        rigs = self._read_given_rigs(images.names)
+        if source.rigs is None:
             rigs = self._find_rigs(images)
         in_rig = {name for rig in rigs for name in rig.image_names}
         turned = [image for image in images if image.name in in_rig and image.orientation != 1]
@@ -466,6 +491,13 @@ class _Run:
                 "pixels and remove the EXIF orientation"
             )
         return () if turned else tuple(rigs)
+
+    def _read_given_rigs(self, names: Sequence[str]) -> tuple[Rig, ...]:
+        """Return the rigs that the user gave as such."""
+        rigs = self._source.rigs
+        if isinstance(rigs, Path):
+            return read_rigs(rigs, names, self._image_folder)
+        return tuple(rigs or ())
 
     def _find_rigs(self, images: ImageSet) -> tuple[Rig, ...]:
         """Return the rigs of the COLMAP database or models that the user gave for other inputs."""
@@ -636,7 +668,7 @@ class _Run:
         every = self._config.inputs.video.trajectory_every
         if not self._videos or not every:
             return
-        if self._panorama_views is not None:
+        if self._cut is not None:
             return  # the frames of a video between keyframes are not cut into views
         with self._stages.stage("trajectory"):
             progress = partial(self._stages.stage_progress, "trajectory")

@@ -11,7 +11,7 @@ import pytest
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.panorama import is_equirectangular
-from mpsfm_core.inputs.panorama_views import are_panoramas
+from mpsfm_core.inputs.view_cutting import are_panoramas
 from mpsfm_core.testing.synthetic.scenes import room_scene
 
 
