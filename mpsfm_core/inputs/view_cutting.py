@@ -64,6 +64,10 @@ class CutImages(NamedTuple):
     image, for panoramas with x right, y down and z to the middle of the panorama."""
     masks: Path | None
     """Folder of the masks of the views, None if all pixels of all views are used."""
+    view_names: dict[str, tuple[str, ...]]
+    """Names of the views of each image, or its own name if the image is copied."""
+    cutters: dict[str, ViewCutter | None]
+    """Views of each image, None if the image is copied."""
 
 
 class ViewCutter:
@@ -72,6 +76,7 @@ class ViewCutter:
     Attributes:
         camera: Camera of all views.
         rotations: (n, 3, 3) rotation ``view_from_camera`` of each view.
+        tiling: Numbers of the views that cover all directions with the least overlap.
     """
 
     def __init__(self, image_camera: pycolmap.Camera, nadir_angle_deg: float = 0.0) -> None:
@@ -94,6 +99,7 @@ class ViewCutter:
             visible_deg = float(find_visible_angles_deg(image_camera).max())
             self.camera = make_view_camera(2 * np.pi * image_camera.mean_focal_length())
             self.rotations = make_fisheye_view_rotations(visible_deg)
+        self.tiling = range(0, len(self.rotations), 2 if self.is_panorama else 1)
         self._maps: list[Float32] = []
         self._valid: list[Bool] = []
         size = image_camera.width, image_camera.height
@@ -108,14 +114,19 @@ class ViewCutter:
             self._maps.append((pixels - 0.5).astype(np.float32))
             self._valid.append(valid)
 
-    def cut(self, image: UInt8) -> list[UInt8]:
-        """Cut an image (h, w) or (h, w, 3) into its views, black outside of the image."""
+    def cut(self, image: UInt8, numbers: Iterable[int] | None = None) -> list[UInt8]:
+        """Cut an image into views, which are black outside of the image.
+
+        Args:
+            image: (h, w) or (h, w, 3) image.
+            numbers: Numbers of the views to cut, by default all.
+        """
         border = cv2.BORDER_WRAP if self.is_panorama else cv2.BORDER_CONSTANT
-        views = []
-        for pixels in self._maps:
-            view = cv2.remap(image, pixels, None, cv2.INTER_LINEAR, borderMode=border)
-            views.append(np.asarray(view, np.uint8))
-        return views
+        maps = self._maps if numbers is None else [self._maps[number] for number in numbers]
+        return [
+            np.asarray(cv2.remap(image, m, None, cv2.INTER_LINEAR, borderMode=border), np.uint8)
+            for m in maps
+        ]
 
     def cut_mask(self, mask: Bool) -> list[Bool]:
         """Return the mask (h, w) of each view, False at pixels that are not used.
@@ -253,7 +264,8 @@ def cut_images(
         if progress is not None:
             progress(number, len(names))
     view_rigs = _make_rigs(frames, cutter_of, rigs)
-    return CutImages(output, known, view_rigs, masks_output if writes_masks else None)
+    used_masks = masks_output if writes_masks else None
+    return CutImages(output, known, view_rigs, used_masks, frames, cutter_of)
 
 
 def _read_mask(

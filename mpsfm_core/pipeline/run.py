@@ -668,8 +668,6 @@ class _Run:
         every = self._config.inputs.video.trajectory_every
         if not self._videos or not every:
             return
-        if self._cut is not None:
-            return  # the frames of a video between keyframes are not cut into views
         with self._stages.stage("trajectory"):
             progress = partial(self._stages.stage_progress, "trajectory")
             for name, video in self._videos.items():
@@ -681,6 +679,7 @@ class _Run:
                     every,
                     progress,
                     subfolder=name,
+                    cut=self._cut,
                 )
 
     def _describe_videos(self) -> list[dict[str, Any]]:
