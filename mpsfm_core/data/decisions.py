@@ -168,6 +168,9 @@ class DoubtReason(ReasonCode):
     LOW_PARALLAX = ("low-parallax", "angle_deg")
     """The viewing rays of most 3D points are nearly parallel, so only the depth priors determine
     the depth of these points."""
+    SCALE_FROM_DEPTH = ("scale-from-depth", "scale_std_ratio", "depth_std_ratio")
+    """The matches determine the distances between frames of rigs up to the relative standard
+    deviation ``scale_std_ratio``, and depth priors up to ``depth_std_ratio``."""
     FEW_POINTS = ("few-points", "num_images", "min_points")
     """``num_images`` images observe fewer than ``min_points`` 3D points."""
     FEW_EXPLAINED_MATCHES = ("few-explained-matches", "num_images", "min_ratio")

@@ -16,7 +16,13 @@ from mpsfm_core.report.reasons import (
     explain_pair,
     explain_provider,
 )
-from mpsfm_core.report.verdict import is_focal_refined, judge
+from mpsfm_core.report.verdict import (
+    MAX_SCALE_STD_RATIO,
+    combine_stds,
+    find_scale_stds,
+    is_focal_refined,
+    judge,
+)
 
 Level = Literal["bad", "warning", "note"]
 _ORDER: tuple[Level, ...] = ("bad", "warning", "note")
@@ -60,6 +66,7 @@ def findings(summary: Mapping[str, Any]) -> list[Finding]:
         *_unconfirmed(summary),
         *_providers(summary),
         *_scale(summary),
+        *_distances(summary),
         *_focal_lengths(summary),
         *_distortions(summary),
         *_weak(summary),
@@ -240,6 +247,20 @@ def _scale(summary: Mapping[str, Any]) -> Iterator[Finding]:
                 f"By the depth maps of {_count(metric['num_images'], 'photo')}, one unit is about "
                 f"{metric['metres_per_unit']:.3g} m, with a spread of {metric['spread']:.0%}.",
                 "Measure one distance, or use a better metric depth network.",
+            )
+
+
+def _distances(summary: Mapping[str, Any]) -> Iterator[Finding]:
+    """Yield a finding if precise depth alone determines the distances between frames of rigs."""
+    for reconstruction in summary["reconstructions"][:1]:
+        stds = find_scale_stds(reconstruction)
+        if stds is not None and combine_stds(*stds) <= MAX_SCALE_STD_RATIO:
+            yield Finding(
+                "note",
+                "The distances between panoramas or frames of the rig come from depth",
+                f"Matches alone determine them only to {min(stds[0], 1.0):.0%}; the depth maps "
+                f"have a standard deviation of {stds[1]:.0%}.",
+                "Take two or more panoramas per room that see each other, and one in each door.",
             )
 
 

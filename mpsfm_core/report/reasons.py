@@ -287,6 +287,12 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "hardly moved, and depth comes from the depth network alone.",
         "Move sideways between photos instead of only turning or zooming.",
     ),
+    DoubtReason.SCALE_FROM_DEPTH: (
+        "distances from uncertain depth",
+        "Matches alone determine the distances between panoramas or frames of the rig only to "
+        "{scale_std_ratio:.0%}, and the depth maps only to {depth_std_ratio:.0%}.",
+        "Take two or more panoramas per room that see each other, and one in each door.",
+    ),
     DoubtReason.FEW_POINTS: (
         "poses from few points",
         "{num_images} photos see fewer than {min_points} points.",

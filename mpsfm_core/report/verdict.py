@@ -11,6 +11,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
+
 from mpsfm_core.data.decisions import DoubtReason, GpsReason, Reason, reason_from_json
 
 Level = Literal["good", "doubtful", "partial", "failed"]
@@ -24,6 +26,9 @@ MIN_UNEXPLAINED_PAIRS = 2
 """Minimum number of unexplained image pairs that make a model doubtful [ours]."""
 MIN_ANGLE_DEG = 0.5
 """Median triangulation angle in degrees below which depth comes from the priors alone [ours]."""
+MAX_SCALE_STD_RATIO = 0.1
+"""Relative standard deviation of the distances between frames of rigs, from matches and depth,
+above which the model is doubtful [tuned: benchmarks.panoramas]."""
 MIN_POINTS = 30
 """Minimum number of 3D points that support the pose of an image [COLMAP
 abs_pose_min_num_inliers]."""
@@ -87,6 +92,7 @@ def find_doubts(summary: Mapping[str, Any]) -> Iterator[Doubt]:
     yield from _unexplained_pairs(_sum_over_frames(summary))
     for reconstruction in summary["reconstructions"][:1]:
         yield from _weak_evidence(reconstruction["evidence"])
+        yield from _uncertain_distances(reconstruction)
     place = summary.get("georeference") or {}
     if place.get("why_not", {}).get("code") == GpsReason.FEW_INLIERS.value:
         values = {name: place["why_not"][name] for name in GpsReason.FEW_INLIERS.fields}
@@ -199,6 +205,39 @@ def _weak_evidence(evidence: Mapping[str, Any]) -> Iterator[Doubt]:
             num_images=len(unexplained), min_ratio=MIN_EXPLAINED_RATIO
         )
         yield Doubt(reason, unexplained)
+
+
+def find_scale_stds(reconstruction: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Return the relative std of distances between frames of rigs by matches, and by depth.
+
+    The depth errors of one frame are taken as equal, so many points do not reduce them.
+
+    Args:
+        reconstruction: entry of ``reconstructions`` of ``summary.json``.
+
+    Returns:
+        Both standard deviations, or None if matches alone determine the distances.
+    """
+    by_matches = reconstruction["evidence"].get("relative_scale_std")
+    if by_matches is None or by_matches <= MAX_SCALE_STD_RATIO:
+        return None
+    return by_matches, reconstruction["median_relative_depth_std"] or 1.0
+
+
+def combine_stds(first: float, second: float) -> float:
+    """Return the standard deviation of the weighted mean of two independent measurements."""
+    return float(1 / np.hypot(1 / first, 1 / second))
+
+
+def _uncertain_distances(reconstruction: Mapping[str, Any]) -> Iterator[Doubt]:
+    """Yield a doubt if neither matches nor depth determine the distances between frames."""
+    stds = find_scale_stds(reconstruction)
+    if stds is not None and combine_stds(*stds) > MAX_SCALE_STD_RATIO:
+        by_matches, by_depth = (round(min(std, 1.0), 3) for std in stds)
+        reason = DoubtReason.SCALE_FROM_DEPTH.because(
+            scale_std_ratio=by_matches, depth_std_ratio=by_depth
+        )
+        yield Doubt(reason)
 
 
 def _photos(number: int) -> str:

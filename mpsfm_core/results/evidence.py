@@ -19,6 +19,7 @@ from mpsfm_core.mapping.scene.reconstruction import (
     RegisteredImage,
     find_explained_matches,
 )
+from mpsfm_core.results.relative_scale import measure_relative_scale_std
 
 MIN_SHARED_POINTS = 3
 """Minimum number of common 3D points of connected images [minimal sample of PnP]."""
@@ -54,12 +55,15 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
         problem: mapping problem with images and verified pairs.
 
     Returns:
-        Plain data with the keys ``parts``, ``median_angle_deg``, ``images`` and ``frames``.
+        Plain data with the keys ``parts``, ``median_angle_deg``, ``relative_scale_std``,
+        ``images`` and ``frames``.
         ``parts`` are the image names of each connected part of the covisibility graph, largest part
         first. ``median_angle_deg`` is the median over the 3D points of the maximum triangulation
-        angle. ``images`` are the number of 3D points, the share of explained matches and the
-        predicted relative pose error (None without a prediction), by image name. ``frames`` are the
-        image names of each frame with several images.
+        angle. ``relative_scale_std`` is the largest relative standard deviation of a distance
+        between two frames of rigs without depth priors, or None. ``images`` are the number of 3D
+        points, the share of explained matches and the predicted relative pose error (None without a
+        prediction), by image name. ``frames`` are the image names of each frame with several
+        images.
     """
     frames = _group_by_frame(reconstruction, problem)
     frame_of = {image.name: number for number, frame in enumerate(frames) for image in frame}
@@ -79,6 +83,7 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
     return {
         "parts": _connected_parts(frames, len(reconstruction.points)),
         "median_angle_deg": _median_angle_deg(frames, reconstruction.points, is_shared),
+        "relative_scale_std": _relative_scale_std(frames, reconstruction.points, problem),
         "images": {
             image.name: {
                 "points": int(is_shared[_rows(frame)].sum()),
@@ -95,6 +100,16 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
 
 
 _Frame = list[RegisteredImage]
+
+
+def _relative_scale_std(
+    frames: list[_Frame], points: Float64, problem: MappingProblem
+) -> float | None:
+    """Return the relative std of distances between frames of rigs, None for single images."""
+    if not any(len(frame) > 1 for frame in frames):
+        return None
+    std = measure_relative_scale_std(frames, points, problem)
+    return None if std is None else round(std, 4)
 
 
 def _group_by_frame(reconstruction: Reconstruction, problem: MappingProblem) -> list[_Frame]:

@@ -192,6 +192,33 @@ def test_evidence_of_a_rig_counts_only_matches_between_frames() -> None:
     assert {i["explained_ratio"] for i in describe_evidence(model, apart)["images"].values()} == {0}
 
 
+def test_distances_between_frames_are_uncertain_without_points_of_three_frames() -> None:
+    problem = make_problem("panorama", 3).problem
+    (model,) = reconstruct(problem).reconstructions
+    certain = describe_evidence(model, problem)["relative_scale_std"]
+    assert certain < 0.01
+    seen = np.zeros((3, len(model.points)), dtype=bool)
+    for image in model.images:
+        seen[image.index // 8, image.point_ids[image.point_ids >= 0]] = True
+    # Points of odd rows connect the frames 0 and 1, all other points the frames 1 and 2.
+    odd = np.arange(len(model.points)) % 2 == 1
+    hidden = np.stack([~odd, np.zeros_like(odd), odd])
+    images = tuple(
+        replace(
+            image,
+            point_ids=np.where(hidden[image.index // 8][image.point_ids], -1, image.point_ids),
+        )
+        for image in model.images
+    )
+    uncertain = describe_evidence(replace(model, images=tuple(images)), problem)[
+        "relative_scale_std"
+    ]
+    assert uncertain > 0.2
+    two = make_problem("panorama", 2).problem
+    (pair,) = reconstruct(two).reconstructions
+    assert describe_evidence(pair, two)["relative_scale_std"] is None
+
+
 def test_colmap_model_has_rigs_and_frames() -> None:
     rig_problem = make_problem("stereo", 3)
     (model,) = reconstruct(rig_problem.problem).reconstructions

@@ -289,6 +289,22 @@ def test_verdict_doubts_weak_evidence(change: dict[str, Any], code: DoubtReason)
     assert doubts(report) == [code]
 
 
+@pytest.mark.parametrize(
+    ("scale_std", "depth_std", "is_doubtful", "has_note"),
+    [(0.5, 0.15, True, False), (0.5, 0.03, False, True), (0.01, 0.15, False, False)],
+    ids=["weak depth", "precise depth", "matches"],
+)
+def test_verdict_doubts_distances_that_neither_matches_nor_depth_determine(
+    scale_std: float, depth_std: float, is_doubtful: bool, has_note: bool
+) -> None:
+    report = summary()
+    report["reconstructions"][0]["median_relative_depth_std"] = depth_std
+    report["reconstructions"][0]["evidence"]["relative_scale_std"] = scale_std
+    assert doubts(report) == ([DoubtReason.SCALE_FROM_DEPTH] if is_doubtful else [])
+    notes = [item for item in findings(report) if item.level == "note"]
+    assert [note.title.endswith("come from depth") for note in notes] == [True] * has_note
+
+
 def test_verdict_doubts_a_model_that_gps_contradicts() -> None:
     report = summary()
     misfit = GpsReason.FEW_INLIERS.because(num_inliers=7, num_positions=24).to_json()
