@@ -12,9 +12,6 @@ VIEW_HALF_ANGLE_DEG = 45.0
 """Angle between the optical axis of a view of 90 degrees and the middle of its borders."""
 NUM_RING_VIEWS = 6
 """Number of views around the optical axis, so that adjacent views overlap at every angle. [ours]"""
-MAX_TILT_WITHOUT_CENTER_DEG = 30.0
-"""Largest tilt of the views around the optical axis that see the optical axis 15 degrees inside of
-their border, so that no further view is needed. [ours]"""
 _DEGREES = {
     "SIMPLE_FISHEYE": (),
     "FISHEYE": (),
@@ -111,17 +108,16 @@ def make_fisheye_view_rotations(half_angle_deg: float) -> Float64:
     """Return the rotations (n, 3, 3) of views of 90 degrees that cover a fisheye image.
 
     A rotation is ``view_from_camera``. All views are level: their x axis is horizontal in the
-    camera frame. Tilted views around the optical axis reach the border of the image, and a central
-    view follows if the tilt exceeds :data:`MAX_TILT_WITHOUT_CENTER_DEG`.
+    camera frame. The first view looks along the optical axis, and tilted views around the optical
+    axis reach the border of the image.
 
     Args:
         half_angle_deg: Largest angle from the optical axis that the image shows, in degrees.
     """
+    ring = 2 * np.pi * np.arange(NUM_RING_VIEWS) / NUM_RING_VIEWS
     tilt_deg = max(half_angle_deg - VIEW_HALF_ANGLE_DEG, 0.0)
-    azimuths = 2 * np.pi * np.arange(NUM_RING_VIEWS) / NUM_RING_VIEWS
-    tilt = np.full(NUM_RING_VIEWS, np.radians(tilt_deg))
-    if tilt_deg > MAX_TILT_WITHOUT_CENTER_DEG:
-        azimuths, tilt = np.append(azimuths, 0.0), np.append(tilt, 0.0)
+    azimuths = np.concatenate([[0.0], ring])
+    tilt = np.radians(np.concatenate([[0.0], np.full(NUM_RING_VIEWS, tilt_deg)]))
     forward = np.stack(
         [np.sin(tilt) * np.cos(azimuths), np.sin(tilt) * np.sin(azimuths), np.cos(tilt)], axis=1
     )

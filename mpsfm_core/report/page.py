@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 
 from mpsfm_core.data import Float64
@@ -119,6 +120,7 @@ def _payload(result: ResultFolder) -> dict[str, Any]:
             "sparse": _points(sparse_points(result.model, refined_maps, MAX_SPARSE_POINTS)),
             "dense": _points(dense_points(result.dense_cloud(), refined_maps, MAX_DENSE_POINTS)),
         },
+        "frames": _describe_frames(result.model, ids),
         "up": _estimate_up(refined_maps),
         "reconstructions": summary["reconstructions"],
         "scales": [describe_scale(summary, i) for i in range(len(summary["reconstructions"]))],
@@ -129,6 +131,25 @@ def _payload(result: ResultFolder) -> dict[str, Any]:
         "config": write_yaml(summary["config"]),
         "versions": summary["versions"],
     }
+
+
+def _describe_frames(
+    model: pycolmap.Reconstruction, ids: Mapping[str, int]
+) -> list[dict[str, Any]]:
+    """Return name, images and pose of each frame of a rig with several images, such as a panorama.
+
+    The name is that of the first image without the folder of its camera, and the pose is
+    ``world_from_rig`` (3 x 4, row-major).
+    """
+    described = []
+    for frame in model.frames.values():
+        names = sorted(model.images[data.id].name for data in frame.image_ids)
+        rows = [ids[name] for name in names if name in ids]
+        if len(rows) > 1:
+            pose = frame.rig_from_world.inverse().matrix()
+            name = names[0].split("/", 1)[-1]
+            described.append({"name": name, "photos": rows, "pose": _rounded(pose.ravel())})
+    return sorted(described, key=lambda entry: str(entry["name"]))
 
 
 class _ImageEntries:

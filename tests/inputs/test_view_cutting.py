@@ -200,7 +200,7 @@ def test_fisheye_images_are_cut_and_other_images_are_copied(tmp_path: Path) -> N
     (rig,) = views.rigs
     assert rig.frames == (tuple(f"camera{k}/wide.jpg" for k in range(7)),)
     assert views.masks is not None
-    assert not decode_mask(views.masks / "camera0/wide.jpg.png", 10**6).all()
+    assert not decode_mask(views.masks / "camera1/wide.jpg.png", 10**6).all()
 
 
 def test_narrow_fisheye_images_are_not_cut(tmp_path: Path) -> None:

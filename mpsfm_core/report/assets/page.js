@@ -57,6 +57,10 @@
         ["Scale", ...data.scales[0]],
       );
     }
+    if (data.frames.length) {
+      const sizes = data.frames.map((frame) => frame.photos.length);
+      tiles.push(["Frames of the rig", number(data.frames.length), `${Math.max(...sizes)} photos each, such as the views of a panorama; one pose a frame`]);
+    }
     tiles.push(["Time", time(total), data.memory_mb ? `${number(data.memory_mb / 1024, 1)} GB memory at most` : null]);
     for (const [label, value, hint] of tiles)
       byId("figures").append(el("div", {}, el("dt", {}, label), el("dd", {}, value, hint && el("small", {}, hint))));
@@ -123,6 +127,8 @@
       ["Error", photo.error === null ? "–" : `${number(photo.error, 2)} px`], ["Prior depth std", percent(photo.depth_std, 1)],
       ["Focal length", `${number(photo.refined_focal ?? photo.focal)} px`], ["from", photo.refined_focal ? `${photo.focal_from}, refined` : photo.focal_from],
     ];
+    const frame = data.frames.find(({ photos: rows }) => rows.includes(photos.indexOf(photo)));
+    if (frame) facts.push(["Frame", frame.name], ["Frame position", [3, 7, 11].map((i) => number(frame.pose[i], 2)).join(", ")]);
     for (const [name, value, std, digits] of photo.lens) facts.push([name, `${number(value, digits)} ± ${number(std, digits)}`]);
     know.append(el("dl", { class: "small" }, ...facts.map(([k, v]) => el("div", {}, el("dt", {}, k), el("dd", {}, v)))));
     know.append(el("h4", {}, partners[row].length ? `Matches with ${plural(partners[row].length, "photo")}` : "Matches no other photo"));
@@ -524,6 +530,15 @@
       return { group, lines, mesh, row };
     });
 
+    // Frames of rigs: a sphere around the origin of the rig, for a panorama its center.
+    const ball = new THREE.SphereGeometry(0.25, 16, 8);
+    const spheres = data.frames.map(({ pose }) => {
+      const sphere = new THREE.Mesh(ball, new THREE.MeshBasicMaterial({ color: "#4a7fd4", transparent: true, opacity: 0.5 }));
+      sphere.position.set(pose[3], pose[7], pose[11]);
+      scene.add(sphere);
+      return sphere;
+    });
+
     // To the photos that the selected one matches.
     const links = new THREE.LineSegments(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: "#e8833a", transparent: true, opacity: 0.7 }));
     scene.add(links);
@@ -568,6 +583,7 @@
         group.scale.setScalar(frustum * state.camera);
         mesh.visible = state.photos;
       }
+      for (const sphere of spheres) sphere.scale.setScalar(frustum * state.camera);
       draw();
     };
 

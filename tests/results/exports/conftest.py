@@ -11,7 +11,7 @@ import numpy as np
 import pycolmap
 import pytest
 
-from mpsfm_core.data import DepthPrior, MappingImage, MappingProblem, NormalPrior
+from mpsfm_core.data import DepthPrior, MappingImage, MappingProblem, NormalPrior, Rig
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.undistortion import undistort_camera
@@ -31,12 +31,29 @@ CAMERA = pycolmap.Camera(
 NAMES = ("a/0.png", "a/1.jpg", "2.webp", "guess.png")
 
 
+POSES = arc_poses(4, 12.0)
+
+
 @pytest.fixture(scope="session")
 def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write ``out/`` and ``photos/`` in room coordinates; the last image is tentatively
     registered."""
-    folder = tmp_path_factory.mktemp("result")
-    scene, poses = room_scene(), arc_poses(4, 12.0)
+    return write_result(tmp_path_factory.mktemp("result"))
+
+
+@pytest.fixture(scope="session")
+def rig_result(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write the same result, whose first two images are a frame of a rig."""
+    first, second = (np.vstack([pose, [0, 0, 0, 1]]) for pose in POSES[:2])
+    second_from_first = second @ np.linalg.inv(first)
+    sensors = (np.eye(3), np.zeros(3)), (second_from_first[:3, :3], second_from_first[:3, 3])
+    rig = Rig(sensors, (NAMES[:2], (NAMES[2], None)))
+    return write_result(tmp_path_factory.mktemp("rig_result"), (rig,))
+
+
+def write_result(folder: Path, rigs: tuple[Rig, ...] = ()) -> Path:
+    """Write ``out/`` and ``photos/`` in room coordinates into a folder, and return ``out/``."""
+    scene, poses = room_scene(), POSES
     pinhole = undistort_camera(CAMERA)
     points = scene.sample(
         pinhole, poses[0], np.random.default_rng(0).uniform([50, 35], [110, 85], (60, 2))
@@ -62,6 +79,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> Path:
     registered[-1] = replace(registered[-1], confirmed=False)
     metric = MetricScale(1.0, 0.01, 4, True)
     best = Reconstruction(tuple(registered), points, np.zeros(len(points)), metric)
+    best = replace(best, rigs=rigs)
     photos = OriginalImages(ImageSet(sources, InputOptions()), MappingProblem(tuple(problem)))
     component = ComponentResult.of(best, photos)
     summary = {
