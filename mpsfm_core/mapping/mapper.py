@@ -48,6 +48,7 @@ from mpsfm_core.mapping.initialization.view_graph_calibration import calibrate_v
 from mpsfm_core.mapping.model_selection import (
     MapperRun,
     compute_explained_ratios,
+    has_refuted_rigs,
     is_settled,
     select_run,
     sum_step_times,
@@ -81,9 +82,9 @@ def reconstruct(
     many matches observe no common 3D point, the mapper runs again with other random seeds. If
     guessed focal lengths were far off, the mapper runs again with the refined focal lengths. If a
     rig has an unknown relative pose, the mapper runs again with the rig that the first run
-    calibrates. The run with the most matches that observe common 3D points is kept. The same
-    problem, options and machine give bit-identical results, also if an interrupted run continues
-    from a checkpoint.
+    calibrates, and drops the rig if the rig explains fewer matches. The run with the most matches
+    that observe common 3D points is kept. The same problem, options and machine give bit-identical
+    results, also if an interrupted run continues from a checkpoint.
 
     Args:
         problem: Images with depth and normal priors, and geometrically verified matches.
@@ -108,8 +109,9 @@ def reconstruct(
         initial_problem = calibrate_rigs(distinct, initial_models) or distinct
     else:
         initial_problem = _calibrate_view_graph(distinct, options)
-    for run in runs:  # completed mapper runs, oldest first
-        initial_problem = _improve_problem(initial_problem, run, options) or initial_problem
+    for count in range(1, len(runs) + 1):  # completed mapper runs, oldest first
+        next_problem = _improve_problem(initial_problem, runs[:count], options)
+        initial_problem = next_problem or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):
         run_options = options.model_copy(update={"seed": options.seed + number})
         mapper = Mapper(initial_problem, run_options, events, pair_weights, initial_models)
@@ -124,10 +126,13 @@ def reconstruct(
         pair_weights = mapper.pair_weights
         if mapper.is_deterministic or initial_models:
             break
-        improved_problem = _improve_problem(initial_problem, runs[-1], options)
-        if improved_problem is not None:
-            initial_problem, pair_weights = improved_problem, None
-        elif is_settled(runs, options.enough_explained):
+        next_problem = _improve_problem(initial_problem, runs, options)
+        is_refuted = has_refuted_rigs(initial_problem, runs)
+        if next_problem is not None:
+            initial_problem, pair_weights = next_problem, None
+        if is_settled(runs[:-1] if is_refuted else runs, options.enough_explained) and (
+            next_problem is None or is_refuted
+        ):
             break
     checkpointer.save_completed(runs)
     selected = select_run(runs, options.consistency)
@@ -154,10 +159,15 @@ def _calibrate_view_graph(problem: MappingProblem, options: MapperOptions) -> Ma
 
 
 def _improve_problem(
-    problem: MappingProblem, run: MapperRun, options: MapperOptions
+    problem: MappingProblem, runs: Sequence[MapperRun], options: MapperOptions
 ) -> MappingProblem | None:
-    """Return the problem with focal lengths and rigs of a run, or None if they change little."""
-    improved = None
+    """Return the problem with focal lengths and rigs of the last run, or None if all change little.
+
+    Estimated rigs with which the last run explains fewer matches than an earlier run are dropped.
+    """
+    if has_refuted_rigs(problem, runs):
+        return replace(problem, rigs=tuple(rig for rig in problem.rigs if not rig.is_estimated))
+    run, improved = runs[-1], None
     if run.models and options.refinement.refine_focal:
         improved = apply_refined_focal_lengths(problem, run.models[0], options)
     return calibrate_rigs(improved or problem, run.models) or improved

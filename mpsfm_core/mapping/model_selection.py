@@ -74,6 +74,21 @@ def is_settled(runs: Sequence[MapperRun], min_explained_ratio: float) -> bool:
     return is_explained or any(_are_equal(run, last) for run in earlier)
 
 
+def has_refuted_rigs(problem: MappingProblem, runs: Sequence[MapperRun]) -> bool:
+    """Return True if the last run explains fewer matches with estimated rigs than an earlier run.
+
+    A camera that moves evenly looks like a rig, but such a rig contradicts many matches.
+
+    Args:
+        problem: Problem of the last run.
+        runs: All mapper runs, oldest first.
+    """
+    if not any(rig.is_estimated for rig in problem.rigs):
+        return False
+    *earlier, last = (run.largest_explained_ratio for run in runs)
+    return max(earlier, default=0.0) - last > MAX_RATIO_DIFFERENCE
+
+
 def select_run(runs: Sequence[MapperRun], options: ConsistencyOptions) -> MapperRun:
     """Select the run whose largest component explains the most matches.
 

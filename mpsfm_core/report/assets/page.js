@@ -530,13 +530,16 @@
       return { group, lines, mesh, row };
     });
 
-    // Frames of rigs: a sphere around the origin of the rig, for a panorama its center.
-    const ball = new THREE.SphereGeometry(0.25, 16, 8);
-    const spheres = data.frames.map(({ pose }) => {
-      const sphere = new THREE.Mesh(ball, new THREE.MeshBasicMaterial({ color: "#4a7fd4", transparent: true, opacity: 0.5 }));
-      sphere.position.set(pose[3], pose[7], pose[11]);
-      scene.add(sphere);
-      return sphere;
+    // Frames of rigs: an octahedron around the origin of the rig, for a panorama its center.
+    const tips = [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]].map((tip) => tip.map((x) => 0.3 * x));
+    const diamond = new THREE.BufferGeometry();
+    const ends = tips.flatMap((tip, i) => [tip, tips[(i + 1) % 4], tip, [0, 0, 0.3], tip, [0, 0, -0.3]]);
+    diamond.setAttribute("position", new THREE.BufferAttribute(new Float32Array(ends.flat()), 3));
+    const diamonds = data.frames.map(({ pose }) => {
+      const lines = new THREE.LineSegments(diamond, new THREE.LineBasicMaterial({ color: "#4a7fd4" }));
+      lines.position.set(pose[3], pose[7], pose[11]);
+      scene.add(lines);
+      return lines;
     });
 
     // To the photos that the selected one matches.
@@ -583,7 +586,7 @@
         group.scale.setScalar(frustum * state.camera);
         mesh.visible = state.photos;
       }
-      for (const sphere of spheres) sphere.scale.setScalar(frustum * state.camera);
+      for (const lines of diamonds) lines.scale.setScalar(frustum * state.camera);
       draw();
     };
 
