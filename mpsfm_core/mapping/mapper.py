@@ -161,7 +161,7 @@ def _calibrate_view_graph(problem: MappingProblem, options: MapperOptions) -> Ma
 def _improve_problem(
     problem: MappingProblem, runs: Sequence[MapperRun], options: MapperOptions
 ) -> MappingProblem | None:
-    """Return the problem with focal lengths and rigs of the last run, or None if all change little.
+    """Return the problem with focal lengths and rigs of the last run, None if unchanged.
 
     Estimated rigs with which the last run explains fewer matches than an earlier run are dropped.
     """

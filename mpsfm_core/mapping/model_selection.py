@@ -75,7 +75,7 @@ def is_settled(runs: Sequence[MapperRun], min_explained_ratio: float) -> bool:
 
 
 def has_refuted_rigs(problem: MappingProblem, runs: Sequence[MapperRun]) -> bool:
-    """Return True if the last run explains fewer matches with estimated rigs than an earlier run.
+    """Return True if a run without the estimated rigs explains more matches than the last.
 
     A camera that moves evenly looks like a rig, but such a rig contradicts many matches.
 

@@ -136,7 +136,7 @@ def _payload(result: ResultFolder) -> dict[str, Any]:
 def _describe_frames(
     model: pycolmap.Reconstruction, ids: Mapping[str, int]
 ) -> list[dict[str, Any]]:
-    """Return name, images and pose of each frame of a rig with several images, such as a panorama.
+    """Return name, images and pose of each frame of a rig, such as a panorama.
 
     The name is that of the first image without the folder of its camera, and the pose is
     ``world_from_rig`` (3 x 4, row-major).
