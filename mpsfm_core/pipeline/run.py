@@ -58,6 +58,7 @@ from mpsfm_core.mapping.scene.reconstruction import (
     MappingResult,
     Reconstruction,
     RegisteredImage,
+    compute_depth_maps,
     hold_out,
 )
 from mpsfm_core.pipeline import precompile, resources
@@ -337,6 +338,8 @@ class _Run:
         if not mapping.reconstructions:
             self._fail(images, extraction, mapping, originals)
         self._warn_of_uncalibrated_rigs(mapping.reconstructions[0])
+        with self._stages.stage("mapping"):
+            compute_depth_maps(mapping.reconstructions)
         mapping = self._georeference(images, mapping)
         mapping = self._densify(hold_out(mapping, self._config.dense.hold_out_every), originals)
         self._localize_frames(mapping, originals)

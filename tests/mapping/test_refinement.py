@@ -13,6 +13,7 @@ from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.depth_noise import DepthNoise
+from mpsfm_core.mapping.scene.depth_map import DepthRefinement
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -94,15 +95,17 @@ def test_refined_depth_changes_poses_only_if_bundle_depth_selects_it(
 ) -> None:
     group = mapped(0.01)
     scene, refiner = group.scene, group.refiner
-    refined = scene.maps[1].refined
-    assert refined is not None
+    refinement = scene.maps[1].refinement
+    assert refinement is not None
+    refined = refinement.result
     refiner.options = refiner.options.model_copy(update={"bundle_depth": bundle_depth})
     before = scene.snapshot()
     refiner.adjust([0, 1, 2])
     straight = scene.translations.copy()
     scene.restore(before)
     tilt = np.linspace(-0.2, 0.2, refined.log_depth.shape[1])
-    scene.maps[1].set_refined(replace(refined, log_depth=refined.log_depth + tilt))
+    tilted = replace(refined, log_depth=refined.log_depth + tilt)
+    scene.maps[1].set_refinement(DepthRefinement.from_result(tilted))
     refiner.adjust([0, 1, 2])
     assert np.array_equal(scene.translations, straight) != bends
 

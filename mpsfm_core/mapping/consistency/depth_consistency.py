@@ -51,9 +51,9 @@ from mpsfm_core.mapping.refinement.depth_noise import (
     find_well_constrained_keypoints,
     measure_local_depth_noise,
 )
+from mpsfm_core.mapping.scene.depth_map import DepthRefinement
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import StateDict
-from mpsfm_core.optimize.depth_integration import RefinedDepth
 from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, subsample_camera
 from mpsfm_core.support import jit
 
@@ -97,7 +97,7 @@ class DepthConsistencyCheck:
         self._scene = scene
         self._options = options
         self._fill_holes = fill_holes
-        self._grids: dict[int, tuple[_DepthMapState, _DepthGrid]] = {}
+        self._grids: dict[tuple[int, bool], tuple[_DepthMapState, _DepthGrid]] = {}
 
     def check_image(
         self,
@@ -165,6 +165,9 @@ class DepthConsistencyCheck:
     ) -> float:
         """Measure the share of pixels at which one image sees empty space and the other a surface.
 
+        The scaled depth priors are compared first, and the refined depth maps only if the priors
+        contradict each other. Most depth maps need not be refined for the check.
+
         Args:
             a: A registered image.
             b: Another registered image.
@@ -179,14 +182,18 @@ class DepthConsistencyCheck:
         scene, options = self._scene, self._options
         rotation = scene.rotations[b] @ scene.rotations[a].T
         translation = scene.translations[b] - rotation @ scene.translations[a]
-        return compute_violation_ratio(
-            self._get_grid(a, std_factor),
-            self._get_grid(b, std_factor),
-            rotation,
-            translation,
-            ViolationCriteria(options.max_deviation, options.min_gap, by_target_area),
-            limit,
-        )
+        criteria = ViolationCriteria(options.max_deviation, options.min_gap, by_target_area)
+        is_refined = any(scene.maps[image].refinement is not None for image in (a, b))
+
+        def measure(*, refined: bool) -> float:
+            grid_a = self._get_grid(a, std_factor, refined=refined)
+            grid_b = self._get_grid(b, std_factor, refined=refined)
+            return compute_violation_ratio(grid_a, grid_b, rotation, translation, criteria, limit)
+
+        if is_refined and math.isnan(limit):
+            return measure(refined=True)
+        ratio = measure(refined=False)
+        return measure(refined=True) if is_refined and ratio > limit else ratio
 
     def state_dict(self) -> StateDict:
         """Return the cached depth maps for a checkpoint, except depth maps that are outdated.
@@ -196,38 +203,43 @@ class DepthConsistencyCheck:
         """
         maps = self._scene.maps
         return {
-            str(image): {
-                "is_refined": key.refined is not None,
+            f"{image} {refined}": {
+                "image": image,
+                "refined": refined,
+                "has_refinement": key.refinement is not None,
                 "scale": key.scale,
                 "camera": {**vars(key.camera)},
                 "std_factor": key.std_factor,
                 "grid": grid._asdict(),
             }
-            for image, (key, grid) in self._grids.items()
-            if key.refined is None or key.refined is maps[image].refined
+            for (image, refined), (key, grid) in self._grids.items()
+            if key.refinement is None or key.refinement is maps[image].refinement
         }
 
     def load_state_dict(self, state: StateDict) -> None:
         """Restore the cached depth maps from a checkpoint, after the scene was restored."""
-        for image, cached in state.items():
-            refined = self._scene.maps[int(image)].refined if cached["is_refined"] else None
+        for cached in state.values():
+            image = cached["image"]
+            refinement = self._scene.maps[image].refinement if cached["has_refinement"] else None
             camera = PinholeCamera(**cached["camera"])
-            key = _DepthMapState(refined, cached["scale"], camera, cached["std_factor"])
-            self._grids[int(image)] = key, _DepthGrid(**cached["grid"])
+            key = _DepthMapState(refinement, cached["scale"], camera, cached["std_factor"])
+            self._grids[image, cached["refined"]] = key, _DepthGrid(**cached["grid"])
 
-    def _get_grid(self, image: int, std_factor: float) -> _DepthGrid:
+    def _get_grid(self, image: int, std_factor: float, *, refined: bool) -> _DepthGrid:
         """Return the subsampled depth map of an image, from the cache if the map is unchanged."""
         depth_map = self._scene.maps[image]
-        state = _DepthMapState(depth_map.refined, depth_map.scale, depth_map.camera, std_factor)
-        cached = self._grids.get(image)
+        state = _DepthMapState(depth_map.refinement, depth_map.scale, depth_map.camera, std_factor)
+        cached = self._grids.get((image, refined))
         if cached is None or cached[0] != state:
-            cached = self._grids[image] = state, self._make_grid(image, std_factor)
+            depth = depth_map.depth if refined else depth_map.scaled_prior
+            grid = self._make_grid(image, depth, std_factor)
+            cached = self._grids[image, refined] = state, grid
         return cached[1]
 
-    def _make_grid(self, image: int, std_factor: float) -> _DepthGrid:
+    def _make_grid(self, image: int, depth: Float32, std_factor: float) -> _DepthGrid:
         depth_map = self._scene.maps[image]
         step = compute_subsampling_step(depth_map.valid.shape[1], self._options.map_width)
-        depth = subsample(depth_map.depth, step)
+        depth = subsample(depth, step)
         valid = subsample(
             depth_map.valid, step
         ).copy()  # kernels compile again for read-only arrays
@@ -261,10 +273,11 @@ def find_overlapping_images(
     others = scene.registered_images() if candidates is None else candidates
     others = others[(others != image) & np.array([scene.maps[i].active for i in others])]
     depth_map = scene.maps[image]
-    rows, columns = depth_map.depth.shape
+    rows, columns = depth_map.prior.shape
     xy = pixel_centers(OVERLAP_GRID, OVERLAP_GRID) * [columns, rows] / OVERLAP_GRID
     at = xy[..., 1].astype(np.int64), xy[..., 0].astype(np.int64)
-    points = unproject(depth_map.camera, xy, depth_map.depth[at].astype(np.float64))
+    depth = depth_map.scale * depth_map.prior.depth[at].astype(np.float64)
+    points = unproject(depth_map.camera, xy, depth)
     world = (points[depth_map.valid[at]] - scene.translations[image]) @ scene.rotations[image]
     sizes = np.array([scene.problem.images[i].camera.size for i in others]).reshape(-1, 2)
     counts = count_visible_points(
@@ -333,7 +346,7 @@ class _DepthMapState(NamedTuple):
     is refined whenever these points change.
     """
 
-    refined: RefinedDepth | None
+    refinement: DepthRefinement | None
     scale: float
     camera: PinholeCamera
     std_factor: float

@@ -24,6 +24,7 @@ from mpsfm_core.mapping.refinement.self_calibration import (
     compute_intrinsic_priors,
     mask_guessed_focals,
 )
+from mpsfm_core.mapping.scene.depth_map import DepthRefinement
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     MIN_FOCAL_IMAGES,
     PredictedErrors,
@@ -48,7 +49,6 @@ from mpsfm_core.optimize.subsampling import (
     subsample_pixels,
     subsample_prior,
 )
-from mpsfm_core.support.threads import parallel_map
 
 MAX_LOCAL_TRACK_LENGTH = 15
 """Track length above which a point stays fixed in local bundle adjustment.
@@ -211,15 +211,17 @@ class Refiner:
                         scene.maps[image].set_scale(float(np.exp(np.median(log_scales))))
 
     def integrate(self, images: list[int]) -> None:
-        """Refine the depth maps of images by depth integration with the current points.
+        """Request the refinement of depth maps by depth integration with the current points.
 
-        Images whose depth scale is unknown are skipped.
+        The depth maps are refined when they are first used. Images whose depth scale is unknown are
+        skipped.
         """
         if not self.options.integrate:
             return
         images = [image for image in images if self.scene.maps[image].active]
         covariances = self._covariances(images)
-        parallel_map(lambda image: self._integrate(image, *covariances), images)
+        for image in images:
+            self._integrate(image, *covariances)
 
     def refine_depth(self, images: list[int]) -> None:
         """Measure depth noise, and refine the depth maps of images with the current points."""
@@ -549,10 +551,9 @@ class Refiner:
         good &= ~depth_map.keypoint_valid[rows] | self._near(ratio)
         xy = subsample_pixels(depth_map.keypoints[rows][good], self._step(image))
         anchors = Anchors(xy, z[good], variance[good])
-        refined = self._integrator(image).refine(
-            anchors, scale=depth_map.scale, start=depth_map.refined
+        depth_map.set_refinement(
+            DepthRefinement(self._integrator(image), anchors, depth_map.scale, depth_map.refinement)
         )
-        depth_map.set_refined(refined)
 
     def can_refine_focals(self) -> bool:
         """Return whether enough images are registered to refine a guessed focal length."""

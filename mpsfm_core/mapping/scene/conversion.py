@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpsfm_core.data import DepthPrior, PosedImage, SceneState
+from mpsfm_core.data import PosedImage, SceneState
 from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.data.decisions import CameraReason, Reason
 from mpsfm_core.geometry.focal_length import compute_equivalent_mm
 from mpsfm_core.geometry.statistics import MAD_TO_STD
+from mpsfm_core.mapping.scene.depth_map import LazyDepth
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     MIN_FOCAL_IMAGES,
     CalibrationOutcome,
@@ -127,8 +128,6 @@ def convert_image(
     errors = PredictedErrors.unknown(scene.num_images) if errors is None else errors
     pose_error_deg = float(errors.pose_deg[index])
     image, depth_map = scene.problem.images[index], scene.maps[index]
-    depth = depth_map.depth * np.float32(factor)
-    variance = (depth_map.log_std * depth) ** 2
     return RegisteredImage(
         index=index,
         name=image.name,
@@ -136,7 +135,9 @@ def convert_image(
         rotation=scene.rotations[index].copy(),
         translation=scene.translations[index] * factor,
         point_ids=scene.tracks.point_of[scene.graph.keypoints_of(index)].copy(),
-        depth=DepthPrior.from_arrays(depth, variance, depth_map.valid, metric=in_metres),
+        depth=LazyDepth(
+            depth_map.prior, depth_map.refinement, depth_map.scale * factor, metric=in_metres
+        ),
         scale=depth_map.scale * factor,
         camera_model=image.camera_model,
         distortion=scene.distortion[index].copy(),

@@ -2,12 +2,139 @@
 
 from __future__ import annotations
 
+from threading import Lock
+from typing import Any
+
 import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage, PinholeCamera
 from mpsfm_core.geometry import sample_bilinear, scale_pixels
-from mpsfm_core.optimize.depth_integration import RefinedDepth
+from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator, RefinedDepth
 from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, upsample
+
+
+class DepthRefinement:
+    """Refinement of a depth map that is computed when its result is first used.
+
+    The inputs are stored when the refinement is requested, so the result does not depend on when
+    it is computed.
+
+    Args:
+        integrator: Depth integrator of the image.
+        anchors: Triangulated points that constrain the depth map.
+        scale: Scale of the depth prior.
+        previous: Previous refinement of the depth map, from whose result the refinement starts.
+    """
+
+    def __init__(
+        self,
+        integrator: DepthIntegrator,
+        anchors: Anchors,
+        scale: float,
+        previous: DepthRefinement | None = None,
+    ) -> None:
+        self.scale = scale
+        self._inputs: tuple[DepthIntegrator, Anchors, DepthRefinement | None] | None
+        self._inputs = integrator, anchors, previous
+        self._result: RefinedDepth | None = None
+        self._lock = Lock()
+
+    @classmethod
+    def from_result(cls, result: RefinedDepth) -> DepthRefinement:
+        """Build a refinement from its result."""
+        refinement = cls.__new__(cls)
+        refinement.scale, refinement._inputs, refinement._result = result.scale, None, result
+        refinement._lock = Lock()
+        return refinement
+
+    @property
+    def result(self) -> RefinedDepth:
+        """The refined depth map, which is computed at the first access."""
+        pending = [self]
+        while (inputs := pending[-1]._inputs) is not None and inputs[2] is not None:
+            pending.append(inputs[2])
+        for refinement in reversed(pending):
+            refinement._compute()
+        assert self._result is not None
+        return self._result
+
+    def _compute(self) -> None:
+        """Compute the result from the result of the previous refinement."""
+        with self._lock:
+            if self._inputs is not None:
+                integrator, anchors, previous = self._inputs
+                start = previous._result if previous else None
+                self._result = integrator.refine(anchors, scale=self.scale, start=start)
+                self._inputs = None
+
+    def depth(self, prior: DepthPrior) -> Float32:
+        """Return the refined depth on the pixel grid of the prior, in world units.
+
+        If the depth was refined on a subsampled grid, its log ratio to the prior is interpolated.
+        """
+        refined = self.result
+        if refined.log_depth.shape == prior.shape:
+            return refined.depth
+        step = compute_subsampling_step(prior.shape[1], refined.log_depth.shape[1])
+        depth, valid = subsample(prior.depth, step), subsample(prior.valid, step)
+        change = refined.log_depth - np.log(refined.scale * np.where(valid, depth, 1.0))
+        factor = np.exp(upsample(change, valid, prior.shape))
+        upsampled: Float32 = prior.depth * np.float32(refined.scale) * factor
+        return upsampled
+
+    def __reduce__(self) -> tuple[object, tuple[RefinedDepth]]:
+        """Store only the result in a pickle."""
+        return DepthRefinement.from_result, (self.result,)
+
+
+class LazyDepth(DepthPrior):
+    """Depth map of a reconstruction, which is refined when its depth is first read.
+
+    The object then becomes an ordinary :class:`~mpsfm_core.data.DepthPrior`.
+
+    Args:
+        prior: Unscaled depth prior with variance.
+        refinement: Refinement of the depth map, or None to use the scaled prior.
+        scale: Scale of the depth prior, in world units per unit of the prior.
+        metric: True if the world unit is the meter.
+    """
+
+    def __init__(
+        self, prior: DepthPrior, refinement: DepthRefinement | None, scale: float, *, metric: bool
+    ) -> None:
+        # the arrays of the base class stay undefined, so that reading them calls __getattr__
+        vars(self).update(metric=metric, _inputs=(prior, refinement, scale), _lock=Lock())
+
+    def __getattr__(self, name: str) -> Any:
+        """Compute depth, variance and mask at the first access."""
+        if name not in ("depth", "variance", "valid"):
+            raise AttributeError(name)
+        lock = vars(self).get("_lock")
+        if lock is not None:
+            with lock:
+                self._compute()
+        return vars(self)[name]
+
+    def _compute(self) -> None:
+        """Scale depth to world units, with the relative variance of the prior."""
+        if "_inputs" not in vars(self):
+            return
+        prior, refinement, scale = vars(self)["_inputs"]
+        depth = prior.depth
+        if refinement is not None:
+            depth, scale = refinement.depth(prior), scale / refinement.scale
+        depth = depth * np.float32(scale)
+        ratio = depth / np.where(prior.valid, prior.depth, np.float32(1))
+        result = DepthPrior.from_arrays(
+            depth, prior.variance * ratio**2, prior.valid, metric=self.metric
+        )
+        vars(self).update(vars(result))
+        del vars(self)["_inputs"], vars(self)["_lock"]
+        object.__setattr__(self, "__class__", DepthPrior)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Store depth, variance and mask in a pickle."""
+        return DepthPrior, (self.depth, self.variance, self.valid, self.metric)
 
 
 class DepthMap:
@@ -19,7 +146,7 @@ class DepthMap:
         camera: Intrinsics in pixels of the depth map.
         scale: Scale of the depth prior, in world units per unit of the prior.
         active: True if the scale of the depth prior has been estimated.
-        refined: Refined depth of the image, or None before refinement.
+        refinement: Last refinement of the depth map, or None before refinement.
         log_std: (h, w) float32 standard deviation of the log depth prior, 0 where invalid.
         keypoints: (n, 2) float64 keypoints in pixels of the depth map.
         keypoint_valid: (n,) bool mask of the keypoints around which the depth prior is valid.
@@ -44,8 +171,9 @@ class DepthMap:
         self.typical_log_std = float(np.median(known)) if len(known) else np.nan
         self.scale = 1.0
         self.active = False
-        self.refined: RefinedDepth | None = None
-        self._use_prior()
+        self.refinement: DepthRefinement | None = None
+        self._best: Float32 | None = None
+        self._best_at: Float64 | None = None
 
     @property
     def valid(self) -> Bool:
@@ -55,7 +183,15 @@ class DepthMap:
     @property
     def depth(self) -> Float32:
         """(h, w) float32 refined depth, or scaled depth prior, in world units."""
-        depth: Float32 = self._best * np.float32(self._factor)
+        if self.refinement is None:
+            return self.scaled_prior
+        depth: Float32 = self._refined * np.float32(self.scale / self.refinement.scale)
+        return depth
+
+    @property
+    def scaled_prior(self) -> Float32:
+        """(h, w) float32 scaled depth prior, in world units."""
+        depth: Float32 = self.prior.depth * np.float32(self.scale)
         return depth
 
     @property
@@ -70,28 +206,20 @@ class DepthMap:
 
     def at_keypoints(self, rows: Int64 | slice = slice(None)) -> Float64:
         """Return the depth (m,) in world units at keypoints with a valid depth prior."""
-        return self._best_at[rows] * self._factor
+        if self.refinement is None:
+            return self._prior_at[rows] * self.scale
+        if self._best_at is None:
+            self._best_at = self._sample(self._refined)[0]
+        return self._best_at[rows] * (self.scale / self.refinement.scale)
 
     def set_scale(self, scale: float) -> None:
         """Set the scale of the depth prior, and rescale the refined depth by the same factor."""
         self.scale, self.active = scale, True
-        self._factor = scale / self.refined.scale if self.refined else scale
 
-    def set_refined(self, refined: RefinedDepth) -> None:
-        """Replace the scaled depth prior by refined depth.
-
-        If the depth was refined on a subsampled grid, its log ratio to the prior is interpolated.
-        """
-        self.refined = refined
-        self._best = refined.depth
-        if refined.log_depth.shape != self.prior.shape:
-            step = compute_subsampling_step(self.prior.shape[1], refined.log_depth.shape[1])
-            depth, valid = subsample(self.prior.depth, step), subsample(self.prior.valid, step)
-            change = refined.log_depth - np.log(refined.scale * np.where(valid, depth, 1.0))
-            factor = np.exp(upsample(change, valid, self.prior.shape))
-            self._best = self.prior.depth * np.float32(refined.scale) * factor
-        self._best_at = self._sample(self._best)[0]
-        self.set_scale(refined.scale)
+    def set_refinement(self, refinement: DepthRefinement) -> None:
+        """Replace the scaled depth prior by the result of a refinement."""
+        self.refinement, self._best, self._best_at = refinement, None, None
+        self.set_scale(refinement.scale)
 
     def resume(self, depth: DepthPrior, scale: float, width: int) -> None:
         """Load the refined depth map of a reconstruction.
@@ -106,7 +234,8 @@ class DepthMap:
         known = values[valid].astype(np.float64)
         log_depth = np.full(values.shape, np.log(np.median(known)) if len(known) else 0.0)
         log_depth[valid] = np.log(known)
-        self.set_refined(RefinedDepth.from_log_depth(log_depth, valid, scale))
+        refined = RefinedDepth.from_log_depth(log_depth, valid, scale)
+        self.set_refinement(DepthRefinement.from_result(refined))
 
     def set_camera(self, camera: PinholeCamera) -> None:
         """Set the intrinsics of the depth map from a camera in pixels of the image."""
@@ -115,11 +244,16 @@ class DepthMap:
 
     def reset(self) -> None:
         """Discard the scale and the refined depth of the depth map."""
-        self.scale, self.active, self.refined = 1.0, False, None
-        self._use_prior()
+        self.scale, self.active, self.refinement = 1.0, False, None
+        self._best = self._best_at = None
 
-    def _use_prior(self) -> None:
-        self._best, self._best_at, self._factor = self.prior.depth, self._prior_at, self.scale
+    @property
+    def _refined(self) -> Float32:
+        """(h, w) float32 refined depth, with the scale of its refinement."""
+        if self._best is None:
+            assert self.refinement is not None
+            self._best = self.refinement.depth(self.prior)
+        return self._best
 
     def _sample(self, values: Float32) -> tuple[Float64, Bool]:
         return sample_bilinear(values, self.prior.valid, self.keypoints)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
@@ -26,6 +26,7 @@ from mpsfm_core.mapping.scene.estimated_intrinsics import (
     IntrinsicEstimate,
 )
 from mpsfm_core.mapping.state import StateDict, reasons_from_json, reasons_to_json
+from mpsfm_core.support.threads import parallel_map
 
 _NO_ROWS = np.zeros(0, np.int64)
 VIEW_PARAMETERS = (
@@ -122,7 +123,8 @@ class RegisteredImage:
 
     def state_dict(self) -> StateDict:
         """Return the fields of the image as nested dictionaries, for a checkpoint."""
-        parts: StateDict = {"camera": {**vars(self.camera)}, "depth": {**vars(self.depth)}}
+        depth = {item.name: getattr(self.depth, item.name) for item in fields(self.depth)}
+        parts: StateDict = {"camera": {**vars(self.camera)}, "depth": depth}
         parts["camera_model"] = self.camera_model.value
         calibration = {p.name: result.state_dict() for p, result in self.calibration.items()}
         return {**vars(self), **parts, "calibration": calibration}
@@ -253,6 +255,12 @@ class MappingResult:
     """Disconnected components, the largest first, or an empty tuple if no initialization
     succeeded."""
     report: MappingReport
+
+
+def compute_depth_maps(reconstructions: Iterable[Reconstruction]) -> None:
+    """Compute the depth maps of reconstructions that were not read before, in parallel threads."""
+    images = [image for part in reconstructions for image in part.images]
+    parallel_map(lambda image: image.depth.depth, images)
 
 
 def hold_out(mapping: MappingResult, every: int | None) -> MappingResult:

@@ -11,7 +11,7 @@ from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, PinholeCamera
 from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.geometry.distortion import distort_rays, undistort_rays
-from mpsfm_core.mapping.scene.depth_map import DepthMap
+from mpsfm_core.mapping.scene.depth_map import DepthMap, DepthRefinement
 from mpsfm_core.mapping.scene.estimated_intrinsics import EstimatedIntrinsics
 from mpsfm_core.mapping.scene.graph import CorrespondenceGraph
 from mpsfm_core.mapping.scene.kernels import compute_max_triangulation_angles
@@ -31,7 +31,7 @@ class Snapshot(NamedTuple):
     intrinsics: Float64
     xyz: Float64
     point_of: Int64
-    maps: Sequence[tuple[float, bool, RefinedDepth | None]]
+    maps: Sequence[tuple[float, bool, DepthRefinement | None]]
     distortion: Float64
     estimated_intrinsics: StateDict
     rigs: StateDict
@@ -285,9 +285,18 @@ class Scene:
         return world
 
     def lift(self, keypoints: Int64) -> tuple[Float64, Bool]:
-        """Lift keypoints (m,) to world points (m, 3) by depth, with a mask (m,) of valid depth."""
-        depth, valid = self.depth_at(keypoints)
-        return self.at_depth(keypoints, depth), valid
+        """Lift keypoints (m,) to world points (m, 3) by their scaled depth priors.
+
+        Bundle adjustment moves the points to the depth that all observations support.
+
+        Returns:
+            World points (m, 3), and a mask (m,) of the points with known depth.
+        """
+        images = self.graph.image_of[keypoints]
+        is_active = np.array([depth_map.active for depth_map in self.maps], dtype=np.bool_)
+        depth = self.keypoint_prior[keypoints] * self.scales()[images]
+        valid = self.keypoint_valid[keypoints] & is_active[images] & (depth > 0)
+        return self.at_depth(keypoints, np.where(valid, depth, 0.0)), valid
 
     def project(self, keypoints: Int64, points: Float64) -> tuple[Float64, Float64]:
         """Project world points (m, 3) into the images of keypoints (m,).
@@ -371,7 +380,7 @@ class Scene:
 
     def snapshot(self) -> Snapshot:
         """Return a copy of the scene's state for :meth:`restore`."""
-        maps = [(m.scale, m.active, m.refined) for m in self.maps]
+        maps = [(m.scale, m.active, m.refinement) for m in self.maps]
         return Snapshot(
             self.rotations.copy(),
             self.translations.copy(),
@@ -400,19 +409,23 @@ class Scene:
         self.estimated_intrinsics.load_state_dict(snapshot.estimated_intrinsics)
         self.tracks.xyz = snapshot.xyz.copy()
         self.tracks.point_of = snapshot.point_of.copy()
-        for depth_map, (scale, active, refined) in zip(self.maps, snapshot.maps, strict=True):
+        for depth_map, (scale, active, refinement) in zip(self.maps, snapshot.maps, strict=True):
             is_same = (depth_map.scale, depth_map.active) == (scale, active)
-            if not is_same or depth_map.refined is not refined:
+            if not is_same or depth_map.refinement is not refinement:
                 depth_map.reset()
-                if refined is not None:
-                    depth_map.set_refined(refined)
+                if refinement is not None:
+                    depth_map.set_refinement(refinement)
                 if active:
                     depth_map.set_scale(scale)
 
     def state_dict(self) -> StateDict:
         """Return the state of the scene for a checkpoint."""
         maps = [
-            {"scale": m.scale, "active": m.active, "refined": m.refined and {**vars(m.refined)}}
+            {
+                "scale": m.scale,
+                "active": m.active,
+                "refined": m.refinement and {**vars(m.refinement.result)},
+            }
             for m in self.maps
         ]
         return {**self.snapshot()._asdict(), "maps": maps}
@@ -420,7 +433,11 @@ class Scene:
     def load_state_dict(self, state: StateDict) -> None:
         """Restore the state of the scene from a checkpoint of the same mapping problem."""
         maps = [
-            (m["scale"], m["active"], m["refined"] and RefinedDepth(**m["refined"]))
+            (
+                m["scale"],
+                m["active"],
+                m["refined"] and DepthRefinement.from_result(RefinedDepth(**m["refined"])),
+            )
             for m in state["maps"]
         ]
         self.restore(Snapshot(**{**state, "maps": maps}))
