@@ -190,6 +190,9 @@ class DoubtReason(ReasonCode):
     FOCAL_LENGTH_FROM_ONE_IMAGE = ("focal-length-from-one-image", "image")
     """The unknown focal length and the pose of a localized photo result from matches with a single
     image of the model."""
+    DEPTH_CONTRADICTS_MODEL = ("depth-contradicts-model", "violation_ratio", "other_image")
+    """At the pose of a localized photo, the ratio ``violation_ratio`` of its depth map contradicts
+    the depth of an image of the model."""
     MEANINGLESS_SCORES = ("meaningless-scores", "provider", "num_pairs")
     """The match scores of a matcher are not higher for inliers than for outliers."""
 

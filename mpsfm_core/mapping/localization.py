@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from mpsfm_core.data import Float64, Int64, MappingProblem, PinholeCamera, VerifiedPair
+from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, PinholeCamera, VerifiedPair
 from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.component import Component
 from mpsfm_core.mapping.event_log import EventLog
@@ -69,6 +69,9 @@ class LocalizedImage:
     matches: Mapping[str, tuple[Float64, Float64]]
     """Keypoints of the image and of an image of the model, each (m, 2) in pixels of the undistorted
     views, that observe the same 3D point, by name of the image of the model."""
+
+    contradiction: Reason | None = None
+    """``ImageReason.CONTRADICTS_IMAGE`` if the depth of the image contradicts the model."""
 
     @property
     def num_inliers(self) -> int:
@@ -167,7 +170,9 @@ class Localizer:
         """Estimate the poses of images that match each other, such as images of a sequence.
 
         An image that matches no image of the model can be registered by its matches with other
-        images.
+        images. Poses that agree with the depth of the model come first; images without such a pose
+        are registered without the depth check, and :attr:`LocalizedImage.contradiction` tells what
+        the check found.
 
         Args:
             images: Indices of the images in the mapping problem.
@@ -175,22 +180,31 @@ class Localizer:
         Returns:
             The localized image or the reason why it has no pose, for each of the images.
         """
-        component, scene = self._component, self._component.scene
-        before = component.maintenance.state()
+        maintenance, scene = self._component.maintenance, self._component.scene
+        before = maintenance.state()
         candidates = scene.mask(list(images))
-        while component.registration.register_next_image(candidates, wide=True):
-            pass
+        self._register(candidates)
+        checked = scene.registered.copy()
+        with maintenance.depth_check_disabled():
+            self._register(candidates)
         placed = [int(image) for image in np.flatnonzero(candidates & scene.registered)]
         self._refine(placed)
+        limit = self._options.consistency.max_violations
         outcomes = [
-            self._describe(image)
+            self._describe(image, None if checked[image] else maintenance.check_depth(image, limit))
             if scene.registered[image]
             else self._log.image_reasons[scene.problem.images[image].name]
             for image in images
         ]
-        component.maintenance.restore(before)
-        component.maintenance.thresholds.reset()
+        maintenance.restore(before)
         return outcomes
+
+    def _register(self, candidates: Bool) -> None:
+        """Register as many of the candidates as possible."""
+        while self._component.registration.register_next_image(candidates, wide=True):
+            pass
+        self._component.maintenance.thresholds.reset()
+        self._component.maintenance.history.clear()
 
     def _load(self, model: FixedModel) -> None:
         """Load poses, points and depth maps of the model into the scene."""
@@ -230,7 +244,7 @@ class Localizer:
         reason = ImageReason.TOO_FEW_POINTS_AFTER_REFINEMENT.because()
         component.maintenance.deregister(lost, reason)
 
-    def _describe(self, image: int) -> LocalizedImage:
+    def _describe(self, image: int, contradiction: Reason | None) -> LocalizedImage:
         """Copy pose, camera, covariance and inliers of a registered image."""
         scene, graph = self._component.scene, self._component.scene.graph
         edges = graph.edges_of(image)
@@ -253,6 +267,7 @@ class Localizer:
             len(np.unique(source[known])),
             scene.keypoints[inliers].copy(),
             matches,
+            contradiction,
         )
 
 

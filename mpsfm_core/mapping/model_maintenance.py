@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import NamedTuple
 
 import numpy as np
@@ -63,6 +64,7 @@ class ModelMaintenance:
         self._last_size = (0, 0)
         self._checked: Bool = np.zeros(self.scene.num_images, dtype=np.bool_)
         self._wrong_depth: frozenset[int] = frozenset()
+        self._checks_new_images = True
 
     @property
     def size(self) -> int:
@@ -193,7 +195,7 @@ class ModelMaintenance:
         Returns:
             None if the depth of the image is consistent, else the rejection reason.
         """
-        if not self.options.consistency.enabled:
+        if not self.options.consistency.enabled or not self._checks_new_images:
             return None
         limit = self.thresholds.tighten_violations(max_violations)
         with self.event_log.timed("depth check"):
@@ -215,6 +217,15 @@ class ModelMaintenance:
     def exclude_depth(self, images: Iterable[int]) -> None:
         """Exclude images with wrong depth from the depth check of new images."""
         self._wrong_depth = frozenset(images)
+
+    @contextmanager
+    def depth_check_disabled(self) -> Iterator[None]:
+        """Register new images without the check of their depth inside a ``with`` block."""
+        check, self._checks_new_images = self._checks_new_images, False
+        try:
+            yield
+        finally:
+            self._checks_new_images = check
 
     def confirm(self, image: int) -> None:
         """Notify the event receiver of a verified registration, and allow rejected poses again."""

@@ -336,6 +336,11 @@ class _Localization:
             for other, (xy, other_xy) in image.matches.items()
             if other in references
         }
+        contradiction = None
+        if image.contradiction is not None:
+            values = image.contradiction.values
+            other = str(values["other_image"])
+            contradiction = model_names.get(other, other), float(values["violation_ratio"])
         return LocalizedPhoto(
             source.name,
             (image.rotation, image.translation),
@@ -344,7 +349,7 @@ class _Localization:
             image.num_inliers,
             image.num_matches,
             matches,
-            find_pose_doubts(matches, focal_known=source.focal_known),
+            find_pose_doubts(matches, contradiction, focal_known=source.focal_known),
         )
 
 

@@ -335,6 +335,12 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "Give the focal length of the photo with --intrinsics, or add photos of this place to the "
         "model.",
     ),
+    DoubtReason.DEPTH_CONTRADICTS_MODEL: (
+        "depth contradicts the model",
+        "Matches support the pose, but {violation_ratio:.0%} of the depth map contradict the depth "
+        "of {other_image}: the photo may show a place that looks like this one.",
+        "Compare the photo with the matched images of the model.",
+    ),
     DoubtReason.MEANINGLESS_SCORES: (
         "meaningless match scores",
         "The scores of the matcher {provider} are not higher for inliers than for outliers in "

@@ -102,16 +102,25 @@ class LocalizedPhoto:
         }
 
 
-def find_pose_doubts(images: Collection[str], *, focal_known: bool) -> tuple[Reason, ...]:
+def find_pose_doubts(
+    images: Collection[str], contradiction: tuple[str, float] | None = None, *, focal_known: bool
+) -> tuple[Reason, ...]:
     """Return the reasons (``DoubtReason``) to doubt the pose of a localized photo.
 
     Args:
         images: Images of the model that observe the same points as the photo.
+        contradiction: Image of the model whose depth contradicts the photo, and the ratio of the
+            contradicting pixels.
         focal_known: True if the focal length of the photo was given.
     """
-    if focal_known or len(images) != 1:
-        return ()
-    return (DoubtReason.FOCAL_LENGTH_FROM_ONE_IMAGE.because(image=next(iter(images))),)
+    doubts = []
+    if not focal_known and len(images) == 1:
+        doubts.append(DoubtReason.FOCAL_LENGTH_FROM_ONE_IMAGE.because(image=next(iter(images))))
+    if contradiction is not None:
+        other, ratio = contradiction
+        reason = DoubtReason.DEPTH_CONTRADICTS_MODEL
+        doubts.append(reason.because(violation_ratio=ratio, other_image=other))
+    return tuple(doubts)
 
 
 def write_localization(

@@ -125,9 +125,13 @@ def test_wrong_depth_of_an_image_of_the_model_rejects_no_query(problem: MappingP
     problem = MappingProblem(images, tuple(map(without_upper_half, problem.pairs)))
     model = triangulate(problem)
     assert model.wrong_depth == (QUERY - 1,)
-    assert center_error(locate(problem, model)) < 0.01
-    outcome = Localizer(problem, replace(model, wrong_depth=()), OPTIONS).localize(QUERY)
-    assert isinstance(outcome, Reason)
+    found = locate(problem, model)
+    assert center_error(found) < 0.01 and found.contradiction is None
+    # Unless the wrong depth is known, the query is localized without the depth check.
+    unchecked = locate(problem, replace(model, wrong_depth=()))
+    assert center_error(unchecked) < 0.01 and unchecked.contradiction is not None
+    assert unchecked.contradiction.code is ImageReason.CONTRADICTS_IMAGE
+    assert unchecked.contradiction.values["other_image"] == last.name
 
 
 def test_localize_image_without_matches_returns_the_reason(

@@ -94,6 +94,12 @@ def test_focal_length_from_one_image_makes_the_pose_doubtful(
     assert not result.photos[QUERY].doubts
 
 
+def test_contradicting_depth_makes_the_pose_doubtful() -> None:
+    (doubt,) = find_pose_doubts(["a.jpg", "b.jpg"], ("a.jpg", 0.14), focal_known=True)
+    assert doubt.code is DoubtReason.DEPTH_CONTRADICTS_MODEL
+    assert "14%" in explain(doubt).text and "a.jpg" in explain(doubt).text
+
+
 def test_written_files_have_the_poses(folder: Path, result: mpsfm_core.LocalizationResult) -> None:
     pose = result.photos[QUERY].pose
     name, *numbers = (folder / "out" / "poses.txt").read_text().split()
