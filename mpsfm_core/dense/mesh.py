@@ -19,6 +19,7 @@ from scipy.sparse.csgraph import connected_components
 from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.fusion import compute_consistent_masks
+from mpsfm_core.dense.mesh_visibility import find_observed_triangles
 from mpsfm_core.dense.options import MeshOptions
 from mpsfm_core.geometry import (
     camera_center,
@@ -119,7 +120,7 @@ class _WeightedDepth(NamedTuple):
 def mesh_depth_maps(
     reconstruction: Reconstruction, view_of: Callable[[str], View], options: MeshOptions
 ) -> TriangleMesh:
-    """Extract a triangle mesh from all depth maps; unobserved regions remain open.
+    """Extract a triangle mesh from all depth maps, without triangles that no image observes.
 
     The mesh omits pixels with large depth std and inconsistent pixels, as the point cloud does.
 
@@ -155,6 +156,9 @@ def mesh_depth_maps(
     for map_ in maps:
         visible[map_.find_visible(vertices, voxel)[0]] = True
     triangles = triangles[visible[triangles].all(axis=1)]
+    vertices, triangles = _remove_unused_vertices(vertices, triangles)
+    # Noisy depth maps have hidden layers of surface behind or in front of each other.
+    triangles = triangles[find_observed_triangles(vertices, triangles, images)]
     triangles = _remove_islands(vertices, triangles, truncation)
     if not len(triangles):
         raise InputError(

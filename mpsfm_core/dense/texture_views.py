@@ -16,16 +16,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Float32, Float64, Int64
-from mpsfm_core.geometry import inside, project, sample_nearest, transform
-from mpsfm_core.geometry.rasterization import rasterize
+from mpsfm_core.data import Float32, Float64, Int64
+from mpsfm_core.dense.mesh_visibility import projected_areas
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 from mpsfm_core.support.jit import kernel
 
 NO_VIEW = -1
 """Label of triangles that no photo observes."""
-_OCCLUSION_TOLERANCE_EDGES = 2.0
-"""Depth tolerance of the occlusion test, in median edge lengths of the mesh."""
 _MIN_COSINE = 0.1
 """Minimum cosine of the angle between the normal of a triangle and the direction to the camera, as
 photos stretch steeper surfaces."""
@@ -102,12 +99,8 @@ def find_neighbors(triangles: Int64) -> Int64:
 def _find_candidates(
     vertices: Float64, triangles: Int64, images: Sequence[RegisteredImage]
 ) -> _Candidates:
-    edges = vertices[triangles] - vertices[np.roll(triangles, 1, axis=1)]
-    length = float(np.median(np.linalg.norm(edges, axis=2)))
-    world_area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1) / 2
     faces, views, areas = [], [], []
-    for index, image in enumerate(images):
-        projected = _projected_areas(image, vertices, triangles, world_area, length)
+    for index, projected in enumerate(projected_areas(vertices, triangles, images, _MIN_COSINE)):
         seen = np.flatnonzero(projected > 0)
         faces.append(seen)
         views.append(np.full(len(seen), index))
@@ -119,43 +112,6 @@ def _find_candidates(
     np.maximum.at(largest, face, area)
     starts = np.concatenate([[0], np.cumsum(np.bincount(face, minlength=len(triangles)))])
     return _Candidates(starts, view, (1 - area / largest[face]).astype(np.float32))
-
-
-def _projected_areas(
-    image: RegisteredImage,
-    vertices: Float64,
-    triangles: Int64,
-    world_area: Float64,
-    edge_length: float,
-) -> Float64:
-    """Compute the area (m,) of each triangle in pixels of an image, 0 if it is not visible."""
-    local = transform(image.rotation, image.translation, vertices)
-    xy = project(image.camera, local)
-    visible = _find_visible(image, local, triangles, xy, edge_length)
-    a, b, c = (xy[triangles[:, k]] for k in range(3))
-    # In images, whose y axis points down, triangles that face the camera are clockwise.
-    area = ((c - a)[:, 0] * (b - a)[:, 1] - (c - a)[:, 1] * (b - a)[:, 0]) / 2
-    depth = local[triangles, 2].mean(axis=1)
-    frontal = world_area * image.camera.fx * image.camera.fy / np.maximum(depth, 1e-12) ** 2
-    usable = visible[triangles].all(axis=1) & (area > _MIN_COSINE * frontal)
-    projected: Float64 = np.where(usable, area, 0.0)
-    return projected
-
-
-def _find_visible(
-    image: RegisteredImage, local: Float64, triangles: Int64, xy: Float64, edge_length: float
-) -> Bool:
-    """Return the mask (n,) of the vertices that no triangle occludes and the image contains."""
-    height, width = image.depth.shape
-    camera = image.camera.resized(width, height)
-    no_attributes = np.zeros((len(local), 0), np.float32)
-    nearest, _ = rasterize(local, no_attributes, triangles, camera.params, camera.size)
-    visible: Bool = inside(xy, image.camera.size) & (local[:, 2] > 0)
-    rows = np.flatnonzero(visible)
-    scaled = xy[rows] * (width / image.camera.width, height / image.camera.height)
-    tolerance = _OCCLUSION_TOLERANCE_EDGES * edge_length
-    visible[rows] = local[rows, 2] <= sample_nearest(nearest, scaled) + tolerance
-    return visible
 
 
 @kernel()

@@ -20,6 +20,7 @@ from mpsfm_core.cli import build_app
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
+from mpsfm_core.dense.mesh_visibility import find_observed_triangles
 from mpsfm_core.dense.options import MeshOptions
 from mpsfm_core.geometry import pixel_centers, unproject
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
@@ -189,3 +190,13 @@ def test_mesh_command_without_depth_maps_fails(result: Path) -> None:
         path.unlink()
     done = CliRunner().invoke(build_app(), ["mesh", str(result)])
     assert done.exit_code == 2 and "has no depth maps" in done.output
+
+
+def test_find_observed_triangles_omits_hidden_and_reversed_triangles(room: Room) -> None:
+    image = replace(room.reconstruction.images[0], rotation=np.eye(3), translation=np.zeros(3))
+    square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float64)
+    vertices = np.concatenate([0.3 * square + (0, 0, 3), 0.3 * square + (0, 0, 9)])
+    front = np.array([[0, 2, 1], [0, 3, 2]])
+    observed = find_observed_triangles(vertices, np.concatenate([front, front + 4]), [image])
+    np.testing.assert_array_equal(observed, [True, True, False, False])
+    assert not find_observed_triangles(vertices, front[:, ::-1], [image]).any()
