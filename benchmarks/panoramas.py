@@ -36,6 +36,7 @@ from mpsfm_core.data.result_layout import CUT_VIEWS
 from mpsfm_core.geometry import camera_center, compose, invert, rotation_angle_deg
 from mpsfm_core.geometry.panorama import make_view_rotations
 from mpsfm_core.inputs.models import reconstruction_poses
+from mpsfm_core.report.verdict import judge
 
 OVERRIDES = ("inputs.projection=equirectangular", "dense.enabled=false", "results.report=false")
 MAX_ANGLE_DEG, MAX_DISTANCE_M = 5.0, 0.5
@@ -231,8 +232,10 @@ def main() -> None:
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="mpsfm-panoramas-") as temporary:
         work = arguments.work or Path(temporary)
-        print("| panoramas a room | seed | mapper | panoramas | joined | deg | cm | scale | s |")
-        print("| ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |")
+        columns = ["panoramas a room", "seed", "mapper", "panoramas", "joined", "deg", "cm"]
+        columns += ["scale", "s", "verdict"]
+        print(f"| {' | '.join(columns)} |")
+        print("| ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: | --- |")
         for count in arguments.panoramas:
             for seed in arguments.seeds:
                 _compare(work / f"rooms{count}-{seed}", count, seed, arguments.size)
@@ -253,35 +256,38 @@ def _compare(folder: Path, count: int, seed: int, width: int) -> None:
         stored = folder / f"{mapper.replace(' ', '-')}.json"
         if not stored.is_file():
             start = time.perf_counter()
-            poses = _run(mapper, photos, folder, world, truth)
+            poses, verdict = _run(mapper, photos, folder, world, truth)
             seconds = time.perf_counter() - start
             record = {
                 "poses": {n: np.column_stack(pose).tolist() for n, pose in poses.items()},
                 "seconds": seconds,
+                "verdict": verdict,
             }
             stored.write_text(json.dumps(record), encoding="utf-8")
         record = json.loads(stored.read_text(encoding="utf-8"))
         matrices = {name: np.array(pose) for name, pose in record["poses"].items()}
         poses = {name: (matrix[:, :3], matrix[:, 3]) for name, matrix in matrices.items()}
         cells = measure(poses, truth)
-        print(f"| {count} | {seed} | {mapper} | {cells} | {record['seconds']:.0f} |", flush=True)
+        end = f"{record['seconds']:.0f} | {record['verdict']}"
+        print(f"| {count} | {seed} | {mapper} | {cells} | {end} |", flush=True)
 
 
 def _run(
     mapper: str, photos: Path, folder: Path, world: World, truth: Mapping[str, Pose]
-) -> dict[str, Pose]:
-    """Return ``panorama_from_world`` of the largest model of a mapper."""
+) -> tuple[dict[str, Pose], str]:
+    """Return ``panorama_from_world`` of the largest model of a mapper, and our verdict."""
     output = folder / mapper.replace(" ", "-")
     if mapper == "colmap":
         models = run_colmap(folder / "compact" / CUT_VIEWS)
-        return view_to_panorama(models[0]) if models else {}
+        return (view_to_panorama(models[0]) if models else {}), "-"
     depth = TrueDepth(world, truth) if mapper == "true depth" else None
     try:
         result = reconstruct(photos, output, "sift", depth=depth, overrides=OVERRIDES, fresh=True)
     except MpsfmError as error:
         print(f"{mapper}: {error}")
-        return {}
-    return view_to_panorama(result.mapping.reconstructions[0].poses)
+        return {}, "failed"
+    poses = view_to_panorama(result.mapping.reconstructions[0].poses)
+    return poses, judge(result.summary).level
 
 
 if __name__ == "__main__":
