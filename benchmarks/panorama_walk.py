@@ -27,6 +27,7 @@ import pycolmap
 from benchmarks.panoramas import TEXTURE_FACTOR, render_panorama, view_to_panorama
 from benchmarks.walks import FPS, ROOM, SPEED, build_rooms, make_path
 from mpsfm_core.data import Float64, Pose
+from mpsfm_core.data.result_layout import SUMMARY
 from mpsfm_core.evaluation.trajectories import read_trajectory
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.geometry.similarity import umeyama
@@ -112,7 +113,7 @@ def main() -> None:
 
 def print_errors(output: Path, truth: Float64, fps: float) -> None:
     """Print the verdict, and the errors of panoramas and of all frames."""
-    verdict = judge(read_summary(output))
+    verdict = judge(read_summary(output / SUMMARY))
     print(verdict.level, [doubt.reason.code.value for doubt in verdict.doubts])
     model = pycolmap.Reconstruction(str(output / "sparse"))
     poses = view_to_panorama(reconstruction_poses(model))
