@@ -100,7 +100,7 @@ def main() -> None:
         start = time.perf_counter()
         for command in (
             ["reconstruct", video, "-o", output, "--config", "sift", "--fresh"],
-            ["export", output, "gsplat"],
+            ["export", output, "--to", "gsplat"],
         ):
             subprocess.run([sys.executable, "-m", "mpsfm_core", *map(str, command)], check=True)
         used = resource.getrusage(resource.RUSAGE_CHILDREN)
