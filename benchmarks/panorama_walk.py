@@ -98,8 +98,9 @@ def main() -> None:
         missing = None if video.is_file() else video
         truth = write_video(missing, arguments.seconds, arguments.fps, arguments.width)
         start = time.perf_counter()
+        settings = ["--set", "dense.enabled=false", "--set", "runtime.workers=1"]
         for command in (
-            ["reconstruct", video, "-o", output, "--config", "sift", "--fresh"],
+            ["reconstruct", video, "-o", output, "--config", "sift", "--fresh", *settings],
             ["export", output, "--to", "gsplat"],
         ):
             subprocess.run([sys.executable, "-m", "mpsfm_core", *map(str, command)], check=True)
