@@ -139,6 +139,12 @@ def test_predict_calibration_errors_of_focal_length_matches_true_errors(
     assert 0.15 < normalized < 1.7
 
 
+def test_predict_calibration_errors_far_from_the_minimum_match_large_focal_errors() -> None:
+    true, predicted, _ = focal_errors(3, radial=-0.5)
+    assert (true > 0.1).all()
+    np.testing.assert_allclose(predicted, true, rtol=0.1)
+
+
 def test_predict_calibration_errors_with_overestimated_noise_are_below_the_stated_std() -> None:
     _, predicted, stated = focal_errors(8, noise_px=0.1)
     assert (predicted < 0.6 * stated).all()

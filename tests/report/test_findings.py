@@ -320,7 +320,7 @@ def test_verdict_doubts_guessed_focal_lengths_that_were_not_refined() -> None:
 
 
 @pytest.mark.parametrize("source", ["default", "exif"])
-@pytest.mark.parametrize(("std_px", "is_doubtful"), [(80.0, True), (20.0, False)])
+@pytest.mark.parametrize(("std_px", "is_doubtful"), [(100.0, True), (20.0, False)])
 def test_verdict_doubts_focal_lengths_with_large_std(
     source: str, std_px: float, is_doubtful: bool
 ) -> None:
