@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -144,6 +144,35 @@ def extend_matches(
     problem = merge_matches(first.problem, graph.assembled)
     second = describe(context, problem, graph)
     return Extraction(problem, merge_reports(first.report, second))
+
+
+def predict_priors_again(
+    images: ImageSet,
+    config: Config,
+    registry: Registry,
+    problem: MappingProblem,
+    events: ExtractionEvents | None = None,
+) -> MappingProblem:
+    """Replace the depth and normals of a mapping problem by predictions on other views.
+
+    Raises the same errors as :func:`extract`.
+
+    Args:
+        images: Images with the cameras of the mapping problem, in the same order.
+        config: Configuration with a provider of monocular depth.
+        registry: The installed providers.
+        problem: Mapping problem on the views of ``images``.
+        events: Receives progress.
+    """
+    context = ExtractionContext(images, config, registry, events or NullExtractionEvents())
+    with extraction_environment(context):
+        context.run_masks()
+        priors = predict_priors(context, None)
+    views = (
+        replace(view, depth=priors.depth[view.name], normals=priors.normals[view.name])
+        for view in problem.images
+    )
+    return replace(problem, images=tuple(views))
 
 
 def adjust_problem(

@@ -24,7 +24,12 @@ from mpsfm_core.dense.densify import densify
 from mpsfm_core.extraction.active_provider import thread_count, worker_count
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
-from mpsfm_core.extraction.runner import Extraction, extend_matches, extract
+from mpsfm_core.extraction.runner import (
+    Extraction,
+    extend_matches,
+    extract,
+    predict_priors_again,
+)
 from mpsfm_core.inputs.image_search import (
     check_images_folder,
     check_output_folder,
@@ -67,7 +72,7 @@ from mpsfm_core.pipeline.parts import PartMapper
 from mpsfm_core.pipeline.provider_resolution import ProviderResolution, resolve_providers
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.pipeline.trajectory import localize_frames
-from mpsfm_core.providers.provider_config import FROM_MATCHER
+from mpsfm_core.providers.provider_config import FROM_MATCHER, FROM_MULTIVIEW
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.report.page import write_report
@@ -75,6 +80,7 @@ from mpsfm_core.report.reasons import explain
 from mpsfm_core.results.georeference import georeference
 from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.refined_views import (
+    measure_distortion,
     refine_reconstructions,
     take_refined_camera,
     undistort_images,
@@ -99,6 +105,9 @@ from mpsfm_core.support.threads import limit_threads, thread_limit
 PathLike = str | Path
 
 _log = logging.getLogger(__name__)
+_MIN_DISTORTION = 0.1
+"""Relative displacement of the image corners by lens distortion from which depth is predicted again
+in undistorted images. [tuned: benchmarks.distortion]"""
 _MAX_LISTED_NAMES = 5
 
 
@@ -327,11 +336,12 @@ class _Run:
         images, extraction = self._extract(images)
         self._finish_compilation()
         mapping = self._map(extraction.problem.with_poses(self._known_poses))
-        views = images
+        undistorted, extraction, mapping = self._map_undistorted(images, extraction, mapping)
+        views = undistorted
         if self._config.has_second_pass:
-            extraction, views, mapping = self._run_second_pass(images, extraction, mapping)
+            extraction, views, mapping = self._run_second_pass(undistorted, extraction, mapping)
         refined = undistort_images(views, extraction.problem, mapping.reconstructions)
-        problem = undistort_problem(images, refined, extraction.problem)
+        problem = undistort_problem(undistorted, refined, extraction.problem)
         if refined is not views:
             mapping = self._refine_depth_maps(refined, problem, mapping)
         originals = OriginalImages(refined, problem)
@@ -557,6 +567,44 @@ class _Run:
             return part_mapping.reconstruct(
                 problem, options, self._stages, checkpoints, self._part_mapper()
             )
+
+    def _map_undistorted(
+        self, images: ImageSet, extraction: Extraction, mapping: MappingResult
+    ) -> tuple[ImageSet, Extraction, MappingResult]:
+        """Predict depth and map again in undistorted views, if the mapper found strong distortion.
+
+        Depth networks are trained on images without distortion.
+
+        Returns:
+            Images with refined cameras, extraction on their views, and result of the mapper.
+        """
+        config = self._config
+        refined = undistort_images(images, extraction.problem, mapping.reconstructions)
+        pairs = list(zip(refined, images, strict=True))
+        changed = np.array([new is not old for new, old in pairs])
+        shifts = [measure_distortion(new) for new, old in pairs if new is not old]
+        distortion = max(shifts, default=0.0)
+        if distortion < _MIN_DISTORTION or not self._predicts_from_one_view():
+            return images, extraction, mapping
+        self._stages.notice(
+            f"the lens moves the image corners by {distortion:.0%}, so {config.depth.use} predicts "
+            "depth again, from undistorted images"
+        )
+        with self._stages.stage("extraction"):
+            problem = undistort_problem(images, refined, extraction.problem)
+            problem = predict_priors_again(refined, config, self._registry, problem, self._stages)
+            problem = estimate_relative_poses(problem, changed, config.runtime.seed)
+            problem = calibrate_rigs(problem, mapping.reconstructions) or problem
+        mapping = self._map(problem.with_poses(self._known_poses))
+        return refined, replace(extraction, problem=problem), mapping
+
+    def _predicts_from_one_view(self) -> bool:
+        """Return whether depth and normals are predicted from single views, and not from files."""
+        depth, normals = self._config.depth.use, self._config.normals.use
+        if depth in (FROM_MATCHER, FROM_MULTIVIEW):
+            return False
+        specs = self._registry.spec("depth", depth), self._registry.spec("normals", normals)
+        return not any("uncached" in spec.capabilities for spec in specs)
 
     def _run_second_pass(
         self, images: ImageSet, extraction: Extraction, mapping: MappingResult

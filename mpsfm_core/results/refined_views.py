@@ -66,6 +66,16 @@ def undistort_images(
     return images.with_cameras(cameras) if cameras else images
 
 
+def measure_distortion(image: SourceImage) -> float:
+    """Measure the largest relative displacement of the corners of an image by lens distortion."""
+    camera = image.camera
+    center = np.array([camera.principal_point_x, camera.principal_point_y])
+    corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
+    offsets = camera.cam_from_img(corners) * (camera.focal_length_x, camera.focal_length_y)
+    ratios = np.linalg.norm(offsets, axis=1) / np.linalg.norm(corners - center, axis=1)
+    return float(np.nan_to_num(np.abs(ratios - 1)).max())
+
+
 def undistort_problem(
     images: ImageSet, refined: ImageSet, problem: MappingProblem
 ) -> MappingProblem:

@@ -7,6 +7,7 @@ from itertools import combinations
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 from mpsfm_core.config import RuntimeOptions
@@ -17,7 +18,9 @@ from mpsfm_core.extraction.options import AdjustmentOptions, ExtractionOptions, 
 from mpsfm_core.extraction.pairs import pairing as pairs
 from mpsfm_core.extraction.pairs import similarity as pair_similarity
 from mpsfm_core.extraction.priors.prior_maps import EDGE_VARIANCE
+from mpsfm_core.extraction.runner import predict_priors_again
 from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_angle_deg
+from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.providers import ProviderSpec, hookimpl
 from mpsfm_core.providers.provider_config import ProviderConfig
@@ -449,3 +452,19 @@ def test_provider_that_writes_to_its_view_raises(world) -> None:
     with pytest.raises(ProviderRunError):
         world.extract(runtime=runtime, **changes)
     assert np.array_equal(before, seen["view2.png"]) and before[:10].any()
+
+
+def test_predict_priors_again_replaces_priors_and_keeps_matches(world) -> None:
+    extraction = world.extract()
+    world.asked()
+    images = load_images(world.root / "images", world.root / "intrinsics.yaml")
+    camera = pycolmap.Camera(
+        model="SIMPLE_RADIAL", width=160, height=120, params=[140, 80, 60, -0.2], camera_id=1
+    )
+    refined = images.with_cameras({images[0].name: camera})
+    problem = predict_priors_again(refined, world.config(), world.registry, extraction.problem)
+    assert world.asked() == {"depth": 1, "normals": 1}  # other views have cached priors
+    for new, old in zip(problem.images, extraction.problem.images, strict=True):
+        np.testing.assert_array_equal(new.keypoints, old.keypoints)
+    assert problem.pairs is extraction.problem.pairs
+    assert problem.images[0].depth.shape != extraction.problem.images[0].depth.shape

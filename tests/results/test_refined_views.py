@@ -27,6 +27,7 @@ from mpsfm_core.mapping.scene.estimated_intrinsics import (
 from mpsfm_core.mapping.scene.reconstruction import CalibratedParameter, MappingResult
 from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.refined_views import (
+    measure_distortion,
     undistort_cameras,
     undistort_images,
     undistort_problem,
@@ -99,6 +100,16 @@ def test_undistort_problem_moves_keypoints_to_the_refined_pinhole_camera(images,
         np.testing.assert_allclose(view.keypoints[seen], expected, atol=1e-6)
         original = refined[image.index].original_pixels(view.keypoints)
         np.testing.assert_allclose(original, problem.images[image.index].keypoints, atol=1e-6)
+
+
+def test_measure_distortion_is_the_relative_shift_of_the_corners(images) -> None:
+    distorted = replace(images[0], camera=TRUE)
+    corner = np.array([80.0, 60.0])
+    (ray,) = TRUE.cam_from_img(np.zeros((1, 2)))
+    expected = FOCAL_PX * np.linalg.norm(ray) / np.linalg.norm(corner) - 1
+    assert measure_distortion(images[0]) == pytest.approx(0)
+    assert measure_distortion(distorted) == pytest.approx(expected)
+    assert 0.05 < expected < 0.2
 
 
 def test_undistort_images_gives_unregistered_images_the_shared_camera(images, mapped) -> None:

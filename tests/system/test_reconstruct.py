@@ -104,7 +104,10 @@ def test_default_focal_length_is_refined_and_reported(photo_scene, mpsfm, tmp_pa
     assert f"focal length refined from {guess:.0f} (default) to {told[1]:.0f} px" in ended.out
 
 
-def test_radial_distortion_is_estimated_for_all_results(photo_scene, mpsfm, tmp_path: Path) -> None:
+@pytest.mark.parametrize("depth", ["files", "flat"])
+def test_radial_distortion_is_estimated_for_all_results(
+    photo_scene, mpsfm, tmp_path: Path, depth: str
+) -> None:
     (camera,) = pycolmap.Reconstruction(str(photo_scene.truth)).cameras.values()
     distorted = pycolmap.Camera(
         model="SIMPLE_RADIAL", width=320, height=240, params=[280, 160, 120, -0.2]
@@ -120,10 +123,12 @@ def test_radial_distortion_is_estimated_for_all_results(photo_scene, mpsfm, tmp_
         output,
         "--set",
         f"inputs.default_focal_ratio={1.06 * 280 / 320}",
+        *([] if depth == "files" else ["--set", f"depth={{use: {depth}}}"]),
         *POSES_ONLY,
     )
     assert ended.code == 0, ended.err
     assert "radial distortion estimated as -0." in ended.out
+    assert ("flat predicts depth again" in ended.err) == (depth == "flat")
     model = pycolmap.Reconstruction(str(output / "sparse"))
     (refined,) = model.cameras.values()
     assert refined.model_name == "SIMPLE_RADIAL"
