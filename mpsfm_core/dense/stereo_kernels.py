@@ -37,7 +37,8 @@ def compute_ncc_costs(
 ) -> None:
     """Compute the photo-consistency cost ``250 * (1 - NCC)`` of each label in one source view.
 
-    Each pixel of a window is warped with its own depth, so the window follows the base surface.
+    Each pixel of a window is warped with its own depth, so the window follows the base surface. The
+    loops over the columns of a row contain few branches, so that they are vectorized.
 
     Args:
         reference: (h, w) gray values of the reference view.
@@ -55,65 +56,80 @@ def compute_ncc_costs(
     rows, columns = source.shape
     warped = np.zeros((height, width), np.float32)
     seen = np.zeros((height, width), np.float32)
-    column_sums = np.zeros((6, width), np.float32)
+    us, vs = np.zeros(width, np.float32), np.zeros(width, np.float32)
+    # Sums over the rows and over all pixels of a window: number of pixels, gray values of both
+    # views, their squares, and their product. The sums of rows have a border of `radius` zeros.
+    column_sums = np.zeros((6, width + 2 * radius), np.float32)
+    sums = np.zeros((6, width), np.float32)
+    ux, vx, wx = np.float32(matrix[0, 0]), np.float32(matrix[1, 0]), np.float32(matrix[2, 0])
+    u0, v0, w0 = np.float32(offset[0]), np.float32(offset[1]), np.float32(offset[2])
+    half, noise_variance = np.float32(0.5), np.float32(noise)
     for label in range(len(offsets)):
         factor = np.float32(math.exp(offsets[label]))
-        for i in range(height):
-            y = i + 0.5
-            start0 = matrix[0, 1] * y + matrix[0, 2]
-            start1 = matrix[1, 1] * y + matrix[1, 2]
-            start2 = matrix[2, 1] * y + matrix[2, 2]
-            for j in range(width):
-                x = j + 0.5
-                depth = base[i, j] * factor
-                w = depth * (matrix[2, 0] * x + start2) + offset[2]
-                warped[i, j] = 0.0
-                seen[i, j] = 0.0
-                if depth <= 0.0 or w <= 1e-6:
-                    continue
-                inverse = 1.0 / w
-                u = (depth * (matrix[0, 0] * x + start0) + offset[0]) * inverse - 0.5
-                v = (depth * (matrix[1, 0] * x + start1) + offset[1]) * inverse - 0.5
-                if u < 0.0 or v < 0.0 or u >= columns - 1 or v >= rows - 1:
-                    continue
-                c, r = int(u), int(v)
-                a, b = np.float32(u - c), np.float32(v - r)
-                top = source[r, c] + a * (source[r, c + 1] - source[r, c])
-                bottom = source[r + 1, c] + a * (source[r + 1, c + 1] - source[r + 1, c])
-                warped[i, j] = top + b * (bottom - top)
-                seen[i, j] = 1.0
-        for i in range(height):
-            first, last = max(0, i - radius), min(height - 1, i + radius)
-            column_sums[:] = 0.0
-            for k in range(first, last + 1):
+        column_sums[:] = 0.0
+        for last in range(height + radius):
+            if last < height:
+                y = last + 0.5
+                ray_u = np.float32(matrix[0, 1] * y + matrix[0, 2])
+                ray_v = np.float32(matrix[1, 1] * y + matrix[1, 2])
+                ray_w = np.float32(matrix[2, 1] * y + matrix[2, 2])
                 for j in range(width):
-                    reference_value, source_value = reference[k, j], warped[k, j]
-                    weight = seen[k, j]
-                    column_sums[0, j] += weight
-                    column_sums[1, j] += reference_value * weight
-                    column_sums[2, j] += source_value
-                    column_sums[3, j] += reference_value * reference_value * weight
-                    column_sums[4, j] += source_value * source_value
-                    column_sums[5, j] += reference_value * source_value
+                    x = np.float32(j) + half
+                    depth = base[last, j] * factor
+                    w = depth * (wx * x + ray_w) + w0
+                    inverse = np.float32(1.0) / w
+                    us[j] = (depth * (ux * x + ray_u) + u0) * inverse - half
+                    vs[j] = (depth * (vx * x + ray_v) + v0) * inverse - half
+                    if depth <= 0.0 or w <= np.float32(1e-6):
+                        us[j] = np.float32(-1.0)
+                for j in range(width):
+                    u, v = us[j], vs[j]
+                    if u >= 0.0 and v >= 0.0 and u < columns - 1 and v < rows - 1:
+                        c, r = int(u), int(v)
+                        a, b = u - np.float32(c), v - np.float32(r)
+                        top = source[r, c] + a * (source[r, c + 1] - source[r, c])
+                        bottom = source[r + 1, c] + a * (source[r + 1, c + 1] - source[r + 1, c])
+                        warped[last, j] = top + b * (bottom - top)
+                        seen[last, j] = 1.0
+                    else:
+                        warped[last, j] = 0.0
+                        seen[last, j] = 0.0
+                for j in range(width):
+                    gray, source_gray = seen[last, j] * reference[last, j], warped[last, j]
+                    column_sums[0, j + radius] += seen[last, j]
+                    column_sums[1, j + radius] += gray
+                    column_sums[2, j + radius] += source_gray
+                    column_sums[3, j + radius] += gray * gray
+                    column_sums[4, j + radius] += source_gray * source_gray
+                    column_sums[5, j + radius] += gray * source_gray
+            first = last - 2 * radius - 1
+            if first >= 0:
+                for j in range(width):
+                    gray, source_gray = seen[first, j] * reference[first, j], warped[first, j]
+                    column_sums[0, j + radius] -= seen[first, j]
+                    column_sums[1, j + radius] -= gray
+                    column_sums[2, j + radius] -= source_gray
+                    column_sums[3, j + radius] -= gray * gray
+                    column_sums[4, j + radius] -= source_gray * source_gray
+                    column_sums[5, j + radius] -= gray * source_gray
+            i = last - radius
+            if i < 0:
+                continue
+            for k in range(6):
+                for j in range(width):
+                    sums[k, j] = column_sums[k, j]
+                for column in range(1, 2 * radius + 1):
+                    for j in range(width):
+                        sums[k, j] += column_sums[k, j + column]
             for j in range(width):
-                if seen[i, j] == 0.0:
-                    costs[label, i, j] = UNSEEN
-                    continue
-                n = s1 = s2 = s11 = s22 = s12 = np.float32(0.0)
-                for k in range(max(0, j - radius), min(width - 1, j + radius) + 1):
-                    n += column_sums[0, k]
-                    s1 += column_sums[1, k]
-                    s2 += column_sums[2, k]
-                    s11 += column_sums[3, k]
-                    s22 += column_sums[4, k]
-                    s12 += column_sums[5, k]
-                inverse_n = np.float32(1.0) / n
-                reference_variance = s11 * inverse_n - (s1 * inverse_n) ** 2 + noise
-                source_variance = s22 * inverse_n - (s2 * inverse_n) ** 2 + noise
-                covariance = s12 * inverse_n - s1 * s2 * inverse_n * inverse_n
-                ncc = covariance / math.sqrt(max(reference_variance * source_variance, 1e-12))
-                cost = (1.0 - ncc) * MAX_COST
-                costs[label, i, j] = np.uint8(min(max(cost, 0.0), MAX_COST))
+                inverse_n = np.float32(1.0) / max(sums[0, j], np.float32(1.0))
+                mean, source_mean = sums[1, j] * inverse_n, sums[2, j] * inverse_n
+                variance = sums[3, j] * inverse_n - mean * mean + noise_variance
+                source_variance = sums[4, j] * inverse_n - source_mean**2 + noise_variance
+                covariance = sums[5, j] * inverse_n - mean * source_mean
+                ncc = covariance / np.sqrt(max(variance * source_variance, np.float32(1e-12)))
+                cost = min(max((np.float32(1.0) - ncc) * MAX_COST, np.float32(0.0)), MAX_COST)
+                costs[label, i, j] = np.uint8(cost) if seen[i, j] > 0.0 else np.uint8(UNSEEN)
 
 
 @kernel(fastmath=_FASTMATH)
