@@ -22,7 +22,7 @@ The steps of :func:`reconstruct`, compared with COLMAP's ``IncrementalMapper``::
             component.finalize()                        # global refinement, depth check of all
         stop if enough matches are explained, no guessed focal length was far off, no image
             deviates from the focal length of its shared camera, and no rig got calibrated
-    select the run that explains the most matches
+    select the run with the highest score               # likelihood of matches and depth
     register duplicates in the poses of their originals
     register the remaining images tentatively           # if this option is set
 """
@@ -82,9 +82,9 @@ def reconstruct(
     many matches observe no common 3D point, the mapper runs again with other random seeds. If
     guessed focal lengths were far off, the mapper runs again with the refined focal lengths. If a
     rig has an unknown relative pose, the mapper runs again with the rig that the first run
-    calibrates, and drops the rig if the rig explains fewer matches. The run with the most matches
-    that observe common 3D points is kept. The same problem, options and machine give bit-identical
-    results, also if an interrupted run continues from a checkpoint.
+    calibrates, and drops the rig if the rig explains fewer matches. The run with the highest
+    score (likelihood of matches and depth) is kept. The same problem, options and machine give
+    bit-identical results, also if an interrupted run continues from a checkpoint.
 
     Args:
         problem: Images with depth and normal priors, and geometrically verified matches.
@@ -135,7 +135,7 @@ def reconstruct(
         ):
             break
     checkpointer.save_completed(runs)
-    selected = select_run(runs, options.consistency)
+    selected = select_run(runs, distinct)
     models = list(selected.models)
     distinct = calibrate_rigs(distinct, models) or distinct
     if models and options.register_tentatively:

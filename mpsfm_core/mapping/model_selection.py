@@ -1,8 +1,8 @@
 """Selection of one result among mapper runs with different seeds.
 
-The selected run has the component that explains the largest share of the match scores. A component
-explains a match if both keypoints of the match observe the same 3D point. Among runs that explain
-equal shares of the match scores, the run with the best agreement of its depth maps is selected.
+Runs stop when the components explain enough matches, or when two runs give the same result. A
+component explains a match if both keypoints of the match observe the same 3D point. The run with
+the highest score (:mod:`~mpsfm_core.mapping.reconstruction_score`) is selected.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from mpsfm_core.data import MappingProblem
-from mpsfm_core.mapping.consistency.depth_agreement import measure_depth_agreement
-from mpsfm_core.mapping.options import ConsistencyOptions
+from mpsfm_core.mapping.reconstruction_score import score_reconstruction
 from mpsfm_core.mapping.scene.reconstruction import (
     MappingReport,
     Reconstruction,
@@ -89,29 +88,27 @@ def has_refuted_rigs(problem: MappingProblem, runs: Sequence[MapperRun]) -> bool
     return max(earlier, default=0.0) - last > MAX_RATIO_DIFFERENCE
 
 
-def select_run(runs: Sequence[MapperRun], options: ConsistencyOptions) -> MapperRun:
-    """Select the run whose largest component explains the most matches.
+def select_run(runs: Sequence[MapperRun], problem: MappingProblem) -> MapperRun:
+    """Select the run whose components have the highest score.
 
-    Among runs that explain equal shares of the match scores, those with the most calibrated rigs
-    are considered, and the result that occurs in most runs is selected. Among equally frequent
-    results, the result with the best agreement of its depth maps is selected.
+    A run with fewer calibrated rigs is selected only if it explains clearly more matches.
+
+    Args:
+        runs: Mapper runs, oldest first.
+        problem: Mapping problem with the matches that the score compares with the poses.
     """
     max_ratio = max(run.largest_explained_ratio for run in runs)
-    candidates = [
-        run for run in runs if max_ratio - run.largest_explained_ratio < MAX_RATIO_DIFFERENCE
-    ]
-    num_rigs = max(run.num_rigs for run in candidates)
-    candidates = [run for run in candidates if run.num_rigs == num_rigs]
-    counts = [sum(_are_equal(run, other) for other in runs) for run in candidates]
-    frequent = [run for run, count in zip(candidates, counts, strict=True) if count == max(counts)]
-    if len(frequent) == 1 or not max_ratio:
-        return frequent[0]
+    num_rigs = max(
+        run.num_rigs
+        for run in runs
+        if max_ratio - run.largest_explained_ratio < MAX_RATIO_DIFFERENCE
+    )
+    candidates = [run for run in runs if run.num_rigs == num_rigs]
+    if len(candidates) == 1:
+        return candidates[0]
     return max(
-        frequent,
-        key=lambda run: (
-            measure_depth_agreement(run.models[0], options),
-            run.largest_explained_ratio,
-        ),
+        candidates,
+        key=lambda run: sum(score_reconstruction(model, problem).total for model in run.models),
     )
 
 

@@ -1,4 +1,4 @@
-"""Tests of model selection among runs with different seeds, by the share of explained matches."""
+"""Tests of model selection among runs with different seeds."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.data import MappingProblem, PinholeCamera
-from mpsfm_core.mapping.consistency.depth_agreement import measure_depth_agreement
+from mpsfm_core.data import MappingProblem, PinholeCamera, Rig
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.model_selection import (
     MapperRun,
@@ -19,12 +18,12 @@ from mpsfm_core.mapping.model_selection import (
     select_run,
     sum_step_times,
 )
-from mpsfm_core.mapping.options import ConsistencyOptions, MapperOptions
+from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.reconstruction_score import score_reconstruction
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
-OPTIONS = ConsistencyOptions()
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 
 
@@ -69,7 +68,7 @@ def test_reconstruct_stops_after_two_equal_runs(problem: MappingProblem) -> None
     assert result.report.runs == 2
     alone = [reconstruct(doubtful, MapperOptions(max_runs=1, seed=seed)) for seed in range(2)]
     assert [run.report.runs for run in alone] == [1, 1]
-    scores = [compute_explained_score(run.reconstructions[0], doubtful) for run in alone]
+    scores = [score_reconstruction(run.reconstructions[0], doubtful).total for run in alone]
     best = alone[int(np.argmax(scores))].reconstructions[0]
     for image, same in zip(result.reconstructions[0].images, best.images, strict=True):
         np.testing.assert_array_equal(image.rotation, same.rotation)
@@ -85,25 +84,24 @@ def make_run(explained_ratios: Sequence[float]) -> MapperRun:
 
 
 @pytest.mark.parametrize(
-    ("explained_ratios", "selected", "settled"),
+    ("explained_ratios", "settled"),
     [
-        ([[0.5]], 0, False),
-        ([[0.5], [0.6]], 1, False),
-        ([[0.5], [0.6], [0.505]], 1, True),
-        ([[0.5], [0.5]], 0, True),
-        ([[0.5], [0.8]], 1, True),
-        ([[0.4, 0.4]], 0, True),
-        ([[], [0.3]], 1, False),
-        ([[], []], 0, True),
+        ([[0.5]], False),
+        ([[0.5], [0.6]], False),
+        ([[0.5], [0.6], [0.505]], True),
+        ([[0.5], [0.5]], True),
+        ([[0.5], [0.8]], True),
+        ([[0.4, 0.4]], True),
+        ([[], [0.3]], False),
+        ([[], []], True),
     ],
     ids=["one", "two", "same-as-first", "same", "enough", "enough-in-two", "none-first", "none"],
 )
-def test_select_run_by_explained_ratio_until_settled(
-    explained_ratios: list[list[float]], selected: int, settled: bool
+def test_runs_are_settled_if_enough_is_explained_or_two_runs_are_equal(
+    explained_ratios: list[list[float]], settled: bool
 ) -> None:
     runs = [make_run(ratios) for ratios in explained_ratios]
     assert is_settled(runs, MapperOptions().enough_explained) == settled
-    assert select_run(runs, OPTIONS) is runs[selected]
 
 
 def test_sum_step_times_adds_seconds_and_counts_of_all_runs() -> None:
@@ -119,28 +117,38 @@ def test_reconstruct_with_fixed_poses_runs_once(problem: MappingProblem) -> None
     assert reconstruct(doubtful.with_poses(model.poses), options).report.runs == 1
 
 
-def test_select_run_prefers_the_more_frequent_of_equal_runs(problem: MappingProblem) -> None:
-    """A single run is selected only if it explains clearly more than two equal runs."""
+def test_select_run_prefers_the_run_that_registers_more_images(problem: MappingProblem) -> None:
     (model,) = reconstruct(problem).reconstructions
+    fewer = replace(model, images=model.images[:3])
+    runs = [
+        MapperRun([], [], MappingReport()),
+        MapperRun([fewer], [0.66], MappingReport()),
+        MapperRun([model], [0.65], MappingReport()),
+    ]
+    assert select_run(runs, problem) is runs[2]
+    assert select_run(runs[:2], problem) is runs[1]
+    assert select_run(runs[:1], problem) is runs[0]
 
-    def run(size: int, explained: float) -> MapperRun:
-        return MapperRun([replace(model, images=model.images[:size])], [explained], MappingReport())
 
-    single, first, second = run(4, 0.662), run(3, 0.655), run(3, 0.660)
-    assert select_run([single, first, second], OPTIONS) is second
-    assert select_run([single, first], OPTIONS) is single
-    clearly = run(4, 0.68)
-    assert select_run([clearly, first, second], OPTIONS) is clearly
-
-
-def test_select_run_prefers_agreeing_depth_of_equal_runs(problem: MappingProblem) -> None:
-    """Two runs explain equally much, but one has an image that looks away from the others."""
+def test_select_run_prefers_correct_poses_to_more_explained_matches(
+    problem: MappingProblem,
+) -> None:
+    """An image looks away from the others, although its run claims to explain more matches."""
     (model,) = reconstruct(problem).reconstructions
     *rest, last = model.images
     turned = np.diag([-1.0, 1.0, -1.0])
     away = replace(last, rotation=turned @ last.rotation, translation=turned @ last.translation)
-    contradicted = replace(model, images=(*rest, away))
-    assert measure_depth_agreement(contradicted, OPTIONS) < measure_depth_agreement(model, OPTIONS)
     right = MapperRun([model], [0.650], MappingReport())
-    wrong = MapperRun([contradicted], [0.655], MappingReport())
-    assert select_run([right, wrong], OPTIONS) is select_run([wrong, right], OPTIONS) is right
+    wrong = MapperRun([replace(model, images=(*rest, away))], [0.7], MappingReport())
+    assert select_run([right, wrong], problem) is select_run([wrong, right], problem) is right
+
+
+@pytest.mark.parametrize(("ratio", "is_selected"), [(0.645, True), (0.6, False)])
+def test_select_run_prefers_calibrated_rigs_that_explain_as_many_matches(
+    problem: MappingProblem, ratio: float, is_selected: bool
+) -> None:
+    (model,) = reconstruct(problem).reconstructions
+    rig = Rig(((np.eye(3), np.zeros(3)),), ((model.images[0].name,),))
+    single = MapperRun([model], [0.65], MappingReport())
+    calibrated = MapperRun([replace(model, rigs=(rig,))], [ratio], MappingReport())
+    assert (select_run([single, calibrated], problem) is calibrated) == is_selected

@@ -8,6 +8,4 @@
 
 * ``misregistration`` detects registered images whose matches mostly contradict their pose (minimum
   cut of the match graph).
-
-* ``depth_agreement`` measures the share of pixels whose depth agrees with other images.
 """
