@@ -13,6 +13,7 @@ from mpsfm_core.data import Float64, Rig, UInt8
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.geometry.fisheye import project_wide
 from mpsfm_core.geometry.panorama import make_panorama_camera
+from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.masks import decode_mask
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.view_cutting import (
@@ -168,6 +169,18 @@ def test_nadir_angle_masks_the_lower_pixels_of_all_views(tmp_path: Path) -> None
         # The middle column shows pixels 30 degrees below the horizon at tan(30 deg) of its half.
         first = side / 2 * (1 + np.tan(np.radians(30)))
         assert abs(mask[:, side // 2].sum() - first) <= 1
+
+
+def test_masked_pixels_are_masked_in_the_loaded_views(tmp_path: Path) -> None:
+    write_images(tmp_path, ["a.png", "b.png"])
+    views = cut(tmp_path, ["a.png", "b.png"], nadir_angle_deg=60)
+    options = InputOptions(masks=views.masks)
+    images = load_images(views.folder, views.cameras, options=options)
+    assert len(images) == 16
+    for index in range(16):
+        mask = images.view(index).mask
+        assert mask is not None
+        assert mask[: len(mask) // 2].all() and not mask[-1, len(mask) // 2]
 
 
 def test_one_mask_file_masks_all_panoramas(tmp_path: Path) -> None:

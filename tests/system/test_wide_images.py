@@ -13,7 +13,7 @@ import pycolmap
 import pytest
 
 from mpsfm_core import reconstruct
-from mpsfm_core.data import DepthPrior, Float64, UInt8, View
+from mpsfm_core.data import DepthPrior, Float64, Rig, UInt8, View
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
 from mpsfm_core.geometry.fisheye import project_wide
 from mpsfm_core.geometry.panorama import make_panorama_camera
@@ -114,3 +114,41 @@ def test_wide_images_get_their_true_poses(tmp_path: Path, camera: pycolmap.Camer
     assert [frame["name"] for frame in frames] == [f"{name}.jpg" for name in names]
     for frame, center in zip(frames, ours, strict=True):
         np.testing.assert_allclose(np.reshape(frame["pose"], (3, 4))[:, 3], center, atol=1e-3)
+
+
+@pytest.mark.slow
+def test_dual_fisheye_photos_become_frames_in_meters(tmp_path: Path) -> None:
+    turn, shift = np.diag([-1.0, 1.0, -1.0]), np.array([0.0, 0.0, -0.2])
+    lenses = {"front": np.eye(4)[:3], "back": np.column_stack([turn, shift])}
+    poses = {}
+    for number, pose in enumerate(POSES[:3]):
+        for lens, lens_from_rig in lenses.items():
+            name = f"{lens}/{number}"
+            poses[name] = lens_from_rig @ np.vstack([pose, [0.0, 0.0, 0.0, 1.0]])
+            path = tmp_path / "photos" / f"{name}.png"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            cv2.imwrite(str(path), cv2.cvtColor(render(FISHEYE, poses[name]), cv2.COLOR_RGB2BGR))
+    names = tuple(tuple(f"{lens}/{k}.png" for lens in lenses) for k in range(3))
+    rig = Rig(tuple((pose[:, :3], pose[:, 3]) for pose in lenses.values()), names)
+    result = reconstruct(
+        *(tmp_path / "photos", tmp_path / "out", "sift"),
+        cameras=FISHEYE,
+        rigs=[rig],
+        depth=TrueDepth(FISHEYE, poses),
+        overrides=("dense.enabled=false", "results.report=false"),
+    )
+    (colmap_rig,) = result.model.rigs.values()
+    assert colmap_rig.num_sensors() == 14
+    assert result.model.num_frames() == 3
+    images = {image.name: image for image in result.model.images.values()}
+    ours = np.array(
+        [
+            camera_center(matrix[:, :3], matrix[:, 3])
+            for name in poses
+            for matrix in [images[f"camera0/{name}.jpg"].cam_from_world().matrix()]
+        ]
+    )
+    truth = np.array([camera_center(pose[:, :3], pose[:, 3]) for pose in poses.values()])
+    aligned = umeyama(ours, truth)
+    assert aligned.scale == pytest.approx(1.0, abs=0.02)
+    assert np.linalg.norm(aligned.apply(ours) - truth, axis=1).max() < 0.02
