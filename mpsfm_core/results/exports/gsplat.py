@@ -36,12 +36,21 @@ def write(source: ExportSource, folder: Path) -> None:
     source.write_photos(folder / "images")
     write_model(folder / "sparse" / "0", source.undistorted())
     write_maps(source, folder / "maps")
-    points, colors = source.dense_points()
-    if len(points) > _MAX_GAUSSIANS:
-        chosen = np.random.default_rng(0).choice(len(points), _MAX_GAUSSIANS, replace=False)
-        points, colors = points[chosen], colors[chosen]
+    points, colors = initial_points(source)
     if len(points) > _NEIGHBOURS:
         write_gaussians(folder / "gaussians.ply", points, colors)
+
+
+def initial_points(source: ExportSource) -> tuple[Float64, UInt8]:
+    """Return positions and colors of the points from which splatting starts.
+
+    The points are a random subset of the fused depth maps, or of the 3D points without depth maps.
+    """
+    points, colors = source.dense_points()
+    if len(points) <= _MAX_GAUSSIANS:
+        return points, colors
+    chosen = np.random.default_rng(0).choice(len(points), _MAX_GAUSSIANS, replace=False)
+    return points[chosen], colors[chosen]
 
 
 def write_maps(source: ExportSource, folder: Path) -> None:

@@ -1,4 +1,4 @@
-"""Export a ``transforms.json`` with images, depth and points for nerfstudio.
+"""Export a ``transforms.json`` with images, depth and points for nerfstudio and OpenSplat.
 
 ::
 
@@ -6,7 +6,7 @@
     images/NAME          undistorted images
     depths/NAME.npy      refined depth, (h, w) float32, thousandths of a unit, 0 where unknown
     maps/NAME.npz        depth and normals with std, as for gsplat
-    sparse_pc.ply        colored points
+    sparse_pc.ply        colored points of the fused depth maps, from which splatting starts
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.results.exports.gsplat import write_maps
+from mpsfm_core.results.exports.gsplat import initial_points, write_maps
 from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.results.original_images import exported_image_name
 from mpsfm_core.results.ply import write_ply
@@ -33,7 +33,7 @@ def write(source: ExportSource, folder: Path) -> None:
     """Write a nerfstudio folder; raise ``InputError`` if the image files are missing."""
     source.write_photos(folder / "images")
     write_maps(source, folder / "maps")
-    write_ply(folder / "sparse_pc.ply", *source.points())
+    write_ply(folder / "sparse_pc.ply", *initial_points(source))
     depths = _write_depths(source, folder)
     names = [exported_image_name(name) for name in source.names]
     path = folder / "transforms.json"

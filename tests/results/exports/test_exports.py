@@ -33,7 +33,9 @@ def median_error(image, camera, depth, points) -> float:
     local = image.cam_from_world() * points
     scale = depth.shape[1] / camera.width
     column, row = (camera.img_from_cam(local) * scale).astype(int).T
-    return float(np.median(np.abs(depth[row, column] / local[:, 2] - 1)))
+    inside = (row >= 0) & (row < depth.shape[0]) & (column >= 0) & (column < depth.shape[1])
+    seen = inside & (local[:, 2] > 0)
+    return float(np.median(np.abs(depth[row[seen], column[seen]] / local[seen, 2] - 1)))
 
 
 @pytest.mark.parametrize("chosen", FORMATS, ids=lambda chosen: chosen.name)
@@ -139,7 +141,7 @@ def test_nerfstudio_has_depth_of_every_frame_and_keeps_gravity(
     assert transforms["orientation_override"] == "none"
     assert transforms["camera_model"] == "OPENCV"
     points, _ = read_ply(tmp_path / transforms["ply_file_path"])
-    assert len(points) == 60
+    assert len(points) == len(read_ply(result / "dense.ply")[0])
     poses = read_transforms(tmp_path / "transforms.json")
     for frame in transforms["frames"]:
         assert (tmp_path / frame["file_path"]).is_file()
@@ -147,6 +149,20 @@ def test_nerfstudio_has_depth_of_every_frame_and_keeps_gravity(
         image = poses.find_image_with_name(frame["file_path"])
         camera = poses.cameras[image.camera_id]
         assert median_error(image, camera, depth, points) < 0.01
+
+
+def test_nerfstudio_points_have_the_layout_that_opensplat_reads(
+    result: Path, tmp_path: Path
+) -> None:
+    """OpenSplat reads three floats and three bytes per point, and ignores other properties."""
+    export(result, "nerfstudio", tmp_path, turn=False)
+    data = (tmp_path / "sparse_pc.ply").read_bytes()
+    header, _, body = data.partition(b"end_header\n")
+    assert header.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex")
+    rows = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    points, colors = read_ply(result / "dense.ply")
+    np.testing.assert_allclose(rows["xyz"], points, atol=1e-6)
+    np.testing.assert_array_equal(rows["rgb"], colors)
 
 
 def test_colmap_reads_the_text_model(result: Path, tmp_path: Path) -> None:
