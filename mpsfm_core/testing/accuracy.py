@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.data import Bool, DenseMatches, Features, Float64, PairMatches
+from mpsfm_core.data import Bool, DenseMatches, DepthPrior, Features, Float64, PairMatches
 from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.contract_case import ContractCase, first_depth
 from mpsfm_core.testing.examples import Example
@@ -43,6 +43,15 @@ SHIFT_TOLERANCE_PX = 0.25
 """Largest accepted shift of a depth or normal map, in pixels of the view, or of the map if its
 pixels are larger. Integer pixel centers shift a map by 0.5 pixels; correct resizing to half and a
 quarter of the size shifts a map by less than 0.1."""
+_MAX_OUTSIDE_RATIO = 0.02
+"""Largest accepted ratio of pixels whose depth differs from that of all surfaces nearby, for a test
+network. The ratio is 0 for providers that resize neither view nor depth."""
+VALIDITY_TOLERANCE = 0.05
+"""Largest accepted ratio of pixels without a surface, away from edges, that are valid. Padding and
+blur of a network cause some such pixels."""
+MAX_INVALID_RATIO = 0.4
+"""Largest accepted ratio of pixels with a surface that are invalid. A provider may reject pixels
+that are distant, near an edge or uncertain."""
 MIN_MATCHES = 8
 """Smallest number of matches whose accuracy is compared with the ground truth."""
 
@@ -74,8 +83,11 @@ def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str
         quantile = map_errors.error_quantile(errors)
         error = _require_at_most("relative error", quantile, DEPTH_TOLERANCE)
         shift = map_errors.estimate_depth_shift(answer, example)
-        if case.spec.kind != "wrapper" and case.truth_source in ("painted", "prepared"):
-            require_depth_std(answer, example)
+        if case.truth_source in ("painted", "prepared"):
+            require_local_depth(case, example, answer)
+            _require_valid_surfaces(answer, example)
+            if case.spec.kind != "wrapper":
+                require_depth_std(answer, example)
         return f"{error}, {_describe_shift(case, example, shift, answer)}"
     if case.kind == "normals":
         quantile = map_errors.error_quantile(map_errors.angle_errors_deg(answer, example))
@@ -93,6 +105,39 @@ def compare_with_truth(case: ContractCase, example: Example, answer: Any) -> str
         _require_mask_not_shifted(answer, example)
         return f"{wrong_ratio:.1%} of the pixels have the wrong value"
     return _compare_matches(case, example, answer)
+
+
+def _require_valid_surfaces(prior: DepthPrior, example: Example) -> None:
+    """Require that depth is valid at most pixels with a surface, and at few others."""
+    truth = example.truth(prior.shape)
+    empty = truth.edge_free & ~truth.valid
+    if empty.any() and prior.valid[empty].mean() > VALIDITY_TOLERANCE:
+        raise CheckFailed(
+            f"{prior.valid[empty].mean():.0%} of the pixels without surface are valid"
+        )
+    if truth.smooth.any() and 1 - prior.valid[truth.smooth].mean() > MAX_INVALID_RATIO:
+        raise CheckFailed(
+            f"{1 - prior.valid[truth.smooth].mean():.0%} of the pixels with a surface are not valid"
+        )
+
+
+def require_local_depth(case: ContractCase, example: Example, prior: DepthPrior) -> str:
+    """Require that the depth of nearly all valid pixels occurs nearby in the view.
+
+    Raises:
+        CheckFailed: too many pixels have a depth that no surface nearby has.
+    """
+    is_painted = case.truth_source == "painted"
+    ratio = map_errors.measure_outside_local_range(
+        prior,
+        example,
+        any_scale=not prior.metric or case.declares("intrinsics-aware"),
+        mixes_with_zero=is_painted,
+    )
+    limit = _MAX_OUTSIDE_RATIO if is_painted else _MAX_OUTSIDE_RATIO / 4
+    if ratio > limit:
+        raise CheckFailed(f"{ratio:.1%} of the valid pixels have a depth that no surface near has")
+    return f"{ratio:.1%} of the valid pixels have a depth that no surface near has"
 
 
 def require_small_shift(

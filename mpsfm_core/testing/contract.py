@@ -165,11 +165,7 @@ class Contract:
 
     def _case(self, around: str) -> ContractCase:
         if around not in self._cases:
-            setup = self._setup
-            if setup is None:
-                setup = load_setup(self.spec, self._folder)
-            elif not isinstance(setup, ContractSetup):
-                setup = setup(self._folder)
+            setup = self._make_setup(self._folder)
             known = {task.id for task in self.tasks()}
             for name in setup.expected_failures:
                 if name not in known:
@@ -182,8 +178,15 @@ class Contract:
                 name=self._name,
                 behaves_as=around or None,
                 device=self._device,
+                make_setup=self._make_setup,
             )
         return self._cases[around]
+
+    def _make_setup(self, folder: Path) -> ContractSetup:
+        """Return the ContractSetup, whose function writes weights of test networks to a folder."""
+        if self._setup is None:
+            return load_setup(self.spec, folder)
+        return self._setup if isinstance(self._setup, ContractSetup) else self._setup(folder)
 
 
 def run_checks(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib
 import pickle
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
@@ -42,6 +43,7 @@ from mpsfm_core.testing.ground_truth_provider import (
 )
 from mpsfm_core.testing.observed_instance import ObservedInstance, observe_instance
 from mpsfm_core.testing.outcome import CheckSkipped, CheckUnmeasured
+from mpsfm_core.testing.painted_views import depth_unit
 from mpsfm_core.testing.process_state import read_process_settings
 
 TruthSource = Literal["painted", "prepared", "image", "none"]
@@ -112,6 +114,7 @@ class ContractCase:
         name: str | None = None,
         behaves_as: Kind | None = None,
         device: str = "cpu",
+        make_setup: Callable[[Path], ContractSetup] | None = None,
     ) -> None:
         """Create the contract case without constructing the provider.
 
@@ -124,6 +127,8 @@ class ContractCase:
             behaves_as: Kind of the provider inside a wrapper, or None if the provider under test is
                 not a wrapper.
             device: ``"cpu"`` or ``"cuda"``.
+            make_setup: Function that returned ``setup`` for a folder. By default, ``setup`` is used
+                in every folder.
         """
         self.registry = registry
         self.spec = spec
@@ -133,6 +138,7 @@ class ContractCase:
         """Name of the provider in the registry, which may be ``DISTRIBUTION:NAME``."""
         self._folder = folder
         self._device = device
+        self._make_setup = make_setup or (lambda folder: setup)
         self._ground_truth = GroundTruth() if spec.kind == "wrapper" else None
         self._prepared: WeakSet[Example] = WeakSet()
         self._detector: Any = None
@@ -212,10 +218,11 @@ class ContractCase:
         """
         return self.small_example, self.example.partner, self.example
 
-    def create_provider(self, **inner_options: Any) -> Any:
+    def create_provider(self, num_wrappers: int = 1, **inner_options: Any) -> Any:
         """Construct a new instance of the provider under test.
 
         Args:
+            num_wrappers: Number of instances that wrap each other, for a wrapper.
             inner_options: Options of the ground-truth provider inside a wrapper, see
                 :class:`~mpsfm_core.testing.ground_truth_provider.GroundTruthOptions`.
         """
@@ -225,7 +232,20 @@ class ContractCase:
         inner = GROUND_TRUTH_SPECS[self.kind]
         registry.add(self.spec, replace(inner, factory=self._ground_truth.factory(self.kind)))
         wrapper = ProviderConfig(use=self.spec.name, options=dict(self.setup.options))
-        return self._create(registry, self.kind, inner.name, inner_options, (wrapper,))
+        return self._create(
+            registry, self.kind, inner.name, inner_options, num_wrappers * (wrapper,)
+        )
+
+    def run_in_depth_unit(self, meters: float) -> Any:
+        """Run the provider on the example view, whose colors encode larger or smaller depth.
+
+        Args:
+            meters: Factor by which the test network's depth is larger than in :meth:`run`.
+        """
+        with depth_unit(meters), tempfile.TemporaryDirectory(dir=self._folder) as folder:
+            options = self._make_setup(Path(folder)).options
+            provider = self._create(self.registry, self.kind, self.name, options)
+            return self.run(self.example, provider)
 
     @cached_property
     def provider(self) -> Any:

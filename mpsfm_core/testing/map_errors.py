@@ -15,6 +15,10 @@ _MIN_PIXELS = 40
 """Smallest number of valid pixels for which the errors of a map are computed."""
 _OUTLIER_MADS = 5.0
 _HALF_STEP_PX = 0.5
+_NEARBY_PX = 2
+"""Distance in pixels up to which a depth map may mix the depth of neighboring surfaces."""
+_RANGE_TOLERANCE = 0.05
+"""Relative error of depth that is accepted in addition to the mixture of neighboring depths."""
 
 
 def error_quantile(errors: Float64) -> float:
@@ -79,6 +83,38 @@ def log_errors(prior: DepthPrior, example: Example, *, any_scale: bool) -> Float
     where = select_comparable(prior.valid, truth)
     error: Float64 = np.log(prior.depth[where].astype(np.float64) / truth.depth[where])
     return error - np.median(error) if any_scale else error
+
+
+def measure_outside_local_range(
+    prior: DepthPrior, example: Example, *, any_scale: bool, mixes_with_zero: bool
+) -> float:
+    """Return the ratio of valid pixels whose depth does not occur nearby in the view.
+
+    At the border of two surfaces, each depth between those of both surfaces is accepted.
+
+    Args:
+        prior: Predicted depth.
+        example: Synthetic view that the depth belongs to.
+        any_scale: True removes a common factor of all depths.
+        mixes_with_zero: True accepts depth that is too small near pixels without ground truth, from
+            a network that resizes a view whose colors encode a depth of 0 there.
+    """
+    import cv2  # The import is local, because pytest loads this module when it collects tests.
+
+    truth = example.truth(prior.shape)
+    both = prior.valid & truth.smooth
+    if not both.any():
+        return 0.0
+    rows, columns = prior.shape
+    finer = max(1, round(columns / example.camera.width), round(rows / example.camera.height))
+    kernel = np.ones((2 * finer * _NEARBY_PX + 1,) * 2, np.uint8)
+    depth = prior.depth.astype(np.float64)
+    if any_scale:
+        depth = depth / np.median(depth[both] / truth.depth[both])
+    high = cv2.dilate(truth.depth, kernel)
+    low = cv2.erode(np.where(truth.valid, truth.depth, 0.0 if mixes_with_zero else np.inf), kernel)
+    outside = (depth < (1 - _RANGE_TOLERANCE) * low) | (depth > (1 + _RANGE_TOLERANCE) * high)
+    return float(outside[prior.valid & (high > 0)].mean())
 
 
 def angle_errors_deg(normals: NormalPrior, example: Example) -> Float64:

@@ -19,6 +19,9 @@ at every pixel.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
@@ -37,6 +40,21 @@ NORMALS_STD = 0.1
 """Std of normals in rad that small test networks and prepared normal files report."""
 
 _HALF = 127.5
+_UNIT_M: ContextVar[float] = ContextVar("unit of decoded depth in meters", default=1.0)
+
+
+@contextmanager
+def depth_unit(meters: float) -> Iterator[None]:
+    """Multiply the depth that colors encode by ``meters`` in a ``with`` block.
+
+    A test network whose weights :func:`decoder` returns in the block sees a scene that is larger by
+    the factor ``meters``, although the colors of the views are the same.
+    """
+    token = _UNIT_M.set(meters)
+    try:
+        yield
+    finally:
+        _UNIT_M.reset(token)
 
 
 def paint(depth: NDArray[Any], normals: NDArray[Any], valid: Bool) -> UInt8:
@@ -69,7 +87,7 @@ def decoder() -> tuple[Float64, Float64]:
     """
     step = MAX_SLOPE / _HALF
     weights = np.zeros((4, 3))
-    weights[0, 0], weights[1, 1], weights[2, 2] = MAX_DEPTH / 255, step, step
+    weights[0, 0], weights[1, 1], weights[2, 2] = _UNIT_M.get() * MAX_DEPTH / 255, step, step
     return weights, np.array([0.0, -MAX_SLOPE, -MAX_SLOPE, -1.0])
 
 

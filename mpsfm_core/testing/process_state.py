@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import gc
+import locale
 import logging
+import multiprocessing
 import os
 import pickle
 import random
+import signal
+import socket
 import sys
 import tempfile
 import warnings
@@ -25,6 +30,7 @@ _ENVIRONMENT = "environment variables"
 _THREADS = ("the threads of OpenCV", "the threads of torch")
 """Settings of the number of threads, which a provider may set to the number in its context."""
 _NUM_THREADS = 3
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _TORCH_NUMBERS = "the random numbers of torch"
 
 
@@ -78,6 +84,20 @@ def read_process_settings() -> ProcessSettings:
                 str(torch.get_default_dtype()) if is_loaded else "torch.float32"
             ),
             "standard output": id(sys.stdout),
+            "standard error": id(sys.stderr),
+            "the hook for uncaught exceptions": id(sys.excepthook),
+            "the display of warnings": id(warnings.showwarning),
+            "the default timeout of sockets": socket.getdefaulttimeout(),
+            "the locale": locale.setlocale(locale.LC_ALL),
+            "the garbage collection": gc.isenabled(),
+            "the start method of processes": multiprocessing.get_start_method(allow_none=True),
+            "the signal handlers": [id(signal.getsignal(s)) for s in _SIGNALS],
+            "the matrix precision of torch": (
+                torch.get_float32_matmul_precision() if is_loaded else "highest"
+            ),
+            "the deterministic mode of torch": (
+                torch.are_deterministic_algorithms_enabled() if is_loaded else False
+            ),
         },
         dict(os.environ),
     )

@@ -153,13 +153,22 @@ def check_name_does_not_matter(case: ContractCase) -> None:
     # The new name sorts after the name of the partner, the old one before.
     renamed = replace(example.view, name="zoo/another-name.jpg")
     _require_same(case.run(example), case.run_on_view(renamed, example), "of a renamed view")
+    same_name = replace(example.partner.view, name=example.name)
+    auxiliary = case.make_auxiliary_input(same_name, example.partner)
+    _require_same(
+        case.run_on_view(same_name, example.partner, auxiliary=auxiliary),
+        case.run_on_view(
+            replace(same_name, name="zoo/third-name.jpg"), example.partner, auxiliary=auxiliary
+        ),
+        "for another view of the same name",
+    )
 
 
 def check_intrinsics_declared(case: ContractCase) -> None:
-    """Require the capability ``intrinsics-aware`` if the output depends on the focal length.
+    """Require the capability ``intrinsics-aware`` if the output depends on the intrinsics.
 
     Without the capability ``intrinsics-aware``, the cache of a run would return the output for a
-    camera with another focal length.
+    camera with another focal length or principal point.
     """
     if case.declares("intrinsics-aware"):
         raise CheckSkipped("declares 'intrinsics-aware'")
@@ -167,7 +176,9 @@ def check_intrinsics_declared(case: ContractCase) -> None:
         raise CheckSkipped("declares 'uncached'")
     example = case.small_example
     expected, camera = case.run(example), example.camera
-    longer = replace(camera, fx=1.3 * camera.fx, fy=1.3 * camera.fy)
+    longer = replace(
+        camera, fx=1.3 * camera.fx, fy=1.4 * camera.fy, cx=0.9 * camera.cx, cy=1.1 * camera.cy
+    )
     answer = case.run_on_view(replace(example.view, camera=longer), example)
     # Another focal length may only change which normals face the camera, not the normals
     # themselves.
@@ -176,7 +187,7 @@ def check_intrinsics_declared(case: ContractCase) -> None:
     difference = describe_difference(expected, answer)
     if difference:
         raise CheckFailed(
-            f"the output depends on the focal length, but the provider does not declare "
+            f"the output depends on the intrinsics, but the provider does not declare "
             f"'intrinsics-aware': {difference}"
         )
 
@@ -272,18 +283,25 @@ def check_large_view(case: ContractCase) -> str:
     """Require accurate output for a view of 12.2 megapixels (masks) or 2.2 megapixels (others).
 
     Photos of users are usually larger than the input of a network. The large view repeats the
-    pixels of a small view, so that the ground truth is known.
+    pixels of a small view, so that the ground truth is known. A view in portrait format has 0.7
+    megapixels. Wrappers and providers that read files receive a view of 0.4 megapixels.
     """
-    if not case.description.predicts_maps:
-        raise CheckSkipped(f"the output of a {case.kind} provider is no map")
+    width, height = case.example.camera.size
+    if case.kind in ("features", "matcher", "retrieval"):
+        raise CheckSkipped(f"providers of the kind {case.kind} have a check of their own")
     if case.setup.prepare is not None or case.spec.kind == "wrapper":
-        raise CheckSkipped("the ground truth of the provider is prepared for small views only")
+        return _run_and_compare(case, case.example.sized(4 * width, 4 * height))
+    # The portrait view first, because a failure of the larger view has the same cause.
+    portrait = case.example.sized(height, width).sized(5 * height, 5 * width)
+    _run_and_compare(case, portrait)
     factor = 21 if case.kind == "mask" else 9
     small, auxiliary = case.example, case.make_auxiliary_input(case.example.view, case.example)
     image = small.view.image.repeat(factor, axis=0).repeat(factor, axis=1)
     camera = small.camera.resized(image.shape[1], image.shape[0])
     view = View("large.png", image, camera)
     answer = case.run_on_view(view, small, auxiliary=auxiliary)
+    if not case.description.predicts_maps:
+        return compare_with_truth(case, replace(small, camera=camera), answer)
     return compare_with_truth(case, small, _reduce_map(answer, small))
 
 

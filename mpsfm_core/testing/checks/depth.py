@@ -12,7 +12,12 @@ import numpy as np
 from mpsfm_core.data import DepthPrior, NormalPrior
 from mpsfm_core.providers.kinds.depth import run_focal, run_joint
 from mpsfm_core.testing import map_errors
-from mpsfm_core.testing.accuracy import DEPTH_TOLERANCE, NORMALS_TOLERANCE_DEG, require_small_shift
+from mpsfm_core.testing.accuracy import (
+    DEPTH_TOLERANCE,
+    NORMALS_TOLERANCE_DEG,
+    require_local_depth,
+    require_small_shift,
+)
 from mpsfm_core.testing.checks.maps import (
     require_monotonic_calibration,
     require_true_validity,
@@ -38,6 +43,11 @@ _FOCAL_RANGE = (1.2, 1.9)
 network with a canonical camera model has a depth ratio of 1.5. A depth ratio of 1 means that the
 network ignores the focal length, and 0.67 that depth shrinks instead of growing."""
 
+_DEPTH_UNITS = (0.1, 9.0)
+"""Factors by which the depth of a test network changes in ``check_depth_range``: the depth of the
+example view is 0.2 to 0.9 m and 15 to 84 m."""
+_MIN_NEAR_RATIO = 0.5
+"""Smallest accepted ratio of pixels that remain valid if all surfaces are nearer."""
 _FOCAL_GROWTH = (1.5, 2.7)
 """Accepted range of the ratio between the focal lengths that a provider estimates for a view of
 twice the size and for the view."""
@@ -230,10 +240,13 @@ def check_depth_calibration(case: ContractCase) -> None:
 def check_depth_range(case: ContractCase) -> str:
     """Require accurate output for near and distant surfaces, from 0.3 to 75 m.
 
-    The check ``depth-range`` detects clipped, saturated and quantized depth. Colors of views encode
-    depth up to 10 m only, so ``depth-range`` does not apply to ``truth_source="painted"``.
+    The check ``depth-range`` detects clipped, saturated and quantized depth. A test network is
+    constructed with the weights for depth of 0.1 and of 9 times the size, and its output has to
+    change by this factor at each pixel. The plugin may reject distant pixels.
     """
-    case.require_truth("prepared", "image")
+    case.require_truth("painted", "prepared", "image")
+    if case.truth_source == "painted":
+        return " and ".join(_require_proportional_depth(case, factor) for factor in _DEPTH_UNITS)
     example = distant_example("textured")
     prior = first_depth(case.run(example))
     truth = example.truth(prior.shape)
@@ -253,16 +266,31 @@ def check_depth_range(case: ContractCase) -> str:
     return f"relative error {map_errors.error_quantile(errors):.2g}"
 
 
+def check_depth_edges(case: ContractCase) -> str:
+    """Require at each pixel a depth between the smallest and the largest true depth nearby.
+
+    Depth at pixels without a surface must not leak into neighboring pixels. Networks whose input
+    contains a depth of 0 there may mix both, files and wrappers may not.
+    """
+    case.require_truth("painted", "prepared")
+    return require_local_depth(case, case.example, _run(case))
+
+
 def check_depth_joint(case: ContractCase) -> str:
     """Require that ``predict_joint`` returns the depth of ``predict`` and correct normals."""
     if not case.declares("joint-normals"):
         raise CheckSkipped("the provider does not declare 'joint-normals'")
-    case.prepare(case.example)
-    depth, normals = run_joint(case.spec, case.provider, case.example.view)
-    changed = describe_difference(_run(case), depth)
-    if changed:
-        raise CheckFailed(f"predict_joint and predict return different depth: {changed}")
-    return _compare_joint_normals(case, normals)
+    width, height = case.example.camera.size
+    sizes = (height, width), (149, 107), (3 * width, 3 * height)
+    texts = []
+    for example in (case.example, *(case.example.sized(*size) for size in sizes)):
+        case.prepare(example)
+        depth, normals = run_joint(case.spec, case.provider, example.view)
+        changed = describe_difference(first_depth(case.run(example)), depth)
+        if changed:
+            raise CheckFailed(f"predict_joint and predict return different depth: {changed}")
+        texts.append(_compare_joint_normals(case, example, normals))
+    return texts[0]
 
 
 def check_depth_focal(case: ContractCase) -> str:
@@ -275,7 +303,8 @@ def check_depth_focal(case: ContractCase) -> str:
         raise CheckSkipped("the provider does not declare 'estimates-focal'")
     width, height = case.example.camera.size
     common = case.example.with_common_camera()
-    examples = (common, common.sized(2 * width, 2 * height), common.turned())
+    larger = (common.sized(factor * width, factor * height) for factor in (2, 7))
+    examples = (common, *larger, common.turned())
     found = []
     for example in examples:
         case.prepare(example)
@@ -327,6 +356,7 @@ MAP_CHECKS = (
     check_depth_variance,
     check_depth_calibration,
     check_depth_range,
+    check_depth_edges,
 )
 """Contract checks of depth maps, which both depth providers and multi-view providers have to
 pass."""
@@ -339,15 +369,46 @@ def _run(case: ContractCase) -> DepthPrior:
     return first_depth(case.run(case.example))
 
 
-def _compare_joint_normals(case: ContractCase, normals: NormalPrior) -> str:
+def _require_proportional_depth(case: ContractCase, factor: float) -> str:
+    """Require that the depth of each pixel changes by the factor of the test network's depth."""
+    prior, changed = _run(case), first_depth(case.run_in_depth_unit(factor))
+    if changed.shape != prior.shape:
+        raise CheckFailed(f"the depth map has shape {changed.shape} instead of {prior.shape}")
+    both = prior.valid & changed.valid
+    if factor < 1 and both.sum() < _MIN_NEAR_RATIO * prior.valid.sum():
+        raise CheckFailed(f"only {both.sum()} of {prior.valid.sum()} near pixels are valid")
+    if not both.any():
+        return f"no pixel is valid at {factor:g} times the distance"
+    ratios = changed.depth[both] / prior.depth[both].astype(np.float64)
+    if prior.metric and np.abs(ratios - 1).max() < 1e-3:
+        raise CheckSkipped("the test network does not use the weights of painted_views.decoder()")
+    unit = factor if prior.metric else float(np.median(ratios))
+    error = float(np.quantile(np.abs(np.log(ratios / unit)), 0.98))
+    if error > DEPTH_TOLERANCE:
+        far = np.abs(np.log(ratios / unit)) > DEPTH_TOLERANCE
+        raise CheckFailed(
+            f"if all surfaces are {factor:g} times as far, depth changes {ratios[far].min():.2g} "
+            f"to {ratios[far].max():.2g} times"
+        )
+    if prior.variance is not None and changed.variance is not None:
+        stds = np.sqrt(changed.variance[both].astype(np.float64) / prior.variance[both]) / unit
+        if np.abs(np.log(np.quantile(stds, (0.1, 0.5, 0.9)))).max() > np.log(STD_FACTOR):
+            raise CheckFailed(
+                f"if all surfaces are {factor:g} times as far, the std changes "
+                f"{np.median(stds) * unit:.2g} times"
+            )
+    return f"relative error {error:.2g} at {factor:g} times the distance"
+
+
+def _compare_joint_normals(case: ContractCase, example: Example, normals: NormalPrior) -> str:
     """Require that normals of ``predict_joint`` agree with the ground truth, if it is known."""
     if case.truth_source == "none":
         return "the true normals are unknown"
-    angle = map_errors.error_quantile(map_errors.angle_errors_deg(normals, case.example))
+    angle = map_errors.error_quantile(map_errors.angle_errors_deg(normals, example))
     if angle > NORMALS_TOLERANCE_DEG:
         raise CheckFailed(f"the normals of predict_joint are {angle:.0f} degrees off")
     if case.truth_source in ("painted", "prepared"):
-        require_normals_std(normals, case.example)
+        require_normals_std(normals, example)
     return f"normals off by {angle:.2g} degrees"
 
 

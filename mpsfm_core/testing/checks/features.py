@@ -35,9 +35,19 @@ _MAX_SCALING_SHIFT_PX = 1.0
 """Largest accepted shift, to the same side in x and y, of the keypoints of the large view against
 those of a view of a quarter of the size. Integer pixel centers that are scaled from 1024 to 4096
 pixels shift keypoints by 1.5 pixels, but the shift is at most 0.6 pixels for tested detectors."""
-_SCALING_RADIUS_PX = 6.0
-"""Largest distance between keypoints of the large and of the small view that count as the same
-keypoint, in pixels of the large view."""
+_SCALING_RADIUS_PX = 2.0
+"""Largest distance in pixels of the large view between two shifts of keypoints that count as
+equal."""
+_CONTINUED_SIZES = ((211, 149), (768, 576), (403, 611))
+"""Widths and heights of the larger views in ``check_features_other_sizes``."""
+_MAX_SHIFT_PX = 32.0
+"""Largest shift of keypoints that a vote of their offsets detects."""
+_NUM_VOTING = 500
+"""Largest number of keypoints whose offsets vote for a shift."""
+_MIN_RANK_CORRELATION = 0.15
+"""Smallest accepted rank correlation between the scores of the same pixels in two views."""
+_MAX_SCALE_RATIO = 1.5
+"""Largest accepted ratio between the scales of the same pixels in two views."""
 _MIN_COVERING = 40
 """Minimum number of keypoints for which the coverage of a view is checked."""
 _MIN_COVERED_CELLS = 7
@@ -89,22 +99,7 @@ def check_features_coverage(case: ContractCase) -> str:
     every image without matches.
     """
     case.require_truth("image", "prepared")
-    features: Features = case.run(case.example)
-    _require_enough(features)
-    cells = (features.keypoints / case.example.camera.size * 3).astype(int).clip(0, 2)
-    counts = np.zeros((3, 3), dtype=int)
-    np.add.at(counts, (cells[:, 1], cells[:, 0]), 1)
-    covered = int((counts > 0).sum())
-    halves = [counts[:, 0], counts[:, 2], counts[0], counts[2]]
-    smallest = min(float(part.sum()) for part in halves) / len(features)
-    if len(features) < _MIN_COVERING:
-        raise CheckSkipped(f"{len(features)} keypoints are too few to cover a view")
-    if covered < _MIN_COVERED_CELLS or smallest < _MIN_SIDE_RATIO:
-        raise CheckFailed(
-            f"keypoints cover {covered} of 9 parts of a fully textured view, and only "
-            f"{smallest:.0%} are in an outer third"
-        )
-    return f"keypoints cover {covered} of 9 parts"
+    return _require_coverage(case.run(case.example), case.example.camera.size)
 
 
 def check_features_scores(case: ContractCase) -> str:
@@ -248,9 +243,11 @@ def check_features_large_view(case: ContractCase) -> str:
             f"{ratios[1]:.0%} of the keypoints, the largest are x = {x:.0f}, y = {y:.0f}: scale "
             f"the keypoints of a reduced image back"
         )
-    small = 4 * case.run(case.example).keypoints
+    small: Features = case.run(case.example)
     corner = np.array([width - tile.shape[1], height - tile.shape[0]])
-    _require_no_scaling_shift(keypoints, (small, small + corner))
+    parts = [4 * small.keypoints, 4 * small.keypoints + corner]
+    _require_no_scaling_shift(keypoints, parts)
+    _require_four_times_the_scales(features, small, parts[0])
     return f"{sum(ratios):.0%} of {len(features)} keypoints are on the textured corners"
 
 
@@ -279,17 +276,94 @@ def check_features_dimension(case: ContractCase) -> str:
     return f"{len(some)} keypoints with {lengths.pop()} values; {len(none)} on a flat view"
 
 
+def check_features_other_sizes(case: ContractCase) -> str:
+    """Require the features of a part of a view in the same part of larger views.
+
+    A view of 192 x 144 pixels is continued by its reflection to three larger sizes, which contain
+    the view up to four times. Keypoints, descriptors, scores and scales of the copies have to agree
+    with those of the view alone. The check detects wrong scaling, padding and cropping at these
+    sizes, and arrays in different order if there are many keypoints.
+    """
+    case.require_truth("image")
+    alone: Features = case.run(case.example)
+    _require_enough(alone)
+    texts: list[str] = []
+    correlations: list[float] = []
+    for size in _CONTINUED_SIZES:
+        continued = _continue_by_reflection(case.example.view, size)
+        features: Features = case.run_on_view(continued, case.example)
+        where = "of a {} x {} view".format(*size)
+        try:
+            _require_coverage(features, size)
+        except CheckSkipped:
+            pass
+        except CheckFailed as failed:
+            raise CheckFailed(f"{failed} {where}") from failed
+        _require_symmetric(case, features, size)
+        pairs = []
+        for corner in _copies(case.example.camera.size, size):
+            found = features.keypoints - corner
+            inside = ((found >= 0) & (found <= case.example.camera.size)).all(axis=1)
+            rows = np.flatnonzero(inside)
+            peak = _find_shift(found[rows], alone.keypoints, 1.0)
+            if peak is None:
+                continue
+            if np.abs(peak).max() > PIXEL_TOLERANCE * max(2.0, features.std_px):
+                x, y = peak
+                raise CheckFailed(
+                    f"keypoints {where} are shifted by ({x:+.1f}, {y:+.1f}) px at "
+                    f"({corner[0]}, {corner[1]})"
+                )
+            pairs.append(_pair_nearest(found, rows, alone.keypoints))
+        rows, columns = np.concatenate([np.empty((0, 2), np.int64), *pairs]).T
+        if len(rows) < 2 * _MIN_COUNT:
+            continue
+        _require_same_values(take_features(features, rows), alone, columns, where)
+        texts.append(f"{len(rows)} keypoints {where} agree")
+        correlations.append(
+            _correlate_scores(take_features(features, rows), take_features(alone, columns))
+        )
+        if correlations[-1] < _MIN_RANK_CORRELATION <= correlations[0] / 4:
+            raise CheckFailed(
+                f"scores {where} and scores of the same pixels in a part of the view have a rank "
+                f"correlation of {correlations[-1]:.2f}"
+            )
+    if not texts:
+        raise CheckSkipped("too few keypoints of the view repeat in larger views")
+    return texts[-1]
+
+
 CHECKS = (
     check_features_axes,
     check_features_pixel_convention,
     check_features_coverage,
     check_features_large_view,
+    check_features_other_sizes,
     check_features_descriptors,
     check_features_dimension,
     check_features_scores,
     check_features_scales,
     check_features_std,
 )
+
+
+def _require_coverage(features: Features, size: tuple[int, int]) -> str:
+    """Require keypoints in most of nine equal parts of a fully textured view."""
+    _require_enough(features)
+    cells = (features.keypoints / size * 3).astype(int).clip(0, 2)
+    counts = np.zeros((3, 3), dtype=int)
+    np.add.at(counts, (cells[:, 1], cells[:, 0]), 1)
+    covered = int((counts > 0).sum())
+    halves = [counts[:, 0], counts[:, 2], counts[0], counts[2]]
+    smallest = min(float(part.sum()) for part in halves) / len(features)
+    if len(features) < _MIN_COVERING:
+        raise CheckSkipped(f"{len(features)} keypoints are too few to cover a view")
+    if covered < _MIN_COVERED_CELLS or smallest < _MIN_SIDE_RATIO:
+        raise CheckFailed(
+            f"keypoints cover {covered} of 9 parts of a fully textured view, and only "
+            f"{smallest:.0%} are in an outer third"
+        )
+    return f"keypoints cover {covered} of 9 parts"
 
 
 def _require_same_points(case: ContractCase, other: Example) -> str:
@@ -316,16 +390,155 @@ def _require_no_scaling_shift(keypoints: Float64, expected: Sequence[Float64]) -
         keypoints: (n, 2) keypoints of a large view in pixels.
         expected: (m, 2) positions of keypoints in each part of the large view, from a small view.
     """
-    offsets = [_offsets_to_nearest(keypoints, part, _SCALING_RADIUS_PX) for part in expected]
-    if min(map(len, offsets)) < _MIN_COUNT:
+    found = [_find_shift(keypoints, part, _SCALING_RADIUS_PX) for part in expected]
+    if any(shift is None for shift in found):
         return
-    shifts = np.array([np.median(part, axis=0) for part in offsets])
+    shifts = np.array(found)
     if max(shifts.min(), -shifts.max()) > _MAX_SCALING_SHIFT_PX:
         x, y = shifts.mean(axis=0)
         raise CheckFailed(
             f"keypoints of a large view are shifted by ({x:+.1f}, {y:+.1f}) px: scale positions "
             "for which the center of the first pixel is (0.5, 0.5)"
         )
+
+
+def _require_four_times_the_scales(large: Features, small: Features, expected: Float64) -> None:
+    """Require that keypoint scales are in pixels of the large view, not of a reduced one."""
+    if large.scales is None or small.scales is None or np.ptp(small.scales) == 0:
+        return
+    distance = np.linalg.norm(large.keypoints[:, None] - expected[None], axis=2)
+    ratios = [large.scales[row] / small.scales[near] for row, near in enumerate(distance < 4.0)]
+    # A keypoint can have features of several scales, one of which must be four times as large.
+    best = [float(r[np.abs(np.log(r / 4)).argmin()]) for r in ratios if len(r)]
+    if len(best) < 2 * _MIN_COUNT:
+        return
+    factor = float(np.median(best))
+    if abs(np.log(factor / 4)) > np.log(2 * _MAX_SCALE_RATIO) / 2:
+        raise CheckFailed(
+            f"scales in a view of four times the size are {factor:.2g} times as large"
+        )
+
+
+def _continue_by_reflection(view: View, size: tuple[int, int]) -> View:
+    """Enlarge a view to the right and downwards by mirror images of itself."""
+    width, height = size
+    padding = (0, height - view.camera.height), (0, width - view.camera.width), (0, 0)
+    image = np.pad(view.image, padding, mode="symmetric")
+    return View(
+        f"{width}x{height}/{view.name}", image, replace(view.camera, width=width, height=height)
+    )
+
+
+def _copies(part: tuple[int, int], size: tuple[int, int]) -> list[Int64]:
+    """Return the corners of the unmirrored copies of a part in a view continued by reflection."""
+    columns, rows = (range(0, s - p + 1, 2 * p) for p, s in zip(part, size, strict=True))
+    return [np.array([x, y]) for y in rows for x in columns]
+
+
+def _find_shift(found: Float64, expected: Float64, radius: float) -> Float64 | None:
+    """Find the shift (2,) that most keypoints have in common, or None if there is none.
+
+    Args:
+        found: (n, 2) keypoints of a large view.
+        expected: (m, 2) expected keypoints.
+        radius: Largest distance of shifts that count as equal.
+    """
+    found = found[:: -(-len(found) // _NUM_VOTING) or 1]
+    offsets = (found[:, None] - expected[None]).reshape(-1, 2)
+    offsets = offsets[np.abs(offsets).max(axis=1) < _MAX_SHIFT_PX]
+    if not len(offsets):
+        return None
+    # Each offset votes for its cell and the eight cells around it.
+    cells = np.floor((offsets + _MAX_SHIFT_PX) / radius).astype(int)
+    num_cells = int(2 * _MAX_SHIFT_PX / radius) + 3
+    votes = np.zeros((num_cells, num_cells), int)
+    for x in (0, 1, 2):
+        for y in (0, 1, 2):
+            np.add.at(votes, (cells[:, 0] + x, cells[:, 1] + y), 1)
+    best = np.unravel_index(int(votes.argmax()), votes.shape)
+    chance = 9 * len(offsets) / (2 * _MAX_SHIFT_PX / radius) ** 2
+    # Six standard deviations of the number of random votes, of which the largest is taken.
+    significant = chance + 6 * np.sqrt(chance) + _MIN_COUNT
+    least = max(_MIN_REPEATED_RATIO * min(len(found), len(expected)), 2 * chance, significant)
+    if votes[best] < least:
+        return None
+    center = (np.array(best) - 0.5) * radius - _MAX_SHIFT_PX
+    near = np.abs(offsets - center).max(axis=1) <= 1.5 * radius
+    shift: Float64 = np.median(offsets[near], axis=0)
+    return shift
+
+
+def _pair_nearest(found: Float64, rows: Int64, expected: Float64) -> Int64:
+    """Return index pairs (n, 2) of the keypoints ``found[rows]`` and of unique expected ones."""
+    distance = np.linalg.norm(found[rows, None] - expected[None], axis=2)
+    near = distance < 1.0
+    # Keypoints with several features at one position belong to several pairs.
+    i, j = np.nonzero(near & (near.sum(axis=1) == 1)[:, None] & (near.sum(axis=0) == 1))
+    pairs: Int64 = np.stack([rows[i], j], axis=1)
+    return pairs
+
+
+def _require_same_values(features: Features, alone: Features, rows: Int64, where: str) -> None:
+    """Require similar descriptors and scales of features and of ``alone[rows]``."""
+    x, y = features.descriptors.astype(np.float64), alone.descriptors.astype(np.float64)
+    distance = (y**2).sum(1)[None] - 2 * x @ y.T
+    right = float((distance.argmin(axis=1) == rows).mean())
+    if right < _MIN_CORRECT_RATIO:
+        raise CheckFailed(
+            f"only {right:.0%} of the descriptors {where} are most similar to those of the same "
+            "pixels in a part of the view"
+        )
+    if features.scales is not None and alone.scales is not None:
+        factor = float(np.median(features.scales / alone.scales[rows]))
+        if abs(np.log(factor)) > np.log(_MAX_SCALE_RATIO):
+            raise CheckFailed(f"scales {where} are {factor:.2g} times those of the same pixels")
+
+
+def _correlate_scores(first: Features, second: Features) -> float:
+    """Return the rank correlation of the scores of equal pixels, or 0 for equal scores."""
+    if first.scores is None or second.scores is None:
+        return 0.0
+    if min(np.ptp(first.scores), np.ptp(second.scores)) == 0:
+        return 0.0
+    return float(np.corrcoef(_rank(first.scores), _rank(second.scores))[0, 1])
+
+
+def _require_symmetric(case: ContractCase, features: Features, size: tuple[int, int]) -> None:
+    """Require that keypoints of a point-symmetric view are symmetric, unless the detector is not.
+
+    Scaling keypoints with integer pixel centers shifts all keypoints of a reduced large view.
+    """
+    view = case.example.view
+    if any(side % (2 * part) for side, part in zip(size, view.camera.size, strict=True)):
+        return
+    turned = replace(view, image=np.ascontiguousarray(view.image[::-1, ::-1]))
+    small, rotated = case.run(case.example), case.run_on_view(turned, case.example)
+    asymmetry = _find_shift(small.keypoints, np.array(view.camera.size) - rotated.keypoints, 1.0)
+    shift = _find_shift(features.keypoints, np.array(size) - features.keypoints, 1.0)
+    limit = 2 * PIXEL_TOLERANCE * max(1.0, features.std_px)
+    if asymmetry is None or shift is None or np.abs(asymmetry).max() > limit:
+        return
+    if np.abs(shift).max() > limit:
+        x, y = shift / 2
+        raise CheckFailed(
+            f"keypoints of a {size[0]} x {size[1]} view are shifted by ({x:+.2f}, {y:+.2f}) px"
+        )
+
+
+def take_features(features: Features, rows: Int64) -> Features:
+    """Return some of the features."""
+    return Features(
+        features.keypoints[rows],
+        features.descriptors[rows],
+        None if features.scores is None else features.scores[rows],
+        None if features.scales is None else features.scales[rows],
+        features.std_px,
+    )
+
+
+def _rank(values: Float32) -> Int64:
+    """Return the rank of each value."""
+    return values.argsort(kind="stable").argsort(kind="stable")
 
 
 def _blank_outside(view: View, *, upper_right: bool) -> tuple[View, tuple[int, int, int, int]]:

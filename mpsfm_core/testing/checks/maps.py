@@ -11,16 +11,10 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Bool, DepthPrior, Float32, NormalPrior
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.geometry import resize_map
+from mpsfm_core.testing.accuracy import MAX_INVALID_RATIO, VALIDITY_TOLERANCE
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.examples import Example, TrueMaps
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
-
-VALIDITY_TOLERANCE = 0.05
-"""Largest accepted ratio of pixels without a surface, away from edges, that are valid. Padding and
-blur of a network cause some such pixels."""
-MAX_INVALID_RATIO = 0.4
-"""Largest accepted ratio of pixels with a surface that are invalid. A provider may reject pixels
-that are distant, near an edge or uncertain."""
 
 
 def require_true_validity(valid: Bool, truth: TrueMaps) -> str:

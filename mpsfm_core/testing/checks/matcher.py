@@ -26,7 +26,7 @@ from mpsfm_core.testing.accuracy import (
     point_matches,
 )
 from mpsfm_core.testing.checks.depth import RAY_TOLERANCE
-from mpsfm_core.testing.checks.features import order_probability
+from mpsfm_core.testing.checks.features import order_probability, take_features
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.examples import Example, outdoor_example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUndecided, CheckUnmeasured
@@ -37,6 +37,16 @@ number to 1024 or 2048; the time of a transformer grows with the square of the n
 _MANY_SIZE = (480, 360)
 """Width and height in pixels of the views with many features. Both views have the same size,
 because some matchers resize all views to one size and are not invariant to scale."""
+_LARGE_FACTOR = 21
+"""Factor of the size of views with 12 megapixels for sparse matchers, which see features only."""
+_NUM_FOREIGN = 40
+"""Number of features of another scene in ``check_matcher_feature_order``."""
+_DENSE_FACTOR = 5
+"""Factor of the size of the large views for dense matchers."""
+_MAX_STD_FACTOR = 3.0
+"""Largest accepted ratio of the measured match error and ``std_px``."""
+_MAX_ERROR_PX = 8.0
+"""Distance in pixels above which a match counts as wrong instead of inaccurate."""
 MIN_COVERING = 40
 """Minimum number of matches for which the coverage of the views is checked."""
 _MIN_COVERED_CELLS = 6
@@ -150,6 +160,7 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
         where = f"between a view and its copy at {numerator}/{denominator} of the size"
         text = _describe_residual(residual, matches.std_px, expected, where, counts) or text
     if text:
+        _require_no_shift_of_odd_sizes(case)
         return text
     if case.setup.prepare is None:
         matches = _match_rotated(case)
@@ -220,6 +231,110 @@ def check_matcher_many_features(case: ContractCase) -> str:
     return text
 
 
+def check_matcher_feature_order(case: ContractCase) -> str:
+    """Require the same matches if the features are in another order and others are added.
+
+    Features have no order. The second view gets further features from another scene, which have no
+    match. Matches of features at the same position may differ, and wrong matches with low scores.
+    """
+    if not case.declares("sparse"):
+        raise CheckSkipped("the matcher needs no features")
+    views = case.example.view, case.example.partner.view
+    given = case.extract_features(*views)
+    foreign = case.extract_features(outdoor_example("textured").view)[0]
+    foreign = take_features(foreign, np.arange(min(_NUM_FOREIGN, len(foreign))))
+    rng = np.random.default_rng(0)
+    shuffled = [rng.permutation(len(features)) for features in given]
+    pairs, scores, foreign_xy = [], [], np.empty((0, 2))
+    for rows in ([np.arange(len(features)) for features in given], shuffled):
+        first, second = (take_features(*entry) for entry in zip(given, rows, strict=True))
+        if rows is shuffled:
+            second = _append(second, foreign)
+            foreign_xy = second.keypoints[len(given[1]) :][::-1]
+        answer = case.run_on_views(views, (first, second)).sparse
+        assert answer is not None
+        originals = rows[0], np.concatenate([rows[1], -1 - np.arange(len(foreign))])
+        matched = np.stack([r[answer.indices[:, i]] for i, r in enumerate(originals)], axis=1)
+        pairs.append(set(map(tuple, matched.tolist())))
+        scores.append(dict(zip(map(tuple, matched.tolist()), answer.scores.tolist(), strict=True)))
+    if case.truth_source == "image":
+        _require_enough(len(pairs[0]))
+    changed = sorted(pairs[0] ^ pairs[1])
+    text = f"{len(changed)} of {len(pairs[0])} matches differ if features are in another order"
+    if changed and case.truth_source == "image":
+        # Features at equal positions can replace each other in a match.
+        rows, columns = np.array(changed).T
+        xy = given[0].keypoints[rows], np.concatenate([given[1].keypoints, foreign_xy])[columns]
+        found = DenseMatches(*xy, np.ones(len(changed), np.float32))
+        errors = match_errors_px(case.example, case.example.partner, found)
+        middle = float(np.median(list(scores[0].values())))
+        sure = [max(s.get(pair, 0.0) for s in scores) >= middle for pair in changed]
+        num_wrong = int((errors > _MAX_ERROR_PX)[sure].sum())
+        if num_wrong:
+            raise CheckFailed(f"{text}, {num_wrong} of them are wrong and have high scores")
+    return text
+
+
+def check_matcher_large_view(case: ContractCase) -> str:
+    """Require correct matches of two large views.
+
+    A sparse matcher receives the features of small views with keypoints and scales of views of 4032
+    x 3024 pixels. A dense matcher receives two views of 960 x 720 pixels.
+    """
+    case.require_truth("image")
+    import cv2  # The import is local, because pytest loads this module when it collects tests.
+
+    is_sparse = case.declares("sparse")
+    factor = _LARGE_FACTOR if is_sparse else _DENSE_FACTOR
+    examples = case.example, case.example.partner
+    size = case.example.camera.width * factor, case.example.camera.height * factor
+    a, b = (example.sized(*size) for example in examples)
+    views = [
+        View(large.name, cv2.resize(small.view.image, size), large.camera)
+        for large, small in zip((a, b), examples, strict=True)
+    ]
+    features = None
+    if is_sparse:
+        given = case.extract_features(*(example.view for example in examples))
+        features = _enlarge(given[0], factor), _enlarge(given[1], factor)
+    # The provider is given, because comparing large views with those of other calls takes long.
+    matches = point_matches(case.run_on_views(views, features, case.provider), features)
+    _require_enough(len(matches))
+    limit = factor * MATCH_TOLERANCE_STD * max(1.0, matches.std_px)
+    right = match_errors_px(a, b, matches) < limit
+    text = (
+        f"{right.mean():.0%} of {len(matches)} matches of {size[0]} x {size[1]} views are correct"
+    )
+    if right.mean() < _MIN_CORRECT_RATIO_OF_HARD_PAIRS:
+        raise CheckFailed(text)
+    outer = _measure_outer_quarters(matches.points_a[right], a.camera)
+    if right.sum() >= MIN_COVERING and outer.min() < _MIN_SIDE_RATIO:
+        raise CheckFailed(f"only {outer.min():.0%} of {text} and in the outer quarter of one side")
+    return text
+
+
+def check_matcher_std(case: ContractCase) -> str:
+    """Require a ``std_px`` of dense matches that is not far below their measured error.
+
+    A ``std_px`` that is measured in pixels of a reduced image or of a feature map is too small.
+    """
+    if not case.declares("dense"):
+        raise CheckSkipped("sparse matches have no positions of their own")
+    case.require_truth("image", "prepared")
+    a, b = case.example, case.example.partner
+    matches = match_points(case, a, b, case.run(a))
+    true = a.correspondences(b, matches.points_a)
+    error = (matches.points_b - true.xy_b)[true.visible]
+    error = error[np.abs(error).max(axis=1) < _MAX_ERROR_PX * max(1.0, matches.std_px)]
+    if len(error) < 2 * MIN_MATCHES:
+        raise CheckUndecided(f"only {len(error)} matches are correct, too few to measure std_px")
+    # The median absolute deviation of a normal distribution is 0.67 of its std.
+    factor = float(np.median(np.abs(error)) / 0.6745) / matches.std_px
+    if factor > _MAX_STD_FACTOR:
+        raise CheckFailed(f"matches are off by {factor:.2g} times the declared std_px")
+    return f"errors are {factor:.2g} times std_px"
+
+
 def check_matcher_scores(case: ContractCase) -> str:
     """Require higher scores of reliable matches than of unreliable ones.
 
@@ -288,6 +403,9 @@ CHECKS = (
     check_matcher_no_features,
     check_matcher_few_features,
     check_matcher_many_features,
+    check_matcher_feature_order,
+    check_matcher_large_view,
+    check_matcher_std,
     check_matcher_scores,
     check_matcher_pair_depth,
 )
@@ -331,14 +449,40 @@ def _depth_error(prior: DepthPrior, example: Example) -> float:
     )
 
 
+def _enlarge(features: Features, factor: int) -> Features:
+    """Return features with the keypoints and scales of a view of ``factor`` times the size."""
+    scales = None if features.scales is None else np.float32(factor) * features.scales
+    return replace(features, keypoints=factor * features.keypoints, scales=scales)
+
+
+def _append(features: Features, others: Features) -> Features:
+    """Return features, followed by other features at the same positions."""
+
+    def join(a: Float32 | None, b: Float32 | None) -> Float32 | None:
+        return None if a is None or b is None else np.concatenate([a, b])
+
+    return Features(
+        np.concatenate([features.keypoints, np.resize(features.keypoints, (len(others), 2))]),
+        np.concatenate([features.descriptors, others.descriptors]),
+        join(features.scores, others.scores),
+        join(features.scales, others.scales),
+        features.std_px,
+    )
+
+
 def _take_first(features: Features, count: int) -> Features:
     """Return the first ``count`` features of a view."""
-    return Features(
-        features.keypoints[:count],
-        features.descriptors[:count],
-        None if features.scores is None else features.scores[:count],
-        None if features.scales is None else features.scales[:count],
-        features.std_px,
+    return take_features(features, np.arange(min(count, len(features))))
+
+
+def _require_no_shift_of_odd_sizes(case: ContractCase) -> None:
+    """Require unshifted matches between a view of 211 x 149 pixels and a smaller copy."""
+    a, b = case.example.sized(158, 111), case.example.sized(211, 149)
+    matches = match_points(case, a, b, case.run_on_examples(a, b))
+    true = a.correspondences(b, matches.points_a)
+    residual = (matches.points_b - true.xy_b)[true.visible]
+    _describe_residual(
+        residual, matches.std_px, 0.5, "between views of 158 x 111 and of 211 x 149 pixels", []
     )
 
 

@@ -134,6 +134,8 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
     common = case.example.with_common_camera()
     sizes = ((2 * width, 2 * height), (height, width))
     examples = (common, *(case.example.sized(*size).with_common_camera() for size in sizes))
+    if case.truth_source == "prepared":
+        examples = (case.example, *(case.example.sized(*size) for size in sizes))
     found = case.run_on_examples(*examples).intrinsics
     assert found is not None  # The validator requires the predicted intrinsics.
     if case.truth_source == "none":

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.data import Float64, NormalPrior
+from mpsfm_core.data import DepthPrior, Float64, NormalPrior
 from mpsfm_core.geometry import angle_between_deg
 from mpsfm_core.testing import map_errors
 from mpsfm_core.testing.accuracy import NORMALS_TOLERANCE_DEG, require_small_shift
@@ -118,6 +118,32 @@ def check_normals_same_in_larger_view(case: ContractCase) -> str:
     return f"angle {angle:.2f} degrees"
 
 
+def check_normals_depth_input(case: ContractCase) -> str:
+    """Require the same normals for depth in another unit, of half the size or without variance.
+
+    The check applies to providers that declare ``needs-depth``.
+    """
+    case.require_capability("needs-depth")
+    case.require_truth("painted", "prepared", "image")
+    example = case.example
+    truth, small = (
+        example.truth(),
+        example.truth(tuple(-(-n // 2) for n in example.truth().valid.shape)),
+    )
+    depths = {
+        "of ten times the size": DepthPrior.from_arrays(10 * truth.depth, None, metric=False),
+        "of a smaller map": DepthPrior.from_arrays(small.depth, (0.02 * small.depth) ** 2),
+    }
+    worst = 0.0
+    for what, depth in depths.items():
+        prior = case.run_on_view(example.view, example, case.provider, depth)
+        angle = map_errors.error_quantile(map_errors.angle_errors_deg(prior, example))
+        if angle > NORMALS_TOLERANCE_DEG:
+            raise CheckFailed(f"the normals are {angle:.0f} degrees off for depth {what}")
+        worst = max(worst, angle)
+    return f"angle {worst:.2f} degrees"
+
+
 def check_normals_variance(case: ContractCase) -> str:
     """Require a variance in rad^2, the square of the angular std that the test network reports."""
     case.require_truth("painted", "prepared")
@@ -144,6 +170,7 @@ CHECKS = (
     check_normals_validity,
     check_normals_flip,
     check_normals_same_in_larger_view,
+    check_normals_depth_input,
     check_normals_variance,
     check_normals_calibration,
 )

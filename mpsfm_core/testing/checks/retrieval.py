@@ -6,8 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from mpsfm_core.data import View
 from mpsfm_core.testing.contract_case import ContractCase
-from mpsfm_core.testing.examples import outdoor_example
+from mpsfm_core.testing.examples import Example, outdoor_example
 from mpsfm_core.testing.outcome import CheckFailed
 
 _MIN_MARGIN = 1e-4
@@ -82,6 +83,7 @@ def check_retrieval_sizes(case: ContractCase) -> str:
     vector = case.run(example).astype(np.float64)
     unrelated = max(float(vector @ case.run(e)) for e in (other, other.sized(height, width)))
     similarity = {name: float(vector @ case.run(copy)) for name, copy in copies.items()}
+    similarity["eight times larger"] = float(vector @ case.run_on_view(_enlarge(example), example))
     for name, value in similarity.items():
         if value <= unrelated:
             raise CheckFailed(
@@ -89,6 +91,15 @@ def check_retrieval_sizes(case: ContractCase) -> str:
                 f"to another scene"
             )
     return f"similarity at least {min(similarity.values()):.3f} to copies of other sizes"
+
+
+def _enlarge(example: Example) -> View:
+    """Return a view of 1536 x 1152 pixels with the content of the example."""
+    import cv2  # The import is local, because pytest loads this module when it collects tests.
+
+    camera = example.camera.resized(8 * example.camera.width, 8 * example.camera.height)
+    image = cv2.resize(example.view.image, camera.size, interpolation=cv2.INTER_CUBIC)
+    return View("large.png", image, camera)
 
 
 CHECKS = (

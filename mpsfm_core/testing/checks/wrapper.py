@@ -20,6 +20,9 @@ variance."""
 _MAX_STD_SPREAD = 1.7
 """Largest accepted ratio between the 90 % and 10 % quantiles of the std ratio of wrapper and
 wrapped provider. The std of the wrapped provider varies by a factor of 3."""
+_MAX_LOG_FACTOR = 0.03
+"""Largest accepted logarithm of the ratio between the change of the wrapper's depth and that of the
+wrapped depth."""
 _MAX_FILLED_RATIO = 0.05
 """Largest accepted ratio of pixels without a value that a wrapper makes valid."""
 
@@ -56,20 +59,36 @@ def check_wrapper_keeps_unit(case: ContractCase) -> None:
 def check_wrapper_uses_the_provider(case: ContractCase) -> str:
     """Require that the wrapper's depth is computed from the depth of the wrapped provider.
 
-    If the wrapped provider returns twice the depth, the wrapper has to return twice the depth.
+    If the wrapped provider returns 0.1, 2 or 9 times the depth, the depth of the wrapper has to
+    change by the same factor at each pixel.
     """
     if case.kind != "depth":
         raise CheckSkipped("the check applies to depth only")
-    once, twice = case.run(case.example), case.run(case.example, case.create_provider(scale=2.0))
-    both = once.valid & twice.valid
-    if not both.any():
-        raise CheckFailed("no pixel is valid both for the original and for the doubled depth")
-    factor = float(np.median(twice.depth[both] / once.depth[both]))
-    if abs(factor - 2) > 0.05:
-        raise CheckFailed(
-            f"if the wrapped depth doubles, the wrapper's depth grows {factor:.2f} times"
-        )
+    once = case.run(case.example)
+    for scale in (2.0, 0.1, 9.0):
+        scaled = case.run(case.example, case.create_provider(scale=scale))
+        both = once.valid & scaled.valid
+        if not both.any():
+            raise CheckFailed(f"no pixel is valid if the wrapped depth is {scale:g} times as large")
+        factors = scaled.depth[both] / once.depth[both] / scale
+        low, factor, high = np.quantile(factors, (0.02, 0.5, 0.98))
+        if max(abs(np.log([low, factor, high]))) > _MAX_LOG_FACTOR:
+            raise CheckFailed(
+                f"if the wrapped depth grows {scale:g} times, the wrapper's depth grows "
+                f"{low * scale:.2f} to {high * scale:.2f} times"
+            )
     return f"factor {factor:.2f}"
+
+
+def check_wrapper_stacked(case: ContractCase) -> str:
+    """Require accurate output of the wrapper around itself.
+
+    The configuration of a run may name several wrappers, the first of which wraps the provider.
+    """
+    answer = case.run(case.example, case.create_provider(num_wrappers=2))
+    if answer.variance is None:
+        raise CheckFailed("two wrappers drop the variance of the wrapped provider")
+    return compare_with_truth(case, case.example, answer)
 
 
 def check_wrapper_hands_on_depth(case: ContractCase) -> None:
@@ -146,6 +165,7 @@ CHECKS = (
     check_wrapper_low_resolution,
     check_wrapper_validity,
     check_wrapper_inputs,
+    check_wrapper_stacked,
 )
 
 
