@@ -37,6 +37,7 @@ from tests.testing import (
     test_mutants_maps,
     test_mutants_matching,
     test_mutants_multiview,
+    test_mutants_sizes,
 )
 
 PAINTED = ContractSetup(truth_source="painted")
@@ -489,6 +490,7 @@ def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
         test_mutants_maps,
         test_mutants_matching,
         test_mutants_multiview,
+        test_mutants_sizes,
     )
     tests = [
         test

@@ -1,0 +1,233 @@
+"""Providers whose faults depend on the size, order, unit or neighborhood of their input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from mpsfm_core import (
+    DenseMatches,
+    DepthPrior,
+    Features,
+    NormalPrior,
+    PairMatches,
+    ProviderContext,
+    SparseMatches,
+    View,
+)
+from mpsfm_core.providers.builtin.mutual_nearest import MutualNearest
+from mpsfm_core.providers.builtin.options import MutualNearestOptions, SiftOptions
+from mpsfm_core.providers.builtin.sift import Sift
+from mpsfm_core.testing import ContractSetup
+from mpsfm_core.testing.painted_views import read_depth, read_normals
+from tests.support.reference_providers import PaintedDepth, Wrapper, depth_prior, normal_prior
+
+PAINTED = ContractSetup(truth_source="painted")
+
+
+class Millimeters16(PaintedDepth):
+    """Fault: stores depth in millimeters with 16 bits, which overflow at 65.5 m."""
+
+    def predict(self, view: View) -> DepthPrior:
+        depth = (1000 * read_depth(view.image)).astype(np.int64).astype(np.uint16)
+        return depth_prior(depth / 1000)
+
+
+class BorderOfTiles(PaintedDepth):
+    """Fault: adds up the depth of two tiles in the columns where the tiles overlap."""
+
+    def predict(self, view: View) -> DepthPrior:
+        depth = read_depth(view.image)
+        middle = depth.shape[1] // 2
+        depth[:, middle - 4 : middle + 4] *= 2
+        return depth_prior(depth)
+
+
+class NormalsOfMeters:
+    """Fault: uses input depth without regard to its unit and to the size of its map."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        self.options = options
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        assert depth is not None
+        normals = read_normals(view.image)
+        if np.median(depth.depth) > 15:
+            normals[..., :2] = 0
+        return normal_prior(normals, view)
+
+
+class BlursOverHoles(Wrapper):
+    """Fault: smooths depth together with the zeros of invalid pixels."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        prior = self.inner.predict(view)
+        blurred = np.maximum(cv2.blur(prior.depth, (3, 3)), 1e-3)
+        return replace(prior, depth=np.where(prior.valid, blurred, 0).astype(np.float32))
+
+
+class NeedsItsName(Wrapper):
+    """Fault: works only if the wrapped provider has the attribute of a certain class."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        prior = self.inner.predict(view)
+        if type(self.inner) is type(self):
+            return replace(prior, depth=1.2 * prior.depth)
+        return prior
+
+
+@pytest.mark.parametrize(
+    ("kind", "factory", "check", "message", "setup", "capabilities"),
+    [
+        ("depth", Millimeters16, "depth-range", "9 times as far", PAINTED, ("metric",)),
+        ("depth", BorderOfTiles, "depth-edges", "no surface near has", PAINTED, ("metric",)),
+        (
+            "normals",
+            NormalsOfMeters,
+            "normals-depth-input",
+            "off for depth of ten times the size",
+            PAINTED,
+            ("needs-depth",),
+        ),
+        ("wrapper", BlursOverHoles, "depth-edges", "no surface near", None, ("wraps-depth",)),
+        ("wrapper", NeedsItsName, "wrapper-stacked", "relative error", None, ("wraps-depth",)),
+    ],
+)
+def test_faulty_map_provider_fails_its_check(
+    caught: Callable[..., None],
+    kind: str,
+    factory: type,
+    check: str,
+    message: str,
+    setup: ContractSetup | None,
+    capabilities: tuple[str, ...],
+) -> None:
+    caught(kind, factory, check, message, setup, *capabilities)
+
+
+class Reduced(Sift):
+    """Detector that reduces the longer side of a view to 320 pixels."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(SiftOptions(max_keypoints=2000), context)
+
+    def extract(self, view: View) -> Features:
+        scale = 320 / max(view.camera.size)
+        if scale >= 1:
+            return super().extract(view)
+        size = tuple(max(1, round(scale * side)) for side in view.camera.size)
+        image = cv2.resize(view.image, size, interpolation=cv2.INTER_AREA)
+        found = super().extract(View(view.name, image, view.camera.resized(*size)))
+        xy = self.enlarge(found.keypoints, np.array(view.camera.size) / size)
+        return Features(np.clip(xy, 0, view.camera.size), found.descriptors)
+
+    def enlarge(self, xy: Any, factor: Any) -> Any:
+        raise NotImplementedError
+
+
+class IntegerCenters(Reduced):
+    """Fault: multiplies keypoints whose first pixel has the center (0, 0)."""
+
+    def enlarge(self, xy: Any, factor: Any) -> Any:
+        return (xy - 0.5) * factor + 0.5
+
+
+class SortsManyDescriptors(Sift):
+    """Fault: sorts keypoints but no descriptors if there are more than 1500 keypoints."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(SiftOptions(max_keypoints=3000), context)
+
+    def extract(self, view: View) -> Features:
+        found = super().extract(view)
+        if len(found) <= 1500:
+            return found
+        order = np.argsort(found.keypoints[:, 1], kind="stable")
+        return Features(found.keypoints[order], found.descriptors)
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [
+        (IntegerCenters, "features-other-sizes", r"768 x 576 view are shifted by \(-0.70, -0.70"),
+        (SortsManyDescriptors, "features-other-sizes", "descriptors of a 768 x 576 view"),
+    ],
+)
+def test_faulty_features_provider_fails_its_check(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
+    caught("features", factory, check, message)
+
+
+class Given(MutualNearest):
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(MutualNearestOptions(), context)
+
+
+class DummyMatch(Given):
+    """Fault: clips the index of a missing match to the last feature, with a score of 1."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        found = super().match(a, b, fa, fb).sparse
+        assert found is not None
+        free = np.setdiff1d(np.arange(len(fa)), found.indices[:, 0])
+        if not len(free) or len(fb) - 1 in found.indices[:, 1]:
+            return PairMatches(found)
+        indices = np.concatenate([found.indices, [[free[0], len(fb) - 1]]])
+        return PairMatches(SparseMatches(indices, np.append(found.scores, np.float32(1))))
+
+
+class Coordinates8(Given):
+    """Fault: drops matches whose coordinates exceed 1024 pixels."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        found = super().match(a, b, fa, fb).sparse
+        assert found is not None
+        inside = fa.keypoints[found.indices[:, 0]].max(axis=1) < 1024
+        return PairMatches(SparseMatches(found.indices[inside], found.scores[inside]))
+
+
+class DenseSift(Given):
+    """Dense matcher of SIFT features."""
+
+    std_px = 1.0
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        features = [
+            Sift(SiftOptions(), ProviderContext(lambda *_: None)).extract(v) for v in (a, b)
+        ]
+        found = super().match(a, b, *features).sparse
+        assert found is not None
+        points = [self.change(f.keypoints[found.indices[:, i]]) for i, f in enumerate(features)]
+        return PairMatches(dense=DenseMatches(*points, found.scores, self.std_px))
+
+    def change(self, xy: Any) -> Any:
+        return xy
+
+
+class TinyStd(DenseSift):
+    """Fault: rounds to the cells of a feature map and returns the std of a refined match."""
+
+    std_px = 0.1
+
+    def change(self, xy: Any) -> Any:
+        return np.floor(xy / 4) * 4 + 2
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message", "capability"),
+    [
+        (DummyMatch, "matcher-feature-order", "wrong and have high scores", "sparse"),
+        (Coordinates8, "matcher-large-view", "4032 x 3024", "sparse"),
+        (TinyStd, "matcher-std", "times the declared std_px", "dense"),
+    ],
+)
+def test_faulty_matcher_fails_its_check(
+    caught: Callable[..., None], factory: type, check: str, message: str, capability: str
+) -> None:
+    caught("matcher", factory, check, message, None, capability)
