@@ -24,6 +24,9 @@ class GroundTruthOptions(Options):
     """True if the returned depth has the flag ``metric``."""
     scale: float = 1.0
     """Factor by which the true depth is multiplied."""
+    mirrored_hole: bool = False
+    """True if the maps of mirrored views have no value in the left third, as networks reject other
+    pixels of a mirrored view."""
     reduction: int = 1
     """Factor by which the returned depth or normal map is smaller than the view."""
 
@@ -52,7 +55,9 @@ class GroundTruth:
         make = GroundTruthDepth if kind == "depth" else GroundTruthNormals
         return lambda options, context: make(self, options)
 
-    def predict(self, view: View, reduction: int = 1) -> tuple[Float64, Float64, Bool, Float64]:
+    def predict(
+        self, view: View, options: GroundTruthOptions
+    ) -> tuple[Float64, Float64, Bool, Float64]:
         """Return depth (h, w), normals (h, w, 3), validity and relative std (h, w) of a view."""
         example = self._recognize(view)
         if example is not None:
@@ -60,10 +65,14 @@ class GroundTruth:
                 self.wrong_inputs.append(
                     f"the camera of {example.name!r}: {view.camera} instead of {example.camera}"
                 )
-            shape = tuple(-(-side // reduction) for side in view.image.shape[:2])
+            shape = tuple(-(-side // options.reduction) for side in view.image.shape[:2])
             truth = example.truth((shape[0], shape[1]))
             spread = relative_std(truth.valid.shape, mirrored=example.mirrored)
-            return truth.depth, truth.normals, truth.valid, spread
+            valid = truth.valid.copy()
+            if example.mirrored and options.mirrored_hole:
+                valid[:, : valid.shape[1] // 3] = False
+            depth, normals = truth.depth * valid, truth.normals * valid[..., None]
+            return depth, normals, valid, spread
         depth = read_depth(view.image)
         spread = np.full(depth.shape, RELATIVE_STD)
         return depth, read_normals(view.image), depth > 0, spread
@@ -107,7 +116,7 @@ class GroundTruthDepth:
 
     def predict(self, view: View) -> DepthPrior:
         """Return the true depth of a view."""
-        depth, _, valid, spread = self._ground_truth.predict(view, self._options.reduction)
+        depth, _, valid, spread = self._ground_truth.predict(view, self._options)
         depth = self._options.scale * depth
         variance = (spread * depth) ** 2 if self._options.variance else None
         return DepthPrior.from_arrays(depth, variance, valid, metric=self._options.metric)
@@ -123,7 +132,7 @@ class GroundTruthNormals:
     def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
         """Return the true normals of a view and record the received depth prior."""
         self._ground_truth.receive_depth(view, depth)
-        _, normals, valid, spread = self._ground_truth.predict(view, self._options.reduction)
+        _, normals, valid, spread = self._ground_truth.predict(view, self._options)
         variance = (2 * spread) ** 2 if self._options.variance else None
         return NormalPrior.from_arrays(normals, variance, valid, camera=view.camera)
 

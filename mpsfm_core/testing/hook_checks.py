@@ -98,10 +98,6 @@ def check_hook_filter_pairs(case: HookCase) -> str:
         return "the filter returns None, which keeps all pairs"
     if len({frozenset(pair) for pair in kept}) < len(kept):
         raise CheckFailed("mpsfm_filter_pairs returns a pair twice")
-    candidates = {frozenset(pair) for pair in _PAIRS}
-    foreign = [pair for pair in kept if frozenset(pair) not in candidates]
-    if foreign:
-        raise CheckFailed(f"mpsfm_filter_pairs returns {foreign[0]!r}, which is no candidate")
     turned = _filter(case, [(b, a) for a, b in reversed(_PAIRS)])
     if {frozenset(pair) for pair in turned or ()} != {frozenset(pair) for pair in kept}:
         raise CheckFailed("mpsfm_filter_pairs depends on the order of pairs or of their images")
@@ -405,9 +401,14 @@ class _CountedHooks(Registry):
 def _filter(case: HookCase, pairs: list[tuple[str, str]]) -> list[tuple[str, str]] | None:
     answer = case.call("mpsfm_filter_pairs", pairs=pairs)
     try:
-        return None if answer is None else validate_filtered_pairs(answer, pairs)[0]
+        kept = None if answer is None else validate_filtered_pairs(answer, pairs)[0]
     except (TypeError, ValueError) as error:
         raise CheckFailed(f"mpsfm_filter_pairs: {error}") from error
+    candidates = {frozenset(pair) for pair in pairs}
+    foreign = [pair for pair in kept or () if frozenset(pair) not in candidates]
+    if foreign:
+        raise CheckFailed(f"mpsfm_filter_pairs returns {foreign[0]!r}, which is no candidate")
+    return kept
 
 
 def _has_hooks(module: object) -> bool:

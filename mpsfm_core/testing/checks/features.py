@@ -42,6 +42,8 @@ _CONTINUED_SIZES = ((211, 149), (768, 576), (403, 611))
 """Widths and heights of the larger views in ``check_features_other_sizes``."""
 _MAX_SHIFT_PX = 32.0
 """Largest shift of keypoints that a vote of their offsets detects."""
+_MIN_STRONG_RATIO = 0.7
+"""Smallest accepted ratio of the numbers of keypoints with high and with low contrast."""
 _NUM_VOTING = 500
 """Largest number of keypoints whose offsets vote for a shift."""
 _MIN_RANK_CORRELATION = 0.15
@@ -105,15 +107,23 @@ def check_features_coverage(case: ContractCase) -> str:
 def check_features_scores(case: ContractCase) -> str:
     """Require higher scores where the texture has more contrast.
 
-    A limit on the number of features keeps the features with the highest scores.
+    A limit on the number of features has to keep the features with the highest scores, so that most
+    keypoints are in the half of the view with more contrast.
     """
     case.require_truth("image", "prepared")
-    view = case.example.view
+    size = 2 * case.example.camera.width, 2 * case.example.camera.height
+    view = _continue_by_reflection(case.example.view, size)
     half = view.camera.width // 2
     image = view.image.astype(np.float64)
     image[:, :half] = 128 + 0.25 * (image[:, :half] - 128)
     view = replace(view, image=image.round().astype(np.uint8))
     features: Features = case.run_on_view(view, case.example)
+    counts = [int((side * (features.keypoints[:, 0] - half) > 8).sum()) for side in (-1, 1)]
+    if counts[1] < _MIN_STRONG_RATIO * counts[0]:
+        raise CheckFailed(
+            f"{counts[0]} keypoints are in the half of a view with a quarter of the contrast, and "
+            f"{counts[1]} in the other half: a limit has to keep the best keypoints"
+        )
     if features.scores is None:
         raise CheckSkipped("the features have no scores")
     x = features.keypoints[:, 0]

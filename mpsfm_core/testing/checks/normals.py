@@ -119,7 +119,7 @@ def check_normals_same_in_larger_view(case: ContractCase) -> str:
 
 
 def check_normals_depth_input(case: ContractCase) -> str:
-    """Require the same normals for depth in another unit, of half the size or without variance.
+    """Require the same normals for depth in another unit and for a depth map of half the size.
 
     The check applies to providers that declare ``needs-depth``.
     """
@@ -131,7 +131,9 @@ def check_normals_depth_input(case: ContractCase) -> str:
         example.truth(tuple(-(-n // 2) for n in example.truth().valid.shape)),
     )
     depths = {
-        "of ten times the size": DepthPrior.from_arrays(10 * truth.depth, None, metric=False),
+        "of ten times the size": DepthPrior.from_arrays(
+            10 * truth.depth, (0.2 * truth.depth) ** 2, metric=False
+        ),
         "of a smaller map": DepthPrior.from_arrays(small.depth, (0.02 * small.depth) ** 2),
     }
     worst = 0.0

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.testing.accuracy import compare_with_truth
+from mpsfm_core.testing.accuracy import compare_with_truth, require_local_depth
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
@@ -135,10 +135,18 @@ def check_wrapper_low_resolution(case: ContractCase) -> str:
 
 
 def check_wrapper_validity(case: ContractCase) -> str:
-    """Require invalid pixels in the wrapper's map where the wrapped provider has no value."""
+    """Require invalid pixels in the wrapper's map where the wrapped provider has no value.
+
+    If the wrapped provider has a value in the view or in the mirrored view only, the wrapper may
+    use this value, but no mean with the meaningless other value.
+    """
     inner, answer = _run_inner(case), case.run(case.example)
     if answer.shape != inner.shape:
         raise CheckSkipped("the map of the wrapper has another size")
+    # A wrapper may use the mirrored view, for which a network rejects other pixels.
+    other = case.run(case.example, case.create_provider(mirrored_hole=True))
+    if case.kind == "depth":
+        require_local_depth(case, case.example, other)
     return _require_same_holes(inner, answer)
 
 
