@@ -40,9 +40,12 @@ def check_mask_polarity(case: ContractCase) -> str:
 def check_mask_place(case: ContractCase) -> str:
     """Require that the mask covers the whole view without a shift.
 
-    Shifted, rotated and cropped masks fail the check.
+    Shifted, rotated and cropped masks fail the check. A second view shows mostly sky.
     """
     case.require_truth("painted", "prepared", "image")
+    width, height = case.example.camera.size
+    sky = case.example.crop(0, -height // 2, width, height)
+    compare_with_truth(case, sky, case.run(sky))
     return compare_with_truth(case, case.example, case.run(case.example))
 
 

@@ -41,6 +41,9 @@ _LARGE_FACTOR = 21
 """Factor of the size of views with 12 megapixels for sparse matchers, which see features only."""
 _NUM_FOREIGN = 40
 """Number of features of another scene in ``check_matcher_feature_order``."""
+_MIN_SCORE_CORRELATION = 0.3
+"""Smallest accepted correlation of the scores of matches if the features are in another order. The
+correlation is 0 if the scores belong to other matches."""
 _DENSE_FACTOR = 5
 """Factor of the size of the large views for dense matchers."""
 _MAX_STD_FACTOR = 3.0
@@ -236,6 +239,7 @@ def check_matcher_feature_order(case: ContractCase) -> str:
 
     Features have no order. The second view gets further features from another scene, which have no
     match. Matches of features at the same position may differ, and wrong matches with low scores.
+    The scores of equal matches have to correlate.
     """
     if not case.declares("sparse"):
         raise CheckSkipped("the matcher needs no features")
@@ -259,6 +263,15 @@ def check_matcher_feature_order(case: ContractCase) -> str:
         scores.append(dict(zip(map(tuple, matched.tolist()), answer.scores.tolist(), strict=True)))
     if case.truth_source == "image":
         _require_enough(len(pairs[0]))
+    common = sorted(pairs[0] & pairs[1])
+    values = [np.array([s[pair] for pair in common]) for s in scores]
+    if len(common) >= MIN_COVERING and min(map(np.ptp, values)) > 1e-3:
+        correlation = float(np.corrcoef(values[0], values[1])[0, 1])
+        if correlation < _MIN_SCORE_CORRELATION:
+            raise CheckFailed(
+                "the scores of the same matches have a correlation of "
+                f"{correlation:.2f} if the features are in another order"
+            )
     changed = sorted(pairs[0] ^ pairs[1])
     text = f"{len(changed)} of {len(pairs[0])} matches differ if features are in another order"
     if changed and case.truth_source == "image":
@@ -268,7 +281,7 @@ def check_matcher_feature_order(case: ContractCase) -> str:
         found = DenseMatches(*xy, np.ones(len(changed), np.float32))
         errors = match_errors_px(case.example, case.example.partner, found)
         middle = float(np.median(list(scores[0].values())))
-        sure = [max(s.get(pair, 0.0) for s in scores) >= middle for pair in changed]
+        sure = [max(s.get(pair, 0.0) for s in scores) > middle for pair in changed]
         num_wrong = int((errors > _MAX_ERROR_PX)[sure].sum())
         if num_wrong:
             raise CheckFailed(f"{text}, {num_wrong} of them are wrong and have high scores")

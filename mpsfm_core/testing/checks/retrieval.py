@@ -30,7 +30,7 @@ def check_retrieval_self_similarity(case: ContractCase) -> str:
 
     Descriptors of unit norm always pass the check. If descriptors have different norms, the
     descriptors of bright or detailed views can be similar to those of all views. One of the views
-    has low contrast.
+    has low contrast, another one 1.8 megapixels.
     """
     flat = replace(case.example.view, image=np.full_like(case.example.view.image, 255))
     image = case.example.view.image
@@ -42,6 +42,7 @@ def check_retrieval_self_similarity(case: ContractCase) -> str:
             case.run(outdoor_example("textured")),
             case.run_on_view(flat, case.example),
             case.run_on_view(faint, case.example),
+            case.run_on_view(_enlarge(case.example), case.example),
         ]
     ).astype(np.float64)
     similarity = descriptors @ descriptors.T
