@@ -191,7 +191,7 @@ class TripsOverMasks(Changed):
         (Smoothed, "no-state", "after other views"),
         (WritesToTheImage, "inputs-unchanged", "modifies its input image"),
         (GoesByName, "name-does-not-matter", "renamed view"),
-        (SecretlyCanonical, "intrinsics-declared", "depends on the focal length"),
+        (SecretlyCanonical, "intrinsics-declared", "depends on the intrinsics"),
         (SharedBuffer, "threads", "in two parallel threads"),
         (LocalPrior, "pickles", "the answer cannot be pickled"),
         (TriesTheNetwork, "offline", "opens a network connection: localhost"),

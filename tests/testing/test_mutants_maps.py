@@ -441,7 +441,7 @@ class DoublesIntrinsics(Wrapper):
         (DropsVariance, "wrapper-keeps-variance", "drops the variance", "normals"),
         (WantsVariance, "wrapper-without-variance", "NoneType", "depth"),
         (AlwaysMetric, "wrapper-keeps-unit", "returns depth with metric=True", "depth"),
-        (OfItsOwn, "wrapper-uses-the-provider", "grows 1.00 times", "depth"),
+        (OfItsOwn, "wrapper-uses-the-provider", "grows 1.00 to 1.00 times", "depth"),
         (KeepsDepth, "wrapper-hands-on-depth", "does not pass the depth prior", "normals"),
         (MirrorNotUndone, "depth-scale", "not proportional to z", "depth"),
         (MirroredNormals, "normals-frame", "x is negated", "normals"),

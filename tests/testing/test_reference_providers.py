@@ -44,11 +44,11 @@ def spec(kind: Kind, name: str, *capabilities: str, options: str | None = None) 
 @pytest.mark.parametrize(
     ("given", "setup", "skipped"),
     [
-        (spec("depth", "PaintedDepth", *JOINT), PAINTED, {"depth-intrinsics", "depth-range"}),
+        (spec("depth", "PaintedDepth", *JOINT), PAINTED, {"depth-intrinsics"}),
         (
             spec("normals", "PaintedNormals", "variance"),
             PAINTED,
-            {"normals-validity"},
+            {"normals-validity", "normals-depth-input"},
         ),
         (
             spec("matcher", "ToldMatcher", "dense", "pair-depth", options="ToldOptions"),
@@ -61,12 +61,14 @@ def spec(kind: Kind, name: str, *capabilities: str, options: str | None = None) 
                 "large-view",
                 "matcher-sizes",
                 "matcher-scores",
+                "matcher-feature-order",
+                "matcher-large-view",
             },
         ),
         (
             spec("multiview", "ToldGroup", *EVERYTHING, options="ToldOptions"),
             told_group,
-            {"name-does-not-matter", "depth-channel-order", "depth-intrinsics", "large-view"},
+            {"name-does-not-matter", "depth-channel-order", "depth-intrinsics"},
         ),
         (spec("retrieval", "Thumbnail"), None, {"large-view"}),
         (spec("mask", "PaintedMask"), PAINTED, set()),
@@ -84,7 +86,7 @@ def spec(kind: Kind, name: str, *capabilities: str, options: str | None = None) 
                 "depth-focal",
                 "normals-channel-order",
                 "normals-variance",
-                "large-view",
+                "normals-depth-input",
             },
         ),
     ],

@@ -514,7 +514,7 @@ def _correlate_scores(first: Features, second: Features) -> float:
 
 
 def _require_symmetric(case: ContractCase, features: Features, size: tuple[int, int]) -> None:
-    """Require that keypoints of a point-symmetric view are symmetric, unless the detector is not.
+    """Require symmetric keypoints of a point-symmetric view if the detector is symmetric.
 
     Scaling keypoints with integer pixel centers shifts all keypoints of a reduced large view.
     """
