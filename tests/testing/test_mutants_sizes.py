@@ -25,7 +25,14 @@ from mpsfm_core.providers.builtin.options import MutualNearestOptions, SiftOptio
 from mpsfm_core.providers.builtin.sift import Sift
 from mpsfm_core.testing import ContractSetup
 from mpsfm_core.testing.painted_views import read_depth, read_normals
-from tests.support.reference_providers import PaintedDepth, Wrapper, depth_prior, normal_prior
+from tests.support.reference_providers import (
+    PaintedDepth,
+    PaintedMask,
+    Thumbnail,
+    Wrapper,
+    depth_prior,
+    normal_prior,
+)
 
 PAINTED = ContractSetup(truth_source="painted")
 
@@ -46,6 +53,55 @@ class BorderOfTiles(PaintedDepth):
         middle = depth.shape[1] // 2
         depth[:, middle - 4 : middle + 4] *= 2
         return depth_prior(depth)
+
+
+class RotatesAgain(PaintedDepth):
+    """Fault: rotates the map by the EXIF orientation, although the view is upright."""
+
+    def predict(self, view: View) -> DepthPrior:
+        turned = np.rot90(read_depth(view.image), 1 if view.orientation == 6 else 0)
+        return depth_prior(np.ascontiguousarray(turned))
+
+
+class CachedByCorners(PaintedDepth):
+    """Fault: compares size and two pixels of a view to find it in a cache."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(options, context)
+        self.known: dict[Any, DepthPrior] = {}
+
+    def predict(self, view: View) -> DepthPrior:
+        key = view.image.shape, view.image[0, 0].tobytes(), view.image[-1, -1].tobytes()
+        if key not in self.known:
+            self.known[key] = super().predict(view)
+        return self.known[key]
+
+
+class SkyIsMinority(PaintedMask):
+    """Fault: inverts a mask that excludes more than half of the view."""
+
+    def mask(self, view: View) -> Any:
+        mask = super().mask(view)
+        return mask if mask.mean() > 0.5 else ~mask
+
+
+class Faint(Thumbnail):
+    """Fault: the length of descriptors grows with the contrast."""
+
+    def describe(self, view: View) -> Any:
+        return super().describe(view) * np.float32(1 + view.image.std())
+
+
+class MeanWithZeros(Wrapper):
+    """Fault: averages depth of view and mirrored view where one of both is valid."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        camera = replace(view.camera, cx=view.camera.width - view.camera.cx)
+        image = np.ascontiguousarray(view.image[:, ::-1])
+        first, second = self.inner.predict(view), self.inner.predict(View("m", image, camera))
+        mean = (first.depth + second.depth[:, ::-1]) / 2
+        valid = first.valid | second.valid[:, ::-1]
+        return DepthPrior.from_arrays(mean, (0.1 * mean) ** 2, valid, metric=first.metric)
 
 
 class NormalsOfMeters:
@@ -86,6 +142,11 @@ class NeedsItsName(Wrapper):
     [
         ("depth", Millimeters16, "depth-range", "9 times as far", PAINTED, ("metric",)),
         ("depth", BorderOfTiles, "depth-edges", "no surface near has", PAINTED, ("metric",)),
+        ("depth", RotatesAgain, "name-does-not-matter", "renamed view", PAINTED, ("metric",)),
+        ("depth", CachedByCorners, "no-state", "differs|same borders", PAINTED, ("metric",)),
+        ("mask", SkyIsMinority, "mask-place", "wrong value", PAINTED, ()),
+        ("retrieval", Faint, "retrieval-self-similarity", "lengths of descriptors", None, ()),
+        ("wrapper", MeanWithZeros, "wrapper-validity", "no surface near", None, ("wraps-depth",)),
         (
             "normals",
             NormalsOfMeters,
@@ -137,6 +198,24 @@ class IntegerCenters(Reduced):
         return (xy - 0.5) * factor + 0.5
 
 
+class KeepsTheWeakest(Sift):
+    """Fault: a limit keeps the keypoints with the lowest contrast."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(SiftOptions(max_keypoints=3000), context)
+
+    def extract(self, view: View) -> Features:
+        found = super().extract(view)
+        gray = view.image.mean(axis=2)
+        columns, rows = (found.keypoints.astype(int).T + 0).clip(0)
+        near = [
+            gray[np.maximum(y - 4, 0) : y + 5, np.maximum(x - 4, 0) : x + 5]
+            for x, y in zip(columns, rows, strict=True)
+        ]
+        keep = np.argsort([part.std() for part in near], kind="stable")[:300]
+        return Features(found.keypoints[keep], found.descriptors[keep])
+
+
 class SortsManyDescriptors(Sift):
     """Fault: sorts keypoints but no descriptors if there are more than 1500 keypoints."""
 
@@ -155,6 +234,7 @@ class SortsManyDescriptors(Sift):
     ("factory", "check", "message"),
     [
         (IntegerCenters, "features-other-sizes", r"768 x 576 view are shifted by \(-0.70, -0.70"),
+        (KeepsTheWeakest, "features-scores", "a limit has to keep the best keypoints"),
         (SortsManyDescriptors, "features-other-sizes", "descriptors of a 768 x 576 view"),
     ],
 )
@@ -180,6 +260,15 @@ class DummyMatch(Given):
             return PairMatches(found)
         indices = np.concatenate([found.indices, [[free[0], len(fb) - 1]]])
         return PairMatches(SparseMatches(indices, np.append(found.scores, np.float32(1))))
+
+
+class SortedScores(Given):
+    """Fault: sorts the scores without the matches."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        found = super().match(a, b, fa, fb).sparse
+        assert found is not None
+        return PairMatches(SparseMatches(found.indices, np.sort(found.scores)[::-1].copy()))
 
 
 class Coordinates8(Given):
@@ -223,6 +312,7 @@ class TinyStd(DenseSift):
     ("factory", "check", "message", "capability"),
     [
         (DummyMatch, "matcher-feature-order", "wrong and have high scores", "sparse"),
+        (SortedScores, "matcher-feature-order", "scores of the same matches", "sparse"),
         (Coordinates8, "matcher-large-view", "4032 x 3024", "sparse"),
         (TinyStd, "matcher-std", "times the declared std_px", "dense"),
     ],
