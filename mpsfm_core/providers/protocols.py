@@ -28,8 +28,10 @@ Uncertainties are variances unless the name ends with ``std``. A depth or normal
 whole image and may have any resolution.
 
 A provider must be deterministic, so that the same input and seed give the same output, bit for bit.
-Providers keep no state between calls. A provider may raise any exception, which the run reports
-with the names of the provider and the image.
+The output depends only on the arguments of the call, so a cache is allowed if no result depends on
+it. A provider does not modify its arguments. Each thread of a run has its own instance, but
+instances share the modules and global variables of the plugin. A provider may raise any exception,
+which the run reports with the names of the provider and the image.
 """
 
 from __future__ import annotations
@@ -274,7 +276,7 @@ class Hooks:
             pairs: Candidate pairs of image names.
 
         Returns:
-            Selected pairs of image names, a subset of ``pairs``.
+            Selected pairs of image names, a subset of ``pairs`` with the names in the same order.
         """
 
     @hookspec(firstresult=True)

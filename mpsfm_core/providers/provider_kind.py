@@ -10,7 +10,7 @@ from mpsfm_core.data import View
 from mpsfm_core.providers.protocols import Capability, Kind, ProviderSpec
 
 COMMON_CAPABILITIES: Mapping[Capability, str] = {
-    "intrinsics-aware": "The output of the provider depends on the focal length.",
+    "intrinsics-aware": "The output of the provider depends on the intrinsics of the view.",
     "uncached": "The provider reads its output from files, so the run does not cache the output.",
 }
 """Meaning of each capability that providers of every kind may declare."""
