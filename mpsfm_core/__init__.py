@@ -7,7 +7,17 @@ defines an exported name is imported when the name is first used, so that comman
 from __future__ import annotations
 
 import importlib
+import sys
+import warnings
 from typing import TYPE_CHECKING, Any
+
+if "pycolmap" in sys.modules and "zlib" not in sys.modules:
+    warnings.warn(
+        "import mpsfm_core or zlib before pycolmap: the wheels of pycolmap contain a zlib that "
+        "replaces the one of Python, and the process may abort when it compresses files",
+        stacklevel=2,
+    )
+importlib.import_module("zlib")  # before any module of this package imports pycolmap
 
 if TYPE_CHECKING:
     from mpsfm_core.api import (

@@ -41,3 +41,22 @@ def test_help_imports_neither_numpy_nor_pydantic() -> None:
     )
     ended = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
     assert ended.stdout.splitlines()[-1] == b"set()"
+
+
+COMPRESSION = """
+import mpsfm_core
+import pycolmap
+import io, numpy
+numpy.savez_compressed(io.BytesIO(), a=numpy.random.default_rng(0).random((1000, 100)))
+"""
+
+
+def test_compression_works_if_pycolmap_is_imported_later() -> None:
+    subprocess.run([sys.executable, "-c", COMPRESSION], check=True)
+
+
+def test_import_after_pycolmap_warns() -> None:
+    """A stand-in for pycolmap, because the real one aborts the process."""
+    script = "import sys; sys.modules['pycolmap'] = sys; import mpsfm_core"
+    ended = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True)
+    assert b"import mpsfm_core or zlib before pycolmap" in ended.stderr
