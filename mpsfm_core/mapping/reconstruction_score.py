@@ -35,6 +35,7 @@ from mpsfm_core.geometry import (
     transform,
     unproject,
 )
+from mpsfm_core.mapping.consistency.depth_consistency import count_visible_points
 from mpsfm_core.mapping.refinement.depth_noise import CELLS
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
@@ -153,11 +154,16 @@ def _sample_depth(
 
 def _score_depth(images: Sequence[RegisteredImage]) -> Iterator[float]:
     """Yield the log likelihood ratio of the depth of each ordered pair of overlapping images."""
-    samples = [_sample_points(image) for image in images]
-    for row, (points, log_std) in enumerate(samples):
-        for other, image in enumerate(images):
+    rotations = np.array([image.rotation for image in images]).reshape(-1, 3, 3)
+    translations = np.array([image.translation for image in images]).reshape(-1, 3)
+    intrinsics = np.array([image.camera.params for image in images]).reshape(-1, 4)
+    sizes = np.array([image.camera.size for image in images], np.float64).reshape(-1, 2)
+    for row, image in enumerate(images):
+        points, log_std = _sample_points(image)
+        counts = count_visible_points(points, rotations, translations, intrinsics, sizes)
+        for other in map(int, np.flatnonzero(counts)):
             if other != row:
-                ratios = _compare_depth(points, log_std, image)
+                ratios = _compare_depth(points, log_std, images[other])
                 yield NUM_INDEPENDENT / GRID**2 * float(ratios.sum())
 
 
