@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mpsfm_core.data.arrays import (
+    Bool,
     Float32,
     Float64,
     Int64,
@@ -47,6 +48,16 @@ class Features:
                 require_finite(self, name)
         if not (np.isfinite(self.std_px) and self.std_px > 0):
             raise DataError("std_px", "must be positive")
+
+    def select(self, rows: Int64 | Bool) -> Features:
+        """Return the features that row indices or a bool mask select."""
+        return Features(
+            self.keypoints[rows],
+            self.descriptors[rows],
+            None if self.scores is None else self.scores[rows],
+            None if self.scales is None else self.scales[rows],
+            self.std_px,
+        )
 
     @classmethod
     def from_arrays(

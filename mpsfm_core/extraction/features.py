@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Features
+from mpsfm_core.data import Features
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.context import ExtractionContext
@@ -77,7 +77,7 @@ class FeatureTable:
         mask = self._context.mask(index)
         if mask is None:
             return features
-        return _select(features, sample_nearest(mask, features.keypoints))
+        return features.select(sample_nearest(mask, features.keypoints))
 
 
 class FeatureSet(Mapping[str, Features]):
@@ -128,13 +128,3 @@ class GivenFeatures:
     def key(self, index: int) -> str:
         """Return the hash of the features of an image."""
         return digest(self._features[index])
-
-
-def _select(features: Features, rows: Bool) -> Features:
-    return Features(
-        features.keypoints[rows],
-        features.descriptors[rows],
-        None if features.scores is None else features.scores[rows],
-        None if features.scales is None else features.scales[rows],
-        features.std_px,
-    )

@@ -328,11 +328,9 @@ def check_features_other_sizes(case: ContractCase) -> str:
         rows, columns = np.concatenate([np.empty((0, 2), np.int64), *pairs]).T
         if len(rows) < 2 * _MIN_COUNT:
             continue
-        _require_same_values(take_features(features, rows), alone, columns, where)
+        _require_same_values(features.select(rows), alone, columns, where)
         texts.append(f"{len(rows)} keypoints {where} agree")
-        correlations.append(
-            _correlate_scores(take_features(features, rows), take_features(alone, columns))
-        )
+        correlations.append(_correlate_scores(features.select(rows), alone.select(columns)))
         if correlations[-1] < _MIN_RANK_CORRELATION <= correlations[0] / 4:
             raise CheckFailed(
                 f"scores {where} and scores of the same pixels in a part of the view have a rank "
@@ -533,17 +531,6 @@ def _require_symmetric(case: ContractCase, features: Features, size: tuple[int, 
         raise CheckFailed(
             f"keypoints of a {size[0]} x {size[1]} view are shifted by ({x:+.2f}, {y:+.2f}) px"
         )
-
-
-def take_features(features: Features, rows: Int64) -> Features:
-    """Return some of the features."""
-    return Features(
-        features.keypoints[rows],
-        features.descriptors[rows],
-        None if features.scores is None else features.scores[rows],
-        None if features.scales is None else features.scales[rows],
-        features.std_px,
-    )
 
 
 def _rank(values: Float32) -> Int64:

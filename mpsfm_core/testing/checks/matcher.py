@@ -26,7 +26,7 @@ from mpsfm_core.testing.accuracy import (
     point_matches,
 )
 from mpsfm_core.testing.checks.depth import RAY_TOLERANCE
-from mpsfm_core.testing.checks.features import order_probability, take_features
+from mpsfm_core.testing.checks.features import order_probability
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.examples import Example, outdoor_example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUndecided, CheckUnmeasured
@@ -246,12 +246,12 @@ def check_matcher_feature_order(case: ContractCase) -> str:
     views = case.example.view, case.example.partner.view
     given = case.extract_features(*views)
     foreign = case.extract_features(outdoor_example("textured").view)[0]
-    foreign = take_features(foreign, np.arange(min(_NUM_FOREIGN, len(foreign))))
+    foreign = foreign.select(np.arange(min(_NUM_FOREIGN, len(foreign))))
     rng = np.random.default_rng(0)
     shuffled = [rng.permutation(len(features)) for features in given]
     pairs, scores, foreign_xy = [], [], np.empty((0, 2))
     for rows in ([np.arange(len(features)) for features in given], shuffled):
-        first, second = (take_features(*entry) for entry in zip(given, rows, strict=True))
+        first, second = (entry.select(row) for entry, row in zip(given, rows, strict=True))
         if rows is shuffled:
             second = _append(second, foreign)
             foreign_xy = second.keypoints[len(given[1]) :][::-1]
@@ -485,7 +485,7 @@ def _append(features: Features, others: Features) -> Features:
 
 def _take_first(features: Features, count: int) -> Features:
     """Return the first ``count`` features of a view."""
-    return take_features(features, np.arange(min(count, len(features))))
+    return features.select(np.arange(min(count, len(features))))
 
 
 def _require_no_shift_of_odd_sizes(case: ContractCase) -> None:
