@@ -54,11 +54,13 @@ def read_frames(source: Path) -> list[Frame]:
     truth = read_trajectory(require_path(source / "groundtruth.txt", "true trajectory"))
     has_depth = (source / "depth.txt").is_file()
     depths = read_image_list(source / "depth.txt") if has_depth else None
+    if not photos:
+        return []
+    camera = _camera(source, photo_size(source / photos[0]))  # one camera took all images
     frames = []
     for time, photo, pose in zip(times, photos, truth.interpolate(times, MAX_GAP_S), strict=True):
         if pose is None:
             continue
-        camera = _camera(source, photo_size(source / photo))
         depth = None if depths is None else _nearest(time, *depths)
         read = None if depth is None else partial(_read_depth, source / depth)
         frames.append(Frame(photo, source / photo, camera, np.column_stack(pose), read))
