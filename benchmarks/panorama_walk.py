@@ -1,4 +1,4 @@
-"""Reconstruct a rendered 360-degree video of a walk through four rooms.
+"""Render a 360-degree video of a walk through four rooms, reconstruct it and print the errors.
 
 Usage::
 
@@ -68,9 +68,10 @@ def write_video(path: Path | None, seconds: float, fps: float, width: int) -> Fl
 
 
 def measure_errors(name: str, ours: Float64, truth: Float64) -> str:
-    """Return the errors of camera centers after alignment in one sentence.
+    """Align camera centers with the true ones, and describe their errors in one line.
 
-    The alignment is fitted twice, at the second time without the centers that are far off.
+    The similarity transform is fitted three times. From the second time on, it ignores the centers
+    whose error is above the larger of ``MAX_ERROR_M`` and the median.
     """
     chosen = np.ones(len(ours), dtype=np.bool_)
     for _ in range(3):
@@ -113,7 +114,7 @@ def main() -> None:
 
 
 def print_errors(output: Path, truth: Float64, fps: float) -> None:
-    """Print the verdict, and the errors of panoramas and of all frames."""
+    """Print the verdict, and the position errors of the keyframes and of all video frames."""
     verdict = judge(read_summary(output / SUMMARY))
     print(verdict.level, [doubt.reason.code.value for doubt in verdict.doubts])
     model = pycolmap.Reconstruction(str(output / "sparse"))

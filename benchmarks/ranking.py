@@ -57,7 +57,7 @@ class Case(NamedTuple):
     problem: MappingProblem
     truth: Poses
     room: tuple[int, ...] = ()
-    """Room of each image in the scene of two rooms, which is -1 in the corridor."""
+    """For the scene of two rooms: number of the room of each image, -1 in the corridor."""
 
 
 def rotate(pose: Pose, axis: Float64, angle_deg: float, center: Float64) -> Pose:
@@ -203,7 +203,7 @@ def synthetic_cases(scene: str) -> Iterator[Case]:
 
 
 def real_cases(scene: str, work: Path) -> Iterator[Case]:
-    """Yield the test sets of a scene with true depth."""
+    """Yield a case for each test set of a real scene, whose depth priors are the true depth."""
     folder = read_scene(shared_folder() / "data" / scene)
     sets = folder.select_sets(("minimal", "leq10", "leq30", "all"))
     registry, pair_filter = Registry.discover(), SetPairFilter()

@@ -154,9 +154,9 @@ def _linearize(image: RegisteredImage, points: Float64, xy: Float64) -> tuple[Fl
 
 
 def _find_gauge(centers: Float64) -> Float64:
-    """Return an orthonormal basis (6n, 7) of the changes of all frames that keep all pixels.
+    """Return an orthonormal basis (6n, 7) of the gauge freedom of the poses.
 
-    The changes are rotations, shifts and scalings of the whole model.
+    Rotations, shifts and scalings of the whole model change no reprojection error.
     """
     spread = max(float(np.ptp(centers, axis=0).max()), 1e-12)
     offsets = centers - centers.mean(axis=0)

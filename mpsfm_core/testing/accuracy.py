@@ -47,8 +47,9 @@ _MAX_OUTSIDE_RATIO = 0.02
 """Largest accepted ratio of pixels whose depth differs from that of all surfaces nearby, for a test
 network. The ratio is 0 for providers that resize neither view nor depth."""
 VALIDITY_TOLERANCE = 0.05
-"""Largest accepted ratio of pixels without a surface, away from edges, that are valid. Padding and
-blur of a network cause some such pixels."""
+"""Where a view shows no surface, such as sky, a depth map should be invalid. This is the largest
+accepted ratio of such pixels that are valid, without pixels near edges. Padding and blur in a
+network make some of them valid."""
 MAX_INVALID_RATIO = 0.4
 """Largest accepted ratio of pixels with a surface that are invalid. A provider may reject pixels
 that are distant, near an edge or uncertain."""

@@ -53,7 +53,8 @@ def test_project_wide_beyond_180_degrees_is_the_distortion_polynomial() -> None:
 
 
 def test_visible_angle_ends_where_the_distortion_turns_back() -> None:
-    # The derivative 1 - 0.3 t^2 of t - 0.1 t^3 is 0 at t = 1.826, or 104.6 degrees.
+    # At the viewing angle t, the distance from the principal point is 300 (t - 0.1 t^3) pixels. It
+    # is largest where its derivative 300 (1 - 0.3 t^2) is 0: at t = 1.826 radians, 104.6 degrees.
     camera = pycolmap.Camera(
         model="SIMPLE_RADIAL_FISHEYE", width=4000, height=4000, params=[300, 2000, 2000, -0.1]
     )

@@ -17,7 +17,7 @@ FRAME = ["a/0.png", "a/1.jpg"]
 
 
 def read_poses(folder: Path) -> dict[str, np.ndarray]:
-    """Return the pose matrices in an export for gsplat or nerfstudio."""
+    """Read the pose matrix of each image from an export, in the convention of its format."""
     transforms = folder / "transforms.json"
     if transforms.is_file():
         frames = json.loads(transforms.read_text(encoding="utf-8"))["frames"]
