@@ -47,14 +47,13 @@ from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.features import FeatureSet, FeatureSource, FeatureTable, GivenFeatures
 from mpsfm_core.extraction.match_graph import MatchGraph, NamePair, Priors
 from mpsfm_core.inputs import images as image_inputs
-from mpsfm_core.inputs.image_search import find_videos
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.models import read_poses
-from mpsfm_core.inputs.video import extract_frames
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts import part_mapping
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
+from mpsfm_core.pipeline.input_reader import InputReader, Source
 from mpsfm_core.pipeline.provider_resolution import resolve_providers
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry
@@ -117,16 +116,14 @@ def load_images(
         if intrinsics is not None or image_list is not None:
             raise TypeError("arrays have cameras, not intrinsics or image_list")
         return image_inputs.images_from_arrays(images, cameras, config.inputs)
-    folder, stages = Path(images), Stages(registry, on_event)
-    if videos := find_videos(folder, None if output is None else Path(output)):
-        if output is None:
-            raise InputError(f"{folder}: the frames of a video need an output folder")
-        with stages.stage("video"):
-            progress = partial(stages.stage_progress, "video")
-            folder = extract_frames(videos, Path(output), config.inputs.video, progress)
+    stages = Stages(registry, on_event)
     names_file = None if image_list is None else Path(image_list)
+    source = Source(Path(images), given, names_file)
+    reader = InputReader(source, None if output is None else Path(output), config.inputs, stages)
+    reader.find_videos()
+    reader.extract_video_frames()
     with stages.stage("inputs"):
-        return image_inputs.load_images(folder, given, names_file, config.inputs)
+        return reader.load_images()
 
 
 def extract_features(

@@ -17,9 +17,9 @@ from mpsfm_core.config import Config
 from mpsfm_core.config.provider_arguments import Provider, configure
 from mpsfm_core.data import MappingProblem, Pose, Rig
 from mpsfm_core.data.decisions import Reason
-from mpsfm_core.data.errors import ConfigError, InputError, ReconstructionError
+from mpsfm_core.data.errors import ConfigError, ReconstructionError
 from mpsfm_core.data.events import EventCallback
-from mpsfm_core.data.result_layout import CUT_VIEWS, IMAGES, MASKS_OF_VIEWS, SUMMARY
+from mpsfm_core.data.result_layout import SUMMARY
 from mpsfm_core.dense.densify import densify
 from mpsfm_core.extraction.active_provider import thread_count, worker_count
 from mpsfm_core.extraction.cache import cache_folder
@@ -30,30 +30,9 @@ from mpsfm_core.extraction.runner import (
     extract,
     predict_priors_again,
 )
-from mpsfm_core.inputs.image_search import (
-    check_images_folder,
-    check_output_folder,
-    find_images,
-    find_videos,
-    select_listed_images,
-)
-from mpsfm_core.inputs.images import ImageSet, load_images
+from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
-from mpsfm_core.inputs.matches import (
-    ImportedMatches,
-    matches_from_database,
-    matches_from_hloc,
-)
-from mpsfm_core.inputs.models import Poses, describe_name_difference, match_names, read_poses
-from mpsfm_core.inputs.rigs import read_rigs
-from mpsfm_core.inputs.video import VideoSelection, extract_frames, read_selection
-from mpsfm_core.inputs.view_cutting import (
-    MAX_FIELD_OF_VIEW_DEG,
-    CutImages,
-    are_panoramas,
-    cut_images,
-    find_wide_cameras,
-)
+from mpsfm_core.inputs.models import Poses
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.rig_calibration import calibrate_rigs
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
@@ -68,6 +47,7 @@ from mpsfm_core.mapping.scene.reconstruction import (
 )
 from mpsfm_core.pipeline import precompile, resources
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, MappingCheckpoints
+from mpsfm_core.pipeline.input_reader import InputReader, Source
 from mpsfm_core.pipeline.parts import PartMapper
 from mpsfm_core.pipeline.provider_resolution import ProviderResolution, resolve_providers
 from mpsfm_core.pipeline.stages import Stages
@@ -237,7 +217,7 @@ def reconstruct(
     given_cameras = choose_cameras(cameras, intrinsics)
     if isinstance(images, ImageSet) and (given_cameras is not None or image_list is not None):
         raise TypeError("cameras and image_list belong to load_images, which made the images")
-    source = _Source(
+    source = Source(
         images if isinstance(images, ImageSet) else Path(images),
         given_cameras,
         _path(image_list),
@@ -250,58 +230,27 @@ def reconstruct(
         return run.execute()
 
 
-@dataclass(frozen=True)
-class _Source:
-    """Input files and objects of a run."""
-
-    images: Path | ImageSet
-    """Folder of photos or videos, path of a video, or loaded images."""
-    cameras: Path | Cameras | None
-    image_list: Path | None
-    poses: Path | Poses | None
-    matches: tuple[Path, ...]
-    """COLMAP database, or features and matches files of hloc; empty to run the matchers."""
-    rigs: Path | Sequence[Rig] | None = None
-
-    @property
-    def camera_model(self) -> Path | pycolmap.Reconstruction | None:
-        """Model of the known poses, whose cameras are used if no cameras are given."""
-        return None if isinstance(self.poses, Mapping) else self.poses
-
-    @property
-    def folder(self) -> Path | None:
-        """Folder of the photos, or None for images in memory."""
-        return self.images.folder if isinstance(self.images, ImageSet) else self.images
-
-
 class _Run:
     """One reconstruction run; the method ``execute`` runs all stages in order."""
 
     def __init__(
         self,
-        source: _Source,
+        source: Source,
         config: Config,
         registry: Registry,
         output: Path | None,
         fresh: bool,
         on_event: EventCallback | None = None,
     ) -> None:
-        self._source = source
         self._registry = registry
         self._output = output
         self._fresh = fresh
         self._stages = Stages(registry, on_event)
         self._resolution = ProviderResolution(config, ())
-        self._image_folder = source.folder
-        self._imported: ImportedMatches | None = None
-        self._known_poses: dict[str, Pose] = {}
-        self._rigs: tuple[Rig, ...] = ()
-        self._cut: CutImages | None = None
+        self._inputs = InputReader(source, output, config.inputs, self._stages)
         self._georeference_report: dict[str, object] | None = None
         self._dense_reports: list[dict[str, Any]] | None = None
         self._doubts: tuple[Reason, ...] = ()
-        self._videos: dict[str, Path] = {}
-        self._selections: dict[str, VideoSelection] = {}
         self._trajectories: dict[str, list[TrajectoryFrame]] = {}
         self._estimate = resources.ResourceEstimate(0, 0, 0)
         self._children = ChildMemoryMonitor()
@@ -319,8 +268,7 @@ class _Run:
             stack.enter_context(self._stages.recording_logged_warnings())
             stack.enter_context(limit_threads(self._config.runtime.workers))
             if self._output is not None:
-                if isinstance(self._source.images, Path):
-                    check_output_folder(self._output, self._source.images)
+                self._inputs.check_output_folder()
                 stack.enter_context(lock_output_folder(self._output))
             stack.enter_context(self._children.watching())
             stack.callback(self._stop_compilation)
@@ -329,13 +277,15 @@ class _Run:
     def execute(self) -> ReconstructionResult:
         """Run all stages of the reconstruction and return the result."""
         self._resolve_providers()
-        self._extract_video_frames()
-        self._cut_wide_images()
+        self._inputs.extract_video_frames()
+        self._inputs.cut_wide_images()
         self._start_compilation()
-        images = self._load_inputs()
+        with self._stages.stage("inputs"):
+            images = self._inputs.load()
+            self._check_resources(images)
         images, extraction = self._extract(images)
         self._finish_compilation()
-        mapping = self._map(extraction.problem.with_poses(self._known_poses))
+        mapping = self._map(extraction.problem.with_poses(self._inputs.known_poses))
         undistorted, extraction, mapping = self._map_undistorted(images, extraction, mapping)
         views = undistorted
         if self._config.has_second_pass:
@@ -361,15 +311,7 @@ class _Run:
 
     def _resolve_providers(self) -> None:
         """Choose providers and download their weights before any image is decoded."""
-        if isinstance(self._source.images, Path):
-            # A folder without images raises an error before any weights are downloaded.
-            self._videos = find_videos(self._source.images, self._output)
-            if not self._videos:
-                check_images_folder(self._source.images, self._output)
-            elif self._output is None:
-                raise InputError(
-                    f"{self._source.images}: the frames of a video need an output folder"
-                )
+        self._inputs.find_videos()
         with self._stages.stage("providers"):
             for text in self._config.warnings:
                 self._stages.warn(text)
@@ -388,151 +330,13 @@ class _Run:
                 f"the matcher"
             )
 
-    def _extract_video_frames(self) -> None:
-        """Write keyframes of videos to the output folder, and use the keyframes as images."""
-        if not self._videos:
-            return
-        assert self._output is not None
-        with self._stages.stage("video"):
-            progress = partial(self._stages.stage_progress, "video")
-            self._image_folder = extract_frames(
-                self._videos, self._output, self._config.inputs.video, progress
-            )
-            self._selections = {
-                name: read_selection(self._image_folder / name) for name in self._videos
-            }
-
-    def _cut_wide_images(self) -> None:
-        """Cut panoramas and wide fisheye images into views, and use the views as images."""
-        options, source = self._config.inputs, self._source
-        others = {"cameras": source.cameras, "poses": source.poses, "rigs": source.rigs}
-        given = [name for name, value in others.items() if value is not None]
-        given += ["database or hloc"] if source.matches else []
-        if options.projection == "equirectangular" and (
-            given or self._image_folder is None or self._output is None
-        ):
-            what = given[0] if given else "an image set in memory, or no output folder,"
-            raise InputError(
-                f"projection equirectangular: {what} cannot be used, because panoramas are files "
-                "that are cut into views with known cameras and rigs in the output folder"
-            )
-        if self._image_folder is None or self._output is None:
-            return
-        folder = self._image_folder
-        names = find_images(folder, self._output)
-        if source.image_list is not None:
-            names = select_listed_images(source.image_list, names, folder)
-        cameras: dict[str, pycolmap.Camera] | None = None
-        rigs: tuple[Rig, ...] = ()
-        if options.projection == "equirectangular":
-            notice = ""
-        elif options.projection == "auto" and not given and are_panoramas(folder, names):
-            notice = (
-                f"the {len(names)} images are panoramas of 360 x 180 degrees, which are cut into "
-                "views; --projection perspective takes them for ordinary photos"
-            )
-        elif source.cameras is not None and not source.poses and not source.matches:
-            cameras = find_wide_cameras(folder, names, source.cameras, options)
-            if not cameras:
-                return
-            notice = (
-                f"images with a field of view above {MAX_FIELD_OF_VIEW_DEG:g} degrees are cut into "
-                "views"
-            )
-            names = [name for name in names if name in cameras]
-            rigs = self._read_given_rigs(names)
-        else:
-            return
-        if notice:
-            self._stages.notice(notice)
-        with self._stages.stage("views"):
-            self._cut = cut_images(
-                folder,
-                names,
-                self._output / CUT_VIEWS,
-                self._output / MASKS_OF_VIEWS,
-                options,
-                cameras=cameras,
-                rigs=rigs,
-                progress=partial(self._stages.stage_progress, "views"),
-            )
-            self._image_folder = self._cut.folder
-
-    def _load_inputs(self) -> ImageSet:
-        """Read image headers, intrinsics, poses and imported matches; check memory and disk."""
-        source = self._source
-        with self._stages.stage("inputs"):
-            if isinstance(source.images, ImageSet):
-                images = source.images
-                if self._image_folder is None and self._output is not None:
-                    self._image_folder = self._output / IMAGES
-                    images = images.written_to(self._image_folder)
-            else:
-                assert self._image_folder is not None
-                cut, options = self._cut, self._config.inputs
-                if cut is not None:
-                    options = options.model_copy(update={"masks": cut.masks})
-                images = load_images(
-                    self._image_folder,
-                    source.cameras if cut is None else cut.cameras,
-                    source.image_list if cut is None else None,
-                    options,
-                    model=source.camera_model,
-                    without=self._output,
-                )
-            self._check_resources(images)
-            if source.poses is not None:
-                self._known_poses = _read_known_poses(source.poses, images, self._image_folder)
-            self._rigs = self._read_rigs(images)
-            self._imported = _read_matches(source.matches, images)
-        return images
-
-    def _read_rigs(self, images: ImageSet) -> tuple[Rig, ...]:
-        """Return the rigs of the images, by default those of other COLMAP input files."""
-        source = self._source
-        if self._cut is not None:
-            return self._cut.rigs
-        rigs = self._read_given_rigs(images.names)
-        if source.rigs is None:
-            rigs = self._find_rigs(images)
-        in_rig = {name for rig in rigs for name in rig.image_names}
-        turned = [image for image in images if image.name in in_rig and image.orientation != 1]
-        if turned and source.rigs is not None:
-            raise InputError(
-                f"rigs: image {turned[0].name} has EXIF orientation {turned[0].orientation}, but "
-                "the relative poses of a rig need images without EXIF orientation; rotate the "
-                "pixels and remove the EXIF orientation"
-            )
-        return () if turned else tuple(rigs)
-
-    def _read_given_rigs(self, names: Sequence[str]) -> tuple[Rig, ...]:
-        """Return the rigs that the user gave as such."""
-        rigs = self._source.rigs
-        if isinstance(rigs, Path):
-            return read_rigs(rigs, names, self._image_folder)
-        return tuple(rigs or ())
-
-    def _find_rigs(self, images: ImageSet) -> tuple[Rig, ...]:
-        """Return the rigs of the COLMAP database or models that the user gave for other inputs."""
-        source = self._source
-        databases = [file for file in source.matches if file.suffix == ".db"]
-        for path in [*databases, source.cameras, source.poses]:
-            if not isinstance(path, Path) or not (path.is_dir() or path.suffix == ".db"):
-                continue
-            try:
-                if rigs := read_rigs(path, images.names, self._image_folder, required=False):
-                    return rigs
-            except InputError as error:
-                self._stages.warn(f"{error}. The images are mapped without rigs")
-        return ()
-
     def _extract(self, images: ImageSet) -> tuple[ImageSet, Extraction]:
         """Run the providers, with features and matcher of a fast first pass if configured."""
         with self._stages.stage("extraction"):
             images = estimate_focal_lengths(images, self._config, self._registry, self._stages)
             config = self._config.fast_pass_config() or self._config
-            extraction = extract(images, config, self._registry, self._stages, self._imported)
-            problem = replace(extraction.problem, rigs=self._rigs)
+            extraction = extract(images, config, self._registry, self._stages, self._inputs.matches)
+            problem = replace(extraction.problem, rigs=self._inputs.rigs)
             extraction = replace(extraction, problem=problem)
             self._doubts = extraction.doubts
             for doubt in extraction.doubts:
@@ -595,7 +399,7 @@ class _Run:
             problem = predict_priors_again(refined, config, self._registry, problem, self._stages)
             problem = estimate_relative_poses(problem, changed, config.runtime.seed)
             problem = calibrate_rigs(problem, mapping.reconstructions) or problem
-        mapping = self._map(problem.with_poses(self._known_poses))
+        mapping = self._map(problem.with_poses(self._inputs.known_poses))
         return refined, replace(extraction, problem=problem), mapping
 
     def _predicts_from_one_view(self) -> bool:
@@ -643,9 +447,9 @@ class _Run:
         self, problem: MappingProblem, seeds: list[RegisteredImage]
     ) -> MappingResult:
         """Map again from the poses of the fast pass, or poses that the user fixed."""
-        problem = problem.with_poses(self._known_poses)
+        problem = problem.with_poses(self._inputs.known_poses)
         options = self._config.mapper_options()
-        if not self._known_poses:
+        if not self._inputs.known_poses:
             options = options.model_copy(update={"known_poses": "guess"})
         if options.known_poses != "fixed":
             problem = apply_seed_poses(problem, seeds)
@@ -663,7 +467,7 @@ class _Run:
     def _warn_of_uncalibrated_rigs(self, largest: Reconstruction) -> None:
         """Warn of rigs whose relative poses could not be estimated from the largest component."""
         used = {name for rig in largest.rigs for name in rig.image_names}
-        for rig in self._rigs:
+        for rig in self._inputs.rigs:
             if not rig.is_calibrated and not used & set(rig.image_names):
                 names = [name for frame in rig.frames for name in frame[:1] if name is not None]
                 self._stages.warn(
@@ -676,7 +480,7 @@ class _Run:
     def _georeference(self, images: ImageSet, mapping: MappingResult) -> MappingResult:
         """Align reconstructions with GPS positions, if enough images have a position."""
         positions = {image.name: image.gps for image in images if image.gps is not None}
-        if self._known_poses or not self._config.results.georeference or not positions:
+        if self._inputs.known_poses or not self._config.results.georeference or not positions:
             return mapping
         aligned = []
         for number, reconstruction in enumerate(mapping.reconstructions):
@@ -708,7 +512,7 @@ class _Run:
                     partial(self._stages.stage_progress, "dense"),
                     self._dense_checkpoints(part, originals),
                     disk.store,
-                    poses_use_depth=not _has_poses(part, self._known_poses),
+                    poses_use_depth=not _has_poses(part, self._inputs.known_poses),
                 )
                 dense_parts.append(dense)
                 self._dense_reports.append(report.describe())
@@ -717,33 +521,33 @@ class _Run:
     def _localize_frames(self, mapping: MappingResult, originals: OriginalImages) -> None:
         """Estimate the poses of the frames of each video between its keyframes."""
         every = self._config.inputs.video.trajectory_every
-        if not self._videos or not every:
+        if not self._inputs.videos or not every:
             return
         with self._stages.stage("trajectory"):
             progress = partial(self._stages.stage_progress, "trajectory")
-            for name, video in self._videos.items():
+            for name, video in self._inputs.videos.items():
                 self._trajectories[name] = localize_frames(
                     video,
-                    self._selections[name],
+                    self._inputs.selections[name],
                     mapping.reconstructions,
                     originals,
                     every,
                     progress,
                     subfolder=name,
-                    cut=self._cut,
+                    cut=self._inputs.cut,
                 )
 
     def _describe_videos(self) -> list[dict[str, Any]]:
         """Describe the keyframes and the trajectory of each video."""
         return [
             {
-                "file": str(self._videos[name]),
+                "file": str(self._inputs.videos[name]),
                 **selection.describe(),
                 "trajectory": describe_trajectory(self._trajectories[name], name)
                 if name in self._trajectories
                 else None,
             }
-            for name, selection in self._selections.items()
+            for name, selection in self._inputs.selections.items()
         ]
 
     def _write_results(
@@ -829,7 +633,8 @@ class _Run:
         originals: OriginalImages,
     ) -> RunSummary:
         """Collect the results of all stages for ``summary.json``."""
-        config, stages = self._config, self._stages
+        config, stages, inputs = self._config, self._stages, self._inputs
+        photos = inputs.image_folder
         return {
             "format_version": SUMMARY_FORMAT,
             "status": status,
@@ -843,9 +648,9 @@ class _Run:
             "providers": self._resolution.describe(extraction.report["providers"]),
             "config": config.model_dump(mode="json"),
             "versions": describe_versions(),
-            "photos": None if self._image_folder is None else str(self._image_folder.resolve()),
+            "photos": None if photos is None else str(photos.resolve()),
             "videos": self._describe_videos(),
-            "matches_from": None if self._imported is None else self._imported.source,
+            "matches_from": None if inputs.matches is None else inputs.matches.source,
             "images": describe_images(images, extraction.report, mapping, originals),
             "pairs": describe_pairs(extraction.report, mapping, extraction.problem),
             "reconstructions": describe_reconstructions(mapping, models, extraction.problem),
@@ -957,38 +762,6 @@ def _without_matching(config: Config) -> Config:
         )
     removed = dict.fromkeys(("fast_pass", "features", "matcher", "dense_matcher", "retrieval"))
     return config.model_copy(update=removed)
-
-
-def _read_matches(files: tuple[Path, ...], images: ImageSet) -> ImportedMatches | None:
-    """Read matches from a COLMAP database, or from hloc's features and matches files."""
-    if not files:
-        return None
-    if len(files) == 1:
-        return matches_from_database(files[0], images)
-    return matches_from_hloc(files[0], files[1], images)
-
-
-def _read_known_poses(
-    given: Path | Poses, images: ImageSet, images_folder: Path | None
-) -> dict[str, Pose]:
-    """Read the poses of a model, keyed by the matching image names of the run."""
-    poses = read_poses(given, images_folder)
-    model = given if isinstance(given, Path) else "poses"
-    matched = match_names(images.names, poses)
-    if not matched:
-        difference = describe_name_difference(images.names, poses)
-        raise InputError(f"{model}: the model has a pose of none of the images; {difference}")
-    if len(matched) < 2:
-        raise InputError(
-            f"{model}: the model has a pose of {next(iter(matched))} only; a run needs the poses "
-            f"of two images"
-        )
-    unmatched = sorted(poses.keys() - set(matched.values()))
-    if unmatched:
-        text = "%s: %d of its %d images are not among the photos: %s"
-        listed = ", ".join(unmatched[:_MAX_LISTED_NAMES])
-        _log.warning(text, model, len(unmatched), len(poses), listed)
-    return {name: poses[model_name] for name, model_name in matched.items()}
 
 
 def _has_poses(part: Reconstruction, known: Mapping[str, Pose]) -> bool:
