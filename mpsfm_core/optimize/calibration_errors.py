@@ -23,6 +23,12 @@ and Wrobel, "Photogrammetric Computer Vision", 2016, 4.2.3), because the declare
 need not be true. The factors ``v`` and ``c`` account for the curvature of the robust loss (Huber,
 "Robust Statistics", 1981, 7.6).
 
+A depth map has a smooth error that many pixels share, such as a tilt, whereas bundle adjustment
+takes depth errors as independent. Smooth errors with the Jacobian ``S`` of the gradient by their
+coefficients move the solution by ``C S``, which adds ``C S S^T C`` to the covariance (a sandwich
+covariance; Liang and Zeger, "Longitudinal data analysis using generalized linear models", 1986).
+They matter where images with two different neighbors join the scales of two image pairs.
+
 A Newton step is too short if the restricted model is far from the minimum of the extended model,
 for example in a local minimum with a wrong focal length. Therefore bundle adjustment with the
 additional parameters of the cameras starts from the solution, and the larger change counts.
@@ -59,6 +65,11 @@ EDIT_DEVIATIONS = (0.05, 0.02)
 """Standard deviations of an image's log focal length and principal point, in longer image sides,
 from those of its shared camera. Autofocus and optical stabilization of a lens cause small
 deviations, zooming and cropping large deviations. [tuned: benchmarks.verdicts]"""
+SMOOTH_STD = 0.8
+"""Standard deviation of each coefficient of the smooth error of a depth map, in standard deviations
+of its depth. [tuned: depth maps of rendered_kitchen, see benchmarks/results/verdicts.md]"""
+NUM_SMOOTH = 5
+"""Number of linear and quadratic functions that describe the smooth error of a depth map."""
 MIXTURE_ITERATIONS = 3
 """Number of updates of the probabilities that images are edited. [ours]"""
 RADIAL_STDS = (0.1, 0.05)
@@ -117,10 +128,16 @@ class _NormalEquations(NamedTuple):
     """(c, c) Gauss-Newton matrix, whose reprojection part is divided by the variance factor."""
     gradient: Float64
     """(c,) gradient of the cost, scaled to a Newton step with ``information``."""
+    by_smooth: Float64
+    """(c, 5n) change of the gradient by a standard deviation of each smooth depth error."""
 
 
 def predict_calibration_errors(
-    problem: BundleProblem, options: BundleOptions, known: Bool, longer_sides: Float64
+    problem: BundleProblem,
+    options: BundleOptions,
+    known: Bool,
+    sizes: Float64,
+    depth_std_ratio: float = 1.0,
 ) -> CalibrationErrors | None:
     """Predict the errors of poses and intrinsics by an extended camera model.
 
@@ -128,7 +145,9 @@ def predict_calibration_errors(
         problem: Solved bundle adjustment problem with priors of the focal lengths.
         options: Options of bundle adjustment with the robust losses.
         known: (k,) bool, True for cameras with known intrinsics, which are not extended.
-        longer_sides: (k,) longer image side of each camera in pixels.
+        sizes: (k, 2) image width and height of each camera in pixels.
+        depth_std_ratio: Ratio of the standard deviation of depth to ``obs_std_log_depth``, which is
+            larger in bundle adjustment because errors of neighboring pixels correlate.
 
     Returns:
         The predicted errors, or None for more than ``MAX_IMAGES`` images, no variable pose or no
@@ -139,8 +158,10 @@ def predict_calibration_errors(
     if num_images > MAX_IMAGES or moving is None or not moving.any() or not len(problem.points):
         return None
     columns = _number_columns(num_images, num_cameras, len(problem.points))
-    extended = not known.all()
-    equations = _linearize(problem, options, columns, extended=extended)
+    extended, longer_sides = not known.all(), sizes.max(axis=1)
+    equations = _linearize(
+        problem, options, columns, sizes, SMOOTH_STD * depth_std_ratio, extended=extended
+    )
     offsets = _prior_offsets(problem, columns)
     lens_stds, edit_stds = (
         _prior_stds(problem, columns, known, longer_sides, deviation_stds)
@@ -148,12 +169,10 @@ def predict_calibration_errors(
     )
     if not extended:  # The solution is the minimum for known intrinsics.
         equations = equations._replace(gradient=np.zeros(columns.point))
-    step, covariance = pose_step, pose_covariance = _compute_posterior(
-        equations, lens_stds, offsets
-    )
+    step, covariance = pose_step, pose_covariance = _predict_errors(equations, lens_stds, offsets)
     if extended:
         mixed_stds = _mix_prior_stds(equations, offsets, lens_stds, edit_stds, columns)
-        pose_step, pose_covariance = _compute_posterior(equations, mixed_stds, offsets)
+        pose_step, pose_covariance = _predict_errors(equations, mixed_stds, offsets)
     changes = _measure_changes(problem, options, known, longer_sides)
     focal = columns.focal + np.asarray(problem.camera_of_image)
     deviation = columns.focal_deviation + np.arange(num_images)
@@ -340,6 +359,15 @@ def _log_evidence(precision: Float64, vector: Float64, used: Float64, prior: Flo
     return evidence
 
 
+def _predict_errors(
+    equations: _NormalEquations, std: Float64, offsets: Float64
+) -> tuple[Float64, Float64]:
+    """Return the Newton step (c,) and the covariance (c, c) with smooth errors of depth maps."""
+    step, covariance = _compute_posterior(equations, std, offsets)
+    by_smooth = covariance @ equations.by_smooth
+    return step, covariance + by_smooth @ by_smooth.T
+
+
 def _compute_posterior(
     equations: _NormalEquations, std: Float64, offsets: Float64
 ) -> tuple[Float64, Float64]:
@@ -388,7 +416,13 @@ def _solve(information: Float64, std: Float64, free: Int64, right: Float64) -> F
 
 
 def _linearize(
-    problem: BundleProblem, options: BundleOptions, columns: _Columns, *, extended: bool
+    problem: BundleProblem,
+    options: BundleOptions,
+    columns: _Columns,
+    sizes: Float64,
+    smooth_std: float,
+    *,
+    extended: bool,
 ) -> _NormalEquations:
     """Linearize the residuals at the solution, eliminate points, and scale by the variance.
 
@@ -396,14 +430,24 @@ def _linearize(
         problem: Solved bundle adjustment problem.
         options: Options of bundle adjustment with the robust losses.
         columns: First column of each kind of parameter.
+        sizes: (k, 2) image width and height of each camera in pixels.
+        smooth_std: Standard deviation of the coefficients of smooth depth errors, relative to
+            ``obs_std_log_depth``.
         extended: False if all intrinsics are known. The Jacobian then excludes intrinsics.
     """
     seen = _Observations(problem)
     jacobian, residuals = _linearize_reprojection(
         problem, options, columns, seen, extended=extended
     )
+    by_smooth = csr_array((columns.end, 0))
     if problem.obs_log_depth is not None:
-        depth_jacobian, depth_residuals = _linearize_depth(problem, options, columns, seen)
+        depth_jacobian, depth_residuals, weight = _linearize_depth(problem, options, columns, seen)
+        smooth = _evaluate_smooth_errors(problem, seen, sizes) * (smooth_std * weight)[:, None]
+        images = NUM_SMOOTH * seen.image[:, None] + np.arange(NUM_SMOOTH)
+        by_smooth = csr_array(
+            depth_jacobian.T
+            @ _to_sparse(smooth[:, None], images[:, None], NUM_SMOOTH * len(problem.rotations))
+        )
         jacobian = csr_array(vstack([jacobian, depth_jacobian]))
         residuals = np.concatenate([residuals, depth_residuals])
     precision, deviations = _scale_prior(problem)
@@ -411,15 +455,18 @@ def _linearize(
     prior[columns.scale : columns.focal] = precision
     gradient[columns.scale : columns.focal] += precision * deviations
     hessian = csr_array(jacobian.T @ jacobian + diags_array(prior))
-    return _eliminate_points(hessian, gradient, columns.point)
+    return _eliminate_points(hessian, gradient, by_smooth, columns.point)
 
 
-def _eliminate_points(hessian: csr_array, gradient: Float64, first: int) -> _NormalEquations:
+def _eliminate_points(
+    hessian: csr_array, gradient: Float64, by_smooth: csr_array, first: int
+) -> _NormalEquations:
     """Return the normal equations of the camera parameters by the Schur complement.
 
     Args:
         hessian: Gauss-Newton matrix of camera parameters and points.
         gradient: Gradient by camera parameters and points.
+        by_smooth: Change of the gradient by the smooth errors of depth maps.
         first: First column of the points.
     """
     factor = _factorize_inverses(csr_array(hessian[first:, first:]))
@@ -431,7 +478,8 @@ def _eliminate_points(hessian: csr_array, gradient: Float64, first: int) -> _Nor
         dense = rows[:, used].toarray()
         information[np.ix_(used, used)] -= dense.T @ dense
     reduced = gradient[:first] - coupling.T @ (factor @ gradient[first:])
-    return _NormalEquations(information, reduced)
+    by_smooth = by_smooth[:first] - coupling.T @ (factor @ by_smooth[first:])
+    return _NormalEquations(information, reduced, by_smooth.toarray())
 
 
 def _scale_prior(problem: BundleProblem) -> tuple[Float64, Float64]:
@@ -570,11 +618,12 @@ def _linearize_intrinsics(
 
 def _linearize_depth(
     problem: BundleProblem, options: BundleOptions, columns: _Columns, seen: _Observations
-) -> tuple[csr_array, Float64]:
+) -> tuple[csr_array, Float64, Float64]:
     """Linearize the weighted log-depth errors of observations with valid depth.
 
     Returns:
-        Jacobian (m, parameters), which is 0 for invalid depth, and residuals (m,).
+        Jacobian (m, parameters), residuals (m,), and derivatives (m,) of the residuals by the depth
+        error in standard deviations. All are 0 for invalid depth.
     """
     assert problem.obs_log_depth is not None
     z, log_depth = seen.in_camera[:, 2], problem.obs_log_depth[seen.rows]
@@ -596,7 +645,19 @@ def _linearize_depth(
     ]
     root = np.sqrt(weight)
     indices = np.concatenate(parts, axis=1)[:, None]
-    return _to_sparse(jacobian * root[:, None, None], indices, columns.end), residuals * root
+    matrix = _to_sparse(jacobian * root[:, None, None], indices, columns.end)
+    return matrix, residuals * root, np.where(valid, root, 0.0)
+
+
+def _evaluate_smooth_errors(problem: BundleProblem, seen: _Observations, sizes: Float64) -> Float64:
+    """Evaluate the smooth errors (m, 5) of depth maps at the observations.
+
+    They are the linear and quadratic products of Legendre polynomials, each with a mean square of 1
+    in the image.
+    """
+    u, v = (2 * problem.obs_xy[seen.rows] / sizes[seen.camera] - 1).T
+    quadratic = (np.sqrt(5) * (1.5 * x**2 - 0.5) for x in (u, v))
+    return np.stack([np.sqrt(3) * u, np.sqrt(3) * v, 3 * u * v, *quadratic], axis=1)
 
 
 def _distort(problem: BundleProblem, camera: Int64, slopes: Float64) -> tuple[Float64, Float64]:

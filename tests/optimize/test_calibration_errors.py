@@ -22,6 +22,7 @@ FOCAL_PX, WIDTH, HEIGHT = 700.0, 640.0, 480.0
 CENTER = np.array([WIDTH / 2, HEIGHT / 2])
 NUM_IMAGES = 6
 OPTIONS = BundleOptions(threads=1, function_tolerance=1e-9)
+SIZES = np.array([[WIDTH, HEIGHT]])
 UNKNOWN, KNOWN = np.array([False]), np.array([True])
 
 
@@ -88,7 +89,7 @@ def make_scene(
 def solve(scene: BundleProblem) -> tuple[BundleProblem, CalibrationErrors]:
     """Adjust poses, points and the focal length, and predict their errors."""
     solved = start_at(scene, adjust_bundle(scene, OPTIONS))
-    errors = predict_calibration_errors(solved, OPTIONS, UNKNOWN, np.array([WIDTH]))
+    errors = predict_calibration_errors(solved, OPTIONS, UNKNOWN, SIZES)
     assert errors is not None
     return solved, errors
 
@@ -116,9 +117,7 @@ def focal_errors(num_scenes: int, **changes: float) -> tuple[Float64, Float64, F
     for seed in range(num_scenes):
         scene = make_scene(seed, **changes)
         result = adjust_bundle(scene, OPTIONS)
-        errors = predict_calibration_errors(
-            start_at(scene, result), OPTIONS, UNKNOWN, np.array([WIDTH])
-        )
+        errors = predict_calibration_errors(start_at(scene, result), OPTIONS, UNKNOWN, SIZES)
         assert errors is not None
         true.append(np.log(result.intrinsics[0, 0] / FOCAL_PX))
         predicted.append(errors.log_focal[0])
@@ -179,7 +178,7 @@ def test_predict_calibration_errors_of_a_right_camera_are_small() -> None:
 def test_predict_calibration_errors_of_a_known_camera_come_from_noise_only() -> None:
     scene = replace(make_scene(0, center_px=30.0), variable_intrinsics=None)
     solved = start_at(scene, adjust_bundle(scene, OPTIONS))
-    errors = predict_calibration_errors(solved, OPTIONS, KNOWN, np.array([WIDTH]))
+    errors = predict_calibration_errors(solved, OPTIONS, KNOWN, SIZES)
     assert errors is not None
     assert errors.log_focal[0] == errors.radial[0] == 0
     assert errors.pose_deg.max() < 0.5
@@ -189,14 +188,14 @@ def test_predict_calibration_errors_of_a_pure_rotation_are_large() -> None:
     scene = make_scene(0)
     point = camera_center(scene.rotations[0], scene.translations[0])
     one_center = replace(scene, translations=-scene.rotations @ (point + 1e-6))
-    errors = predict_calibration_errors(one_center, OPTIONS, UNKNOWN, np.array([WIDTH]))
+    errors = predict_calibration_errors(one_center, OPTIONS, UNKNOWN, SIZES)
     assert errors is not None
     assert (errors.pose_deg > 20).all()
 
 
 def test_predict_calibration_errors_without_a_variable_pose_returns_none() -> None:
     scene = replace(make_scene(0), variable_pose=np.zeros(NUM_IMAGES, dtype=np.bool_))
-    assert predict_calibration_errors(scene, OPTIONS, UNKNOWN, np.array([WIDTH])) is None
+    assert predict_calibration_errors(scene, OPTIONS, UNKNOWN, SIZES) is None
 
 
 def test_predict_calibration_errors_of_a_weak_unedited_image_are_small() -> None:
@@ -216,3 +215,61 @@ def test_predict_calibration_errors_of_a_weak_unedited_image_are_small() -> None
     solved, errors = solve(weak)
     assert measure_pose_errors_deg(solved, weak)[0] < 0.5
     assert errors.pose_deg[0] < 1
+
+
+def make_chain(seed: int, smooth_std: float) -> BundleProblem:
+    """Return images in a row that share points with one or two neighbors, with true poses.
+
+    Args:
+        seed: Seed of poses, points, keypoint noise and depth errors.
+        smooth_std: Standard deviation of the slope of a depth map from the center to the border.
+    """
+    rng = np.random.default_rng(seed)
+    images, rows, keypoints, depths = [], [], [], []
+    points = rng.uniform((-5, -4, 6), (7 * NUM_IMAGES - 2, 4, 7.5), (150 * NUM_IMAGES, 3))
+    rotations = np.broadcast_to(np.eye(3), (NUM_IMAGES, 3, 3))
+    centers = np.array([[7.0 * i, 0.0, 0.0] for i in range(NUM_IMAGES)])
+    centers[::2] += (0.0, 1.0, -1.5)
+    for image, center in enumerate(centers):
+        in_camera = points - center
+        slopes = in_camera[:, :2] / in_camera[:, 2:]
+        xy = FOCAL_PX / 2 * slopes + CENTER
+        seen = np.flatnonzero(((xy > 0) & (xy < (WIDTH, HEIGHT))).all(axis=1))
+        slope = smooth_std * rng.normal(size=2)
+        depths.append(np.log(in_camera[seen, 2]) + (xy[seen] / CENTER - 1) @ slope)
+        images.append(np.full(len(seen), image))
+        rows.append(seen)
+        keypoints.append(xy[seen] + rng.normal(size=(len(seen), 2)) * 0.4)
+    observed = np.concatenate(rows)
+    shared = np.bincount(observed, minlength=len(points))[observed] == 2
+    used, observed = np.unique(observed[shared], return_inverse=True)
+    return BundleProblem(
+        rotations=rotations,
+        translations=-centers,
+        intrinsics=np.array([[FOCAL_PX / 2, FOCAL_PX / 2, *CENTER]]),
+        camera_of_image=np.zeros(NUM_IMAGES, dtype=np.int64),
+        points=points[used],
+        obs_image=np.concatenate(images)[shared],
+        obs_point=observed,
+        obs_xy=np.concatenate(keypoints)[shared],
+        obs_std_px=0.4,
+        obs_log_depth=np.concatenate(depths)[shared],
+        obs_std_log_depth=0.1,
+        variable_pose=np.arange(NUM_IMAGES) > 0,
+        variable_scale=np.arange(NUM_IMAGES) > 0,
+        std_log_scales=0.2,
+    )
+
+
+def test_predict_calibration_errors_of_a_chain_contains_smooth_depth_errors() -> None:
+    ratios: dict[float, list[float]] = {0.0: [], 1.0: []}
+    for seed in range(8):
+        scene = make_chain(seed, 0.1)
+        solved = start_at(scene, adjust_bundle(scene, OPTIONS))
+        true = measure_pose_errors_deg(solved, scene)
+        for ratio, values in ratios.items():
+            errors = predict_calibration_errors(solved, OPTIONS, KNOWN, SIZES, ratio)
+            assert errors is not None
+            values.append(float(np.sqrt((true**2 / errors.pose_deg**2).mean())))
+    assert np.mean(ratios[0.0]) > 2
+    assert 0.3 < np.mean(ratios[1.0]) < 1.5

@@ -312,7 +312,8 @@ class Refiner:
             problem,
             self._scale_losses(),
             ~mask_guessed_focals(scene, bundle.representatives),
-            np.array([max(image.camera.size) for image in cameras], dtype=np.float64),
+            np.array([image.camera.size for image in cameras], dtype=np.float64),
+            self.std_factor / self.noise.std_factor,
         )
         if errors is not None:
             predicted.pose_deg[bundle.images] = errors.pose_deg
