@@ -20,6 +20,8 @@ import typer.main
 import mpsfm_core
 from mpsfm_core import load_config
 from mpsfm_core.cli import build_app
+from mpsfm_core.providers.kinds import PROVIDER_KINDS
+from mpsfm_core.providers.protocols import Hooks
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -177,3 +179,9 @@ def test_arrays_without_files_take_at_most_20_lines() -> None:
     names = arrays_of_caller()
     exec(compile(block, "library.md", "exec"), names)
     assert names["model"].num_reg_images() == 3  # type: ignore[attr-defined]
+
+
+def test_plugin_page_names_all_kinds_and_hooks() -> None:
+    page = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+    hooks = [name for name in vars(Hooks) if name.startswith("mpsfm_")]
+    assert [name for name in [*PROVIDER_KINDS, *hooks] if f"`{name}" not in page] == []

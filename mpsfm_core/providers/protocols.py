@@ -28,8 +28,9 @@ Uncertainties are variances unless the name ends with ``std``. A depth or normal
 whole image and may have any resolution.
 
 A provider must be deterministic, so that the same input and seed give the same output, bit for bit.
-The output depends only on the arguments of the call, so a cache is allowed if no result depends on
-it. A provider does not modify its arguments. Each thread of a run has its own instance, but
+The output depends only on the arguments of the call, with all fields of a view, so a cache is
+allowed if no result depends on it. The arrays of the arguments are read-only, and a provider does
+not modify them by other means, such as ``torch.from_numpy``. Each thread of a run has its own instance, but
 instances share the modules and global variables of the plugin. A provider may raise any exception,
 which the run reports with the names of the provider and the image.
 """
@@ -276,7 +277,8 @@ class Hooks:
             pairs: Candidate pairs of image names.
 
         Returns:
-            Selected pairs of image names, a subset of ``pairs`` with the names in the same order.
+            Selected pairs of image names, a subset of ``pairs``. The order of the pairs, and of
+            the two names of a pair, has no meaning.
         """
 
     @hookspec(firstresult=True)

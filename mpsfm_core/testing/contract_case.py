@@ -82,7 +82,7 @@ class ContractSetup:
     ``"none"`` for other provider kinds."""
     prepare: Callable[[Example], None] | None = None
     """Function that is called with each synthetic view before the provider runs on the view, for
-    instance to write a depth file."""
+    instance to write the depth ``example.truth().depth`` to a file."""
     expected_failures: Mapping[str, str] = field(default_factory=dict)
     """Reason of each expected failure by the id of the contract check. If a provider passes a check
     that is expected to fail, the check is reported as failed."""

@@ -28,7 +28,8 @@ class FeatureProvider(Protocol):
         Returns:
             Keypoints (n, 2) float64 in pixels of ``view``, not of a resized image. Descriptors (n,
             d) float32 with the same dimension d for every image. Optional detection scores (n,)
-            float32 and optional keypoint scales (n,) float32 in pixels. The standard deviation
+            float32 and optional keypoint scales (n,) float32 in pixels, as sigma, radius or
+            diameter, whichever the matchers of these features expect. The standard deviation
             ``std_px`` of keypoint positions in pixels.
         """
         ...

@@ -25,7 +25,8 @@ class MaskProvider(Protocol):
 
         Returns:
             Mask (H, W) bool in the size of the image, True where the reconstruction may use a
-            pixel.
+            pixel. The core combines the masks of the user and of all mask providers, so the mask
+            need not contain ``view.mask``.
         """
         ...
 

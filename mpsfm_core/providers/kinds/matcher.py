@@ -149,7 +149,7 @@ KIND = ProviderKind(
     checks="mpsfm_core.testing.checks.matcher:CHECKS",
     capabilities={
         "sparse": "The matcher requires features and returns matches of features.",
-        "dense": "The matcher needs no features and returns matches of pixel positions.",
+        "dense": "The matcher returns matches of pixel positions; alone, it needs no features.",
         "pair-depth": "The matcher also predicts the depth of both images.",
     },
     default_capabilities=frozenset({"sparse"}),

@@ -29,9 +29,9 @@ class RetrievalProvider(Protocol):
             view: Undistorted image with its camera.
 
         Returns:
-            Global descriptor (d,) float32 with the same dimension d for every image, normally of
-            unit length. The dot product of two global descriptors is the similarity of their
-            images.
+            Global descriptor (d,) float32 with the same dimension d for every image. The dot
+            product of two global descriptors is the similarity of their images, so descriptors
+            have unit length unless their length is part of the similarity.
         """
         ...
 
