@@ -30,9 +30,9 @@ whole image and may have any resolution.
 A provider must be deterministic, so that the same input and seed give the same output, bit for bit.
 The output depends only on the arguments of the call, with all fields of a view, so a cache is
 allowed if no result depends on it. The arrays of the arguments are read-only, and a provider does
-not modify them by other means, such as ``torch.from_numpy``. Each thread of a run has its own instance, but
-instances share the modules and global variables of the plugin. A provider may raise any exception,
-which the run reports with the names of the provider and the image.
+not modify them by other means, such as ``torch.from_numpy``. Each thread of a run has its own
+instance, but instances share the modules and global variables of the plugin. A provider may raise
+any exception, which the run reports with the names of the provider and the image.
 """
 
 from __future__ import annotations
