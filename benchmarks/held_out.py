@@ -1,11 +1,13 @@
 """Similarity of held-out photos and renderings of dense clouds and meshes, for real photos.
 
     python -m benchmarks.held_out [--sets lund_door ...] [--config fast-cpu] [--output DIR]
+        [--without-validity]
 
-Each set is reconstructed with every fourth photo held out: the mapper registers the photo, and the
+Each set is reconstructed with every fifth photo held out: the mapper registers the photo, and the
 stage ``dense`` does not use it. ``mpsfm mesh`` meshes the depth maps, and COLMAP's Poisson meshing
 meshes the fused cloud. Cloud and meshes are rendered at the poses of the held-out photos. Finished
-reconstructions in the output folder are reused.
+reconstructions in the output folder are reused. With ``--without-validity``, the stage ``dense``
+keeps the pixels that match no other view or are next to a depth edge.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ import pycolmap
 
 import mpsfm_core as mpsfm
 from benchmarks._scenes import shared_folder
+from mpsfm_core.config.model import Config
 from mpsfm_core.data.result_layout import DENSE, MESH_GLB, SUMMARY
 from mpsfm_core.evaluation.held_out import evaluate_held_out
 from mpsfm_core.pipeline.dense_models import mesh_model
@@ -33,7 +36,7 @@ SETS = {
     "hololens_room": "data/hololens_room/images",
 }
 """Folder of the photos of each set, relative to the folder of benchmark data."""
-HOLD_OUT_EVERY = 4
+HOLD_OUT_EVERY = 5
 POISSON = "poisson.ply"
 POISSON_DEPTH, POISSON_TRIM = 9, 6.0
 """Depth of the octree, and the depth below which surfaces are removed; COLMAP's defaults of 13 and
@@ -47,19 +50,24 @@ def main() -> None:
     parser.add_argument("--sets", nargs="+", default=list(SETS), choices=SETS, metavar="SET")
     parser.add_argument("--config", default="fast-cpu")
     parser.add_argument("--output", type=Path, default=Path("build/benchmarks/held_out"))
+    parser.add_argument("--without-validity", action="store_true")
     arguments = parser.parse_args()
+    settings = [
+        f"dense.hold_out_every={HOLD_OUT_EVERY}",
+        f"dense.check_validity={not arguments.without_validity}",
+    ]
+    config = mpsfm.load_config(arguments.config, settings)
     print("| set | photos | geometry | covered, % | PSNR, dB | SSIM | depth within 5 %, % | s |")
     print("| --- | ---: | --- | ---: | ---: | ---: | ---: | ---: |")
     for name in arguments.sets:
-        for row in evaluate_set(name, arguments.config, arguments.output / name):
+        for row in evaluate_set(name, config, arguments.output / name):
             print("| " + " | ".join(row) + " |", flush=True)
 
 
-def evaluate_set(name: str, config: str, folder: Path) -> list[list[str]]:
+def evaluate_set(name: str, config: Config, folder: Path) -> list[list[str]]:
     """Reconstruct and mesh one set, and return the cells of one table row per geometry."""
     if not (folder / SUMMARY).is_file():
-        settings = mpsfm.load_config(config, [f"dense.hold_out_every={HOLD_OUT_EVERY}"])
-        mpsfm.reconstruct(shared_folder() / SETS[name], folder, settings)
+        mpsfm.reconstruct(shared_folder() / SETS[name], folder, config)
     started = time.monotonic()
     if not (folder / MESH_GLB).is_file():
         mesh_model(folder)

@@ -38,7 +38,7 @@ from mpsfm_core.data.options import parse_settings
 from mpsfm_core.dense.densify import densify as densify_reconstruction
 from mpsfm_core.dense.fusion import FusedPointCloud, fuse_depth_maps
 from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
-from mpsfm_core.dense.options import DenseOptions, MeshOptions
+from mpsfm_core.dense.options import DEFAULT_MAX_TEXTURE_SIZE, DenseOptions, MeshOptions
 from mpsfm_core.dense.texture import TexturedMesh, build_texture
 from mpsfm_core.evaluation import CONVENTIONS
 from mpsfm_core.evaluation import evaluate as evaluate_poses
@@ -478,7 +478,7 @@ def texture_mesh(
     reconstruction: Reconstruction,
     images: ImageSet,
     *,
-    max_size: int = 4096,
+    max_size: int = DEFAULT_MAX_TEXTURE_SIZE,
 ) -> TexturedMesh:
     """Texture a mesh with the photos of its reconstruction.
 

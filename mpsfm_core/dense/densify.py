@@ -256,8 +256,9 @@ class _DensifySteps:
         )
         measured = fuse_known_depth(stereo, known)
         posterior = compute_depth_posterior(known, measured, self._options.correlation_px)
-        posterior = add_edge_variance(posterior, self.consistency[row].views, WINDOW_RADIUS)
-        posterior = posterior.with_min_std(~self.matched[row].explained, UNKNOWN_LOG_STD)
+        if self._options.check_validity:
+            posterior = add_edge_variance(posterior, self.consistency[row].views, WINDOW_RADIUS)
+            posterior = posterior.with_min_std(~self.matched[row].explained, UNKNOWN_LOG_STD)
         scale_std = self.scale_stds.get(row, 0.0)
         image = _replace_depth(self._images[row], view, posterior, scale_std, self._store_array)
         return image, self._store_array(measured.known)

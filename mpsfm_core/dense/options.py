@@ -9,6 +9,9 @@ from pydantic import Field
 
 from mpsfm_core.data.options import Options, expert
 
+DEFAULT_MAX_TEXTURE_SIZE = 4096
+"""Default maximum side of the texture of a mesh in pixels [ours]."""
+
 
 class DenseOptions(Options):
     """Options of multi-view stereo after mapping."""
@@ -20,6 +23,9 @@ class DenseOptions(Options):
     hold_out_every: int | None = Field(None, ge=2)
     """Exclude every n-th registered image, in alphabetical order, from dense depth, cloud and mesh,
     so that ``mpsfm evaluate --held-out`` can render the excluded images; None excludes none."""
+    check_validity: bool = expert(True)
+    """Raise the depth std of pixels that match no source view or are next to a depth edge, so that
+    cloud and mesh omit these pixels; False only for comparisons."""
     correlation_px: float = expert(40.0, gt=0)
     """Correlation length of the error of the refined depth, in pixels of the depth map."""
 
@@ -33,5 +39,5 @@ class MeshOptions(Options):
     Smaller voxels reproduce noise of the depth maps and need more memory."""
     max_triangles: int = Field(500_000, ge=4)
     """Maximum number of triangles (about 20 bytes each on disk); a larger mesh is simplified."""
-    max_texture_size: int = Field(4096, ge=0, le=16384)
+    max_texture_size: int = Field(DEFAULT_MAX_TEXTURE_SIZE, ge=0, le=16384)
     """Maximum side of the texture image in pixels; with 0 the mesh only has vertex colors."""

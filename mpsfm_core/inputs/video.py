@@ -25,6 +25,7 @@ from mpsfm_core.inputs.telemetry import Telemetry, read_telemetry
 from mpsfm_core.providers.weights import file_sha256
 from mpsfm_core.support.files import replace_entries
 from mpsfm_core.support.format_versions import VERSION, check_version
+from mpsfm_core.support.jpeg import encode_jpeg
 
 EXTENSIONS = frozenset((".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mts", ".3gp", ".wmv"))
 """File extensions of videos."""
@@ -67,8 +68,6 @@ _DEFAULT_FPS = 30.0
 """Frame rate of a video whose container has neither time stamps nor a frame rate."""
 _MIN_FRAME_RATIO = 0.9
 """Minimum ratio of decoded frames to the frame count in the header of an undamaged video."""
-_JPEG_QUALITY = 95
-"""JPEG quality of the selected frames, from 0 to 100."""
 
 
 def is_video(path: Path) -> bool:
@@ -198,7 +197,7 @@ def _write_keyframes(
     names = {frame.number: frame.name for frame in selection.keyframes}
     for frame in read_frames(video, frozenset(names)):
         path = folder / names[frame.number]
-        path.write_bytes(telemetry.add_exif(encode_frame(frame.image), frame.number))
+        path.write_bytes(telemetry.add_exif(encode_jpeg(frame.image), frame.number))
     content = {
         VERSION: FORMAT,
         **origin,
@@ -232,11 +231,6 @@ def read_selection(folder: Path) -> VideoSelection:
             f"{folder / _LIST}: the list of keyframes cannot be read ({error}); delete the folder "
             f"to extract the keyframes again"
         ) from error
-
-
-def encode_frame(frame: UInt8) -> bytes:
-    """Encode a BGR image as JPEG."""
-    return cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
 
 
 def choose_frames(

@@ -43,12 +43,11 @@ from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.panorama import find_projection, has_panorama_size
 from mpsfm_core.inputs.undistortion import is_pinhole
 from mpsfm_core.support.files import write_file
+from mpsfm_core.support.jpeg import encode_jpeg
 
 MAX_FIELD_OF_VIEW_DEG = 120.0
 """Largest field of view of an image that is undistorted as a whole. An undistorted image with a
 larger field of view has stretched corners or loses its border. [ours]"""
-_JPEG_QUALITY = 95
-"""Quality of the JPEG files of views, at which compression does not move keypoints. [ours]"""
 
 
 class CutImages(NamedTuple):
@@ -365,9 +364,8 @@ def _with_parent(path: Path) -> Path:
 
 def _write_jpeg(path: Path, rgb: UInt8) -> None:
     """Write RGB pixels as a JPEG file."""
-    options = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
-    write_file(_with_parent(path), cv2.imencode(".jpg", bgr, options)[1].tobytes())
+    bgr = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), np.uint8)
+    write_file(_with_parent(path), encode_jpeg(bgr))
 
 
 def _write_mask(path: Path, mask: Bool) -> None:

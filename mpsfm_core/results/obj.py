@@ -11,8 +11,7 @@ from mpsfm_core.data import Int64
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.texture import TexturedMesh
 from mpsfm_core.geometry.statistics import unique_rows
-
-_JPEG_QUALITY = 92
+from mpsfm_core.support.jpeg import encode_jpeg
 
 
 def write_obj(path: Path, mesh: TexturedMesh) -> bytes:
@@ -26,8 +25,7 @@ def write_obj(path: Path, mesh: TexturedMesh) -> bytes:
         Bytes of the JPEG file.
     """
     material, image = path.with_suffix(".mtl"), path.with_suffix(".jpg")
-    bgr = cv2.cvtColor(mesh.texture, cv2.COLOR_RGB2BGR)
-    jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY])[1].tobytes()
+    jpeg = encode_jpeg(np.asarray(cv2.cvtColor(mesh.texture, cv2.COLOR_RGB2BGR), np.uint8))
     image.write_bytes(jpeg)
     material.write_text(f"newmtl photos\nKd 1 1 1\nillum 0\nmap_Kd {image.name}\n", "utf-8")
     with path.open("w", encoding="utf-8") as file:

@@ -15,12 +15,13 @@ from mpsfm_core.geometry import camera_center, rotation_angle_deg
 from mpsfm_core.geometry.panorama import make_panorama_camera
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.inputs.video import SelectedFrame, VideoSelection, encode_frame, read_frames
+from mpsfm_core.inputs.video import SelectedFrame, VideoSelection, read_frames
 from mpsfm_core.inputs.view_cutting import ViewCutter, cut_images
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.pipeline.trajectory import localize_frames
 from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.trajectory import TrajectoryFrame
+from mpsfm_core.support.jpeg import encode_jpeg
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise, render_mapping_image
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -67,7 +68,7 @@ def localize(video: Path, folder: Path, every: int = 1) -> list[TrajectoryFrame]
     keyframes = tuple(SelectedFrame(n, n / 15, 0, reason, 1.0, 1.0) for n in KEYFRAMES)
     names = {frame.number: frame.name for frame in keyframes}
     for frame in read_frames(video, frozenset(names)):
-        (folder / names[frame.number]).write_bytes(encode_frame(frame.image))
+        (folder / names[frame.number]).write_bytes(encode_jpeg(frame.image))
     part, originals = build_part(
         folder, CAMERA, {name: POSES[number] for number, name in names.items()}
     )
@@ -134,7 +135,7 @@ def test_frames_of_a_panorama_video_get_the_pose_of_the_panorama(tmp_path: Path)
     names = {frame.number: frame.name for frame in keyframes}
     (tmp_path / "frames").mkdir()
     for frame in read_frames(path, frozenset(names)):
-        (tmp_path / "frames" / names[frame.number]).write_bytes(encode_frame(frame.image))
+        (tmp_path / "frames" / names[frame.number]).write_bytes(encode_jpeg(frame.image))
     cut = cut_images(
         *(tmp_path / "frames", list(names.values()), tmp_path / "views", tmp_path / "masks"),
         InputOptions(),

@@ -25,7 +25,8 @@ from mpsfm_core.inputs.captures.frame import (
 )
 from mpsfm_core.inputs.options import VideoOptions
 from mpsfm_core.inputs.text_files import read_text_file
-from mpsfm_core.inputs.video import choose_frames, encode_frame, read_frames
+from mpsfm_core.inputs.video import choose_frames, read_frames
+from mpsfm_core.support.jpeg import encode_jpeg
 
 _VIDEO, _ODOMETRY, _MATRIX = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 _POSE = ("qx", "qy", "qz", "qw", "x", "y", "z")
@@ -56,7 +57,7 @@ def _read_frames(path: Path) -> Iterator[CapturedFrame]:
         confidence = read_png(path / "confidence" / f"{number:06d}.png")
         yield CapturedFrame(
             f"{number:06d}.jpg",
-            encode_frame(pixels),
+            encode_jpeg(pixels),
             pinhole_camera((pixels.shape[1], pixels.shape[0]), params, where),
             world_from_cam.inverse(),
             read_depth_png(path / "depth" / f"{number:06d}.png"),
