@@ -7,7 +7,7 @@ Each set is reconstructed with every fifth photo held out: the mapper registers 
 stage ``dense`` does not use it. ``mpsfm mesh`` meshes the depth maps, and COLMAP's Poisson meshing
 meshes the fused cloud. Cloud and meshes are rendered at the poses of the held-out photos. Finished
 reconstructions in the output folder are reused. With ``--without-validity``, the stage ``dense``
-keeps the pixels that match no other view or are next to a depth edge.
+keeps the pixels that match no other view or are next to a depth edge, and there is no Poisson mesh.
 """
 
 from __future__ import annotations
@@ -72,15 +72,16 @@ def evaluate_set(name: str, config: Config, folder: Path) -> list[list[str]]:
     if not (folder / MESH_GLB).is_file():
         mesh_model(folder)
     meshed = time.monotonic()
-    if not (folder / POISSON).is_file():
+    if config.dense.check_validity and not (folder / POISSON).is_file():
         options = pycolmap.PoissonMeshingOptions()
         options.depth, options.trim = POISSON_DEPTH, POISSON_TRIM
         pycolmap.poisson_meshing(folder / DENSE, folder / POISSON, options)
     seconds = {"mesh.obj": meshed - started, POISSON: time.monotonic() - meshed}
     report = evaluate_held_out(folder)
     geometries: dict[str, Any] = dict(report["geometries"])
-    poisson = evaluate_held_out(folder, names=report["images"], geometry=folder / POISSON)
-    geometries |= poisson["geometries"]
+    if (folder / POISSON).is_file():
+        poisson = evaluate_held_out(folder, names=report["images"], geometry=folder / POISSON)
+        geometries |= poisson["geometries"]
     rows = []
     for file, values in geometries.items():
         metrics = [values[metric] for metric in METRICS]

@@ -22,7 +22,9 @@ def mesh(
     overrides: Annotated[
         list[str] | None,
         typer.Option(
-            "--set", metavar="KEY=VALUE", help="Set voxel_px, max_triangles, max_texture_size."
+            "--set",
+            metavar="KEY=VALUE",
+            help="Set voxel_px, max_hole_px, max_triangles or max_texture_size.",
         ),
     ] = None,
     quiet: Quiet = False,

@@ -36,12 +36,12 @@ def add_edge_variance(
     """
     odds = np.float32(_VIEW_ODDS) ** np.maximum(views.astype(np.float32) - 1, 0)
     probability = 1 / (1 + odds)
-    step = np.minimum(_depth_steps(depth.log_depth, window_radius), UNKNOWN_LOG_STD)
+    step = np.minimum(depth_steps(depth.log_depth, window_radius), UNKNOWN_LOG_STD)
     variance = depth.log_std**2 + probability * (1 - probability) * step**2
     return LogDepthMap(depth.log_depth, np.sqrt(variance).astype(np.float32))
 
 
-def _depth_steps(log_depth: Float32, radius: int) -> Float32:
+def depth_steps(log_depth: Float32, radius: int) -> Float32:
     """Compute the relative step (h, w) of inverse depth within a radius in pixels.
 
     With the changes ``a`` and ``b`` of inverse depth to two opposite pixels, the step is

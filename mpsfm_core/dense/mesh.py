@@ -1,8 +1,10 @@
 """Triangle mesh from the depth maps of all images.
 
 Depth maps are integrated into a truncated signed distance field (TSDF) with inverse-variance
-weights [Curless and Levoy, SIGGRAPH 1996]. TSDF blocks exist only around surfaces, so that memory
-does not grow with the volume. Marching cubes of scikit-image extracts the triangles.
+weights [Curless and Levoy, SIGGRAPH 1996]. Pixels in closed holes
+(:mod:`~mpsfm_core.dense.hole_filling`) only have an effect where nothing is measured. TSDF blocks
+exist only around surfaces, so that memory does not grow with the volume. Marching cubes of
+scikit-image extracts the triangles.
 """
 # mypy: allow-untyped-decorators
 
@@ -19,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.fusion import compute_consistent_masks
+from mpsfm_core.dense.hole_filling import find_closable_holes
 from mpsfm_core.dense.mesh_visibility import find_observed_triangles
 from mpsfm_core.dense.options import MeshOptions
 from mpsfm_core.geometry import (
@@ -41,6 +44,8 @@ _TRUNCATION_VOXELS = 3.0
 """Minimum truncation distance of the TSDF in voxels."""
 _TRUNCATION_STDS = 3.0
 """Minimum truncation distance of the TSDF in depth stds, so that noise does not split a surface."""
+_FILLED_WEIGHT_RATIO = 1e-6
+"""Ratio of the weight of pixels in closed holes to the smallest weight of measured pixels."""
 _MERGE_DISTANCE = 1e-3
 """Distance in voxels below which vertices of neighboring TSDF blocks merge, above float32
 rounding."""
@@ -56,6 +61,14 @@ class TriangleMesh(NamedTuple):
     """(m, 3) int64 vertex indices of the triangles, counterclockwise as seen by the cameras."""
     colors: UInt8
     """(n, 3) uint8 RGB colors of the vertices."""
+    filled: Bool
+    """(n,) mask of the vertices in closed holes, whose position comes from depth priors only."""
+
+    @property
+    def filled_triangles(self) -> Bool:
+        """(m,) mask of the triangles with a vertex in a closed hole."""
+        mask: Bool = np.logical_or.reduce(self.filled[self.triangles], axis=1)
+        return mask
 
 
 class _WeightedDepth(NamedTuple):
@@ -67,7 +80,9 @@ class _WeightedDepth(NamedTuple):
     depth: Float32
     """(h, w) z-depth in world units, 0 at holes."""
     weight: Float32
-    """(h, w) inverse variance of depth, 0 at holes."""
+    """(h, w) inverse variance of depth, 0 at holes and close to 0 in closed holes."""
+    filled: Bool
+    """(h, w) mask of the pixels in closed holes."""
 
     @property
     def points(self) -> Float64:
@@ -101,7 +116,8 @@ class _WeightedDepth(NamedTuple):
         xy = project(self.image.camera.resized(width, height), local)
         rows = np.flatnonzero(inside(xy, (width, height)) & (local[:, 2] > 0))
         depth, weight = (sample_nearest(grid, xy[rows]) for grid in (self.depth, self.weight))
-        std_tolerance = _TRUNCATION_STDS / np.sqrt(np.where(weight > 0, weight, np.inf))
+        certain = (weight > 0) & ~sample_nearest(self.filled, xy[rows])
+        std_tolerance = _TRUNCATION_STDS / np.sqrt(np.where(certain, weight, np.inf))
         max_difference = np.maximum(tolerance, std_tolerance)
         rows = rows[(depth > 0) & (np.abs(depth - local[rows, 2]) <= max_difference)]
         return rows, xy[rows]
@@ -136,7 +152,9 @@ def mesh_depth_maps(
     images = reconstruction.dense_images
     masks = compute_consistent_masks(images)
     maps = [
-        _weight_depth(image, mask) for image, mask in zip(images, masks, strict=True) if mask.any()
+        _weight_depth(image, mask, options.max_hole_px)
+        for image, mask in zip(images, masks, strict=True)
+        if mask.any()
     ]
     if not maps:
         raise InputError(
@@ -144,7 +162,7 @@ def mesh_depth_maps(
             "run `mpsfm dense` first, or add photos with more overlap"
         )
     pixel_size = np.median([np.median(m.depth[m.depth > 0]) / m.intrinsics[0] for m in maps])
-    std = np.median([np.median(m.weight[m.depth > 0] ** -0.5) for m in maps])
+    std = np.median([np.median(m.weight[(m.depth > 0) & ~m.filled] ** -0.5) for m in maps])
     voxel = float(options.voxel_px * pixel_size)
     truncation = max(_TRUNCATION_VOXELS * voxel, _TRUNCATION_STDS * float(std))
     surfaces = [
@@ -173,7 +191,8 @@ def mesh_depth_maps(
             target_count=options.max_triangles,
         )
         vertices, triangles = points.astype(np.float64), faces.astype(np.int64)
-    return TriangleMesh(vertices, triangles, _color_vertices(vertices, maps, view_of, voxel))
+    colors, filled = _color_vertices(vertices, maps, view_of, voxel)
+    return TriangleMesh(vertices, triangles, colors, filled)
 
 
 def _import_libraries() -> tuple[Any, Any]:
@@ -189,14 +208,17 @@ def _import_libraries() -> tuple[Any, Any]:
     return marching_cubes, simplify
 
 
-def _weight_depth(image: RegisteredImage, mask: Bool) -> _WeightedDepth:
+def _weight_depth(image: RegisteredImage, mask: Bool, max_hole_px: float) -> _WeightedDepth:
+    """Weight the pixels of a mask by their variance, and close narrow holes of the mask."""
     height, width = image.depth.shape
     variance = image.depth.variance
     assert variance is not None  # The mapper's refined depth maps always have a variance.
     min_variance = np.finfo(np.float32).tiny
     weight = np.where(mask, 1 / np.maximum(variance, min_variance), 0).astype(np.float32)
-    depth = np.where(mask, image.depth.depth, 0).astype(np.float32)
-    return _WeightedDepth(image, image.camera.resized(width, height).params, depth, weight)
+    filled = find_closable_holes(image.depth, mask, max_hole_px)
+    weight[filled] = _FILLED_WEIGHT_RATIO * weight[mask].min()
+    depth = np.where(mask | filled, image.depth.depth, 0).astype(np.float32)
+    return _WeightedDepth(image, image.camera.resized(width, height).params, depth, weight, filled)
 
 
 def _find_surface_blocks(maps: Sequence[_WeightedDepth], voxel: float) -> Int64:
@@ -341,10 +363,16 @@ def _color_vertices(
     maps: Sequence[_WeightedDepth],
     view_of: Callable[[str], View],
     tolerance: float,
-) -> UInt8:
-    """Average the colors of a vertex over the images that see the vertex; gray if no image does."""
+) -> tuple[UInt8, Bool]:
+    """Average the colors of each vertex over images, and find the vertices in closed holes.
+
+    Returns:
+        Colors (n, 3), gray if no image sees a vertex, and the mask (n,) of the vertices that images
+        only see in closed holes.
+    """
     total = np.zeros((len(vertices), 3))
     weight = np.zeros(len(vertices))
+    measured, filled = np.zeros((2, len(vertices)), np.bool_)
     for map_ in maps:
         rows, xy = map_.find_visible(vertices, tolerance)
         height, width = map_.depth.shape
@@ -352,7 +380,9 @@ def _color_vertices(
         pixels = resize_map(view_of(map_.image.name).image, width, height)
         total[rows] += map_weight[:, None] * sample_nearest(pixels, xy)
         weight[rows] += map_weight
+        in_hole = sample_nearest(map_.filled, xy)
+        measured[rows[~in_hole]] = True
+        filled[rows[in_hole]] = True
     gray = np.full((len(vertices), 3), 128.0)
     mean = np.divide(total, weight[:, None], out=gray, where=weight[:, None] > 0)
-    colors: UInt8 = np.round(mean).astype(np.uint8)
-    return colors
+    return np.round(mean).astype(np.uint8), filled & ~measured

@@ -37,6 +37,10 @@ class MeshOptions(Options):
     """Voxel size in pixels of the depth maps at their median depth.
 
     Smaller voxels reproduce noise of the depth maps and need more memory."""
+    max_hole_px: float = Field(32.0, ge=0)
+    """Maximum width of a closed part of a hole in pixels of the depth maps; 0 closes no holes.
+
+    A larger value closes larger holes, with depth of priors. A hole stays open at depth edges."""
     max_triangles: int = Field(500_000, ge=4)
     """Maximum number of triangles (about 20 bytes each on disk); a larger mesh is simplified."""
     max_texture_size: int = Field(DEFAULT_MAX_TEXTURE_SIZE, ge=0, le=16384)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mpsfm_core.data import Float32, Float64, Int64, UInt8, View
+from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.mesh import TriangleMesh
 from mpsfm_core.dense.seam_leveling import level_seams
@@ -43,6 +43,8 @@ class TexturedMesh(NamedTuple):
     """(n, 2) float32 texture coordinates in [0, 1], from the upper left corner of the texture."""
     texture: UInt8
     """(h, w, 3) uint8 RGB texture."""
+    filled: Bool
+    """(m,) mask of the triangles in closed holes, see :attr:`TriangleMesh.filled`."""
 
 
 class _Charts(NamedTuple):
@@ -106,7 +108,8 @@ def build_texture(
     positions = xy * layout.scale + shifts
     _level_texture(charts, colors, positions, texture)
     uv = (positions / layout.texture_size).astype(np.float32)
-    return TexturedMesh(mesh.vertices[charts.vertex_of], charts.triangles, uv, texture)
+    vertices = mesh.vertices[charts.vertex_of]
+    return TexturedMesh(vertices, charts.triangles, uv, texture, mesh.filled_triangles)
 
 
 def _build_charts(triangles: Int64, labels: Int64) -> _Charts:

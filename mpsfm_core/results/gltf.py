@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -56,7 +57,7 @@ class GltfScene:
         mode: int,
         points: Float64,
         colors: UInt8 | None,
-        triangles: Int64 | None = None,
+        triangles: Mapping[str, Int64] | None = None,
         texture: Texture | None = None,
     ) -> int:
         """Add a mesh to the scene; return the mesh number.
@@ -66,7 +67,7 @@ class GltfScene:
             mode: primitive type :data:`POINTS`, :data:`LINES` or :data:`TRIANGLES`.
             points: (n, 3) vertices; a line has two vertices.
             colors: (n, 3) RGB colors of the vertices, or None.
-            triangles: (m, 3) vertex indices of the triangles.
+            triangles: (m, 3) vertex indices of the triangles of each material, by its name.
             texture: texture of the triangles, or None.
         """
         positions = points.astype("<f4")
@@ -76,27 +77,38 @@ class GltfScene:
             opaque = np.concatenate([colors, np.full((len(colors), 1), 255, np.uint8)], axis=1)
             described = {"normalized": True}
             attributes["COLOR_0"] = self._accessor(opaque, "VEC4", _BYTE, described)
-        primitive: dict[str, Any] = {"mode": mode, "attributes": attributes}
-        if triangles is not None:
-            indices = triangles.astype("<u4").ravel()
-            primitive["indices"] = self._accessor(indices, "SCALAR", _UINT, {})
-            primitive["material"] = self._unlit_material(texture)
         if texture is not None:
             uv = texture.uv.astype("<f4")
             attributes["TEXCOORD_0"] = self._accessor(uv, "VEC2", _FLOAT, {})
-        self._json["meshes"].append({"name": name, "primitives": [primitive]})
+        primitive: dict[str, Any] = {"mode": mode, "attributes": attributes}
+        primitives = [primitive]
+        if triangles is not None:
+            number = None if texture is None else self._texture(texture)
+            primitives = [
+                {
+                    **primitive,
+                    "indices": self._accessor(part.astype("<u4").ravel(), "SCALAR", _UINT, {}),
+                    "material": self._unlit_material(material, number),
+                }
+                for material, part in triangles.items()
+            ]
+        self._json["meshes"].append({"name": name, "primitives": primitives})
         return len(self._json["meshes"]) - 1
 
-    def _unlit_material(self, texture: Texture | None) -> int:
+    def _texture(self, texture: Texture) -> int:
+        """Add a texture; return the texture number."""
+        view = self._buffer_view(texture.jpeg)
+        self._json["images"].append({"bufferView": view, "mimeType": "image/jpeg"})
+        self._json["textures"].append({"source": len(self._json["images"]) - 1})
+        return len(self._json["textures"]) - 1
+
+    def _unlit_material(self, name: str, texture: int | None) -> int:
         """Add an unlit, double-sided material; return the material number."""
         unlit = "KHR_materials_unlit"
         self._json["extensionsUsed"] = [unlit]
-        material: dict[str, Any] = {"doubleSided": True, "extensions": {unlit: {}}}
+        material: dict[str, Any] = {"name": name, "doubleSided": True, "extensions": {unlit: {}}}
         if texture is not None:
-            view = self._buffer_view(texture.jpeg)
-            self._json["images"].append({"bufferView": view, "mimeType": "image/jpeg"})
-            self._json["textures"].append({"source": len(self._json["images"]) - 1})
-            color = {"index": len(self._json["textures"]) - 1}
+            color = {"index": texture}
             material["pbrMetallicRoughness"] = {"baseColorTexture": color, "metallicFactor": 0}
         self._json["materials"].append(material)
         return len(self._json["materials"]) - 1

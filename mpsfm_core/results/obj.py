@@ -7,15 +7,31 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mpsfm_core.data import Int64
+from mpsfm_core.data import Bool, Int64
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.texture import TexturedMesh
 from mpsfm_core.geometry.statistics import unique_rows
 from mpsfm_core.support.jpeg import encode_jpeg
 
+MEASURED, CLOSED_HOLES = "measured", "closed_holes"
+"""Names of the materials of measured triangles and of triangles in closed holes."""
+
+
+def split_by_material(triangles: Int64, filled: Bool) -> dict[str, Int64]:
+    """Return the triangles of each material by its name, without materials that nothing uses.
+
+    Args:
+        triangles: (m, 3) vertex indices.
+        filled: (m,) mask of the triangles in closed holes.
+    """
+    parts = {MEASURED: triangles[~filled], CLOSED_HOLES: triangles[filled]}
+    return {name: part for name, part in parts.items() if len(part)}
+
 
 def write_obj(path: Path, mesh: TexturedMesh) -> bytes:
-    """Write an OBJ file, with its material (``.mtl``) and texture (``.jpg``) in the same folder.
+    """Write an OBJ file, with materials (``.mtl``) and texture (``.jpg``) in the same folder.
+
+    Triangles in closed holes have a material of their own, with the same texture.
 
     Args:
         path: OBJ file to write.
@@ -27,13 +43,17 @@ def write_obj(path: Path, mesh: TexturedMesh) -> bytes:
     material, image = path.with_suffix(".mtl"), path.with_suffix(".jpg")
     jpeg = encode_jpeg(np.asarray(cv2.cvtColor(mesh.texture, cv2.COLOR_RGB2BGR), np.uint8))
     image.write_bytes(jpeg)
-    material.write_text(f"newmtl photos\nKd 1 1 1\nillum 0\nmap_Kd {image.name}\n", "utf-8")
+    parts = split_by_material(mesh.triangles, mesh.filled)
+    described = f"Kd 1 1 1\nillum 0\nmap_Kd {image.name}\n"
+    material.write_text("".join(f"newmtl {name}\n{described}" for name in parts), "utf-8")
     with path.open("w", encoding="utf-8") as file:
-        file.write(f"mtllib {material.name}\nusemtl photos\n")
+        file.write(f"mtllib {material.name}\n")
         np.savetxt(file, mesh.vertices, "v %.9g %.9g %.9g")
         # Texture coordinates of OBJ files start at the lower left corner.
         np.savetxt(file, mesh.uv * (1, -1) + (0, 1), "vt %.7g %.7g")
-        np.savetxt(file, np.repeat(mesh.triangles + 1, 2, axis=1), "f %d/%d %d/%d %d/%d")
+        for name, triangles in parts.items():
+            file.write(f"usemtl {name}\n")
+            np.savetxt(file, np.repeat(triangles + 1, 2, axis=1), "f %d/%d %d/%d %d/%d")
     return jpeg
 
 
@@ -54,13 +74,16 @@ def read_obj(path: Path) -> TexturedMesh:
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error
     rows: dict[str, list[list[str]]] = {"v": [], "vt": [], "f": []}
-    library = ""
+    library, filled, in_hole = "", [], False
     for line in text.splitlines():
         key, *words = line.split() or [""]
         if key in rows:
             rows[key].append(words)
         elif key == "mtllib":
             library = " ".join(words)
+        elif key == "usemtl":
+            in_hole = words == [CLOSED_HOLES]
+        filled += [in_hole] * (len(words) - 2) if key == "f" else []
     try:
         vertices = np.array([row[:3] for row in rows["v"]], np.float64).reshape(-1, 3)
         uv = np.array([row[:2] for row in rows["vt"]], np.float64).reshape(-1, 2)
@@ -77,9 +100,8 @@ def read_obj(path: Path) -> TexturedMesh:
     texture = cv2.imread(str(image), cv2.IMREAD_COLOR_RGB)
     if texture is None:
         raise InputError(f"{image}: the texture cannot be read")
-    return TexturedMesh(
-        vertices[vertex], numbers.reshape(-1, 3), flipped, np.asarray(texture, np.uint8)
-    )
+    triangles, rgb = numbers.reshape(-1, 3), np.asarray(texture, np.uint8)
+    return TexturedMesh(vertices[vertex], triangles, flipped, rgb, np.array(filled, np.bool_))
 
 
 def _read_corners(faces: list[list[str]], num_vertices: int, num_uv: int) -> Int64:

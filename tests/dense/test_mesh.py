@@ -27,6 +27,7 @@ from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.results.colmap_model import build_model, write_model
 from mpsfm_core.results.depth_maps import write_depth_maps
+from mpsfm_core.results.obj import read_obj
 
 from .conftest import CAMERA, Room
 
@@ -115,6 +116,46 @@ def test_mesh_ignores_uncertain_wrong_map(room: Room) -> None:
     assert np.median(to_truth) < 0.25 * 0.04 * np.median(wrong.depth)
 
 
+def hole_distance(room: Room, points: np.ndarray) -> np.ndarray:
+    """Return the distance (n,) of points to the center of a hole, in radii of the hole."""
+    center = surface(room).reshape(-1, CAMERA.height, CAMERA.width, 3)[0, 20, 50]
+    radius = 8 * room.truth["0.png"][20, 50] / CAMERA.fx
+    distance: np.ndarray = np.linalg.norm(points - center, axis=-1) / radius
+    return distance
+
+
+def with_hole(room: Room, step: float = 1.0) -> Reconstruction:
+    """Return true depth with a hole of unknown std, 16 pixels wide, and a depth step around it."""
+    distance = hole_distance(room, surface(room)).reshape(-1, CAMERA.height, CAMERA.width)
+    images = []
+    for image, hole in zip(measured(room, std=0.0).images, distance < 1, strict=True):
+        depth, variance = image.depth.depth.copy(), np.asarray(image.depth.variance).copy()
+        depth[hole] *= step
+        variance[hole] = depth[hole] ** 2
+        images.append(replace(image, depth=DepthPrior.from_arrays(depth, variance)))
+    return replace(room.reconstruction, images=tuple(images))
+
+
+def test_mesh_closes_and_marks_hole_where_depth_continues(room: Room) -> None:
+    mesh = mesh_depth_maps(with_hole(room), room.views.__getitem__, MeshOptions())
+    distance, pixel = hole_distance(room, mesh.vertices), room.truth["0.png"][20, 50] / CAMERA.fx
+    assert mesh.filled[distance < 0.8].all() and (distance < 0.8).sum() > 20
+    assert not mesh.filled[(distance > 1.2) & (distance < 2)].any()
+    assert mesh.filled_triangles.sum() > 20
+    assert cKDTree(surface(room)).query(mesh.vertices[mesh.filled])[0].max() < 2 * pixel
+    to_mesh = cKDTree(mesh.vertices).query(surface(room)[hole_distance(room, surface(room)) < 1])
+    assert to_mesh[0].max() < 3 * pixel
+
+
+@pytest.mark.parametrize(("max_hole_px", "step"), [(0, 1.0), (8, 1.0), (32, 0.8), (32, 1.25)])
+def test_mesh_does_not_close_wide_hole_or_hole_with_step(
+    room: Room, max_hole_px: float, step: float
+) -> None:
+    options = MeshOptions(max_hole_px=max_hole_px)
+    mesh = mesh_depth_maps(with_hole(room, step), room.views.__getitem__, options)
+    assert (hole_distance(room, mesh.vertices) > 0.7).all()
+
+
 def test_mesh_without_valid_pixels_raises(room: Room) -> None:
     none = [
         replace(i, depth=DepthPrior(i.depth.depth, i.depth.variance, np.zeros_like(i.depth.valid)))
@@ -136,8 +177,8 @@ def test_mesh_without_libraries_raises(room: Room, monkeypatch: pytest.MonkeyPat
 
 @pytest.fixture
 def result(room: Room, tmp_path: Path) -> Path:
-    """Create a folder with a model, depth maps and images."""
-    exact = measured(room)
+    """Create a folder with a model, depth maps with a hole, and images."""
+    exact = with_hole(room)
     nothing = np.zeros((0, 2))
     cameras, colors = [colmap_from_pinhole(CAMERA)] * len(exact.images), np.zeros((0, 3), np.uint8)
     built = build_model(exact, cameras, [nothing] * len(exact.images), colors)
@@ -160,23 +201,30 @@ def test_mesh_command_writes_ply_glb_and_obj(result: Path) -> None:
     assert done.exit_code == 0, done.output
     ply = trimesh.load(result / "mesh.ply", process=False)
     glb = trimesh.load(result / "mesh.glb", process=False)
-    obj = trimesh.load(result / "mesh.obj", process=False, maintain_order=True)
-    [surface] = glb.geometry.values()
-    assert 1000 < len(ply.faces) <= 2002 and len(surface.faces) == len(ply.faces)
-    assert ply.area == pytest.approx(surface.area, rel=1e-4)
+    obj = trimesh.load(result / "mesh.obj", process=False)
+    surface, holes = glb.geometry.values()
+    assert 1000 < len(ply.faces) <= 2002 and len(surface.faces) + len(holes.faces) == len(ply.faces)
+    assert ply.area == pytest.approx(surface.area + holes.area, rel=1e-4)
+    filled = ply.metadata["_ply_raw"]["vertex"]["data"]["filled"].ravel() > 0
+    assert filled[ply.faces].any(axis=1).sum() == len(holes.faces) > 0
+    assert holes.visual.material.name == "closed_holes"
     assert obj.area == pytest.approx(ply.area, rel=1e-4)
     assert np.allclose(obj.bounds, ply.bounds, atol=1e-4)
     assert len(np.unique(ply.visual.vertex_colors, axis=0)) > 100
-    texture = np.asarray(obj.visual.material.image)
+    texture = cv2.imread(str(result / "mesh.jpg"), cv2.IMREAD_COLOR_RGB)
     assert np.array_equal(texture, np.asarray(surface.visual.material.baseColorTexture))
-    [primitive] = read_gltf(result / "mesh.glb")["meshes"][0]["primitives"]
-    assert primitive["mode"] == 4 and {"POSITION", "TEXCOORD_0"} == set(primitive["attributes"])
-    # trimesh flips v, so the texture coordinates of both files start at the lower left corner.
-    assert np.allclose(surface.visual.uv[surface.faces], obj.visual.uv[obj.faces], atol=1e-5)
+    primitives = read_gltf(result / "mesh.glb")["meshes"][0]["primitives"]
+    for primitive in primitives:
+        assert primitive["mode"] == 4 and {"POSITION", "TEXCOORD_0"} == set(primitive["attributes"])
+    textured = read_obj(result / "mesh.obj")
+    assert textured.filled.sum() == len(holes.faces)
+    # trimesh flips v, so its texture coordinates start at the lower left corner.
+    read = textured.uv[textured.triangles[~textured.filled]]
+    assert np.allclose(surface.visual.uv[surface.faces], read * (1, -1) + (0, 1), atol=1e-5)
 
 
 def test_mesh_command_without_texture(result: Path) -> None:
-    options = ["--set", "max_triangles=2000", "--set", "max_texture_size=0"]
+    options = [f"--set={name}=0" for name in ("max_texture_size", "max_hole_px")]
     (result / "mesh.obj").write_text("old")
     done = CliRunner().invoke(build_app(), ["mesh", str(result), *options])
     assert done.exit_code == 0, done.output

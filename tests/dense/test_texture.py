@@ -153,12 +153,14 @@ def test_obj_is_read_as_written(tmp_path: Path) -> None:
     vertices = np.concatenate([_square(2, 0.5), _square(3, 0.5)])
     triangles = np.array([[0, 1, 2], [4, 5, 6]])
     uv = np.random.default_rng(0).uniform(size=(8, 2)).astype(np.float32)
-    picture = np.full((20, 30, 3), (200, 100, 50), np.uint8)
-    write_obj(tmp_path / "a.obj", TexturedMesh(vertices, triangles, uv, picture))
+    picture, filled = np.full((20, 30, 3), (200, 100, 50), np.uint8), np.array([False, True])
+    write_obj(tmp_path / "a.obj", TexturedMesh(vertices, triangles, uv, picture, filled))
     mesh = read_obj(tmp_path / "a.obj")
     assert np.allclose(mesh.vertices[mesh.triangles], vertices[triangles])
     assert np.allclose(mesh.uv[mesh.triangles], uv[triangles], atol=1e-6)
     assert np.abs(mesh.texture.astype(int) - picture).max() < 4
+    assert mesh.filled.tolist() == filled.tolist()
+    assert (tmp_path / "a.obj").read_text().count("usemtl closed_holes") == 1
 
 
 def test_obj_with_quads_and_negative_indices_is_read(tmp_path: Path) -> None:
