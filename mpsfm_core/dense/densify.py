@@ -47,7 +47,12 @@ from mpsfm_core.dense.scale_uncertainty import (
     estimate_scale_stds,
     measure_scale_constraints,
 )
-from mpsfm_core.dense.stereo import WINDOW_RADIUS, StereoDepth, match_stereo_depth
+from mpsfm_core.dense.stereo import (
+    WINDOW_RADIUS,
+    StereoDepth,
+    match_stereo_depth,
+    measure_parallax,
+)
 from mpsfm_core.dense.view_selection import select_source_views
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
@@ -234,9 +239,15 @@ class _DensifySteps:
             if not difference.is_coincidental(patches[source].matched_ratio)
         }
         pose_std_px = estimate_pose_error_px(patches[source] for source in consistent)
-        consistency = evaluate_consistency(image.parallax_px, consistent.values(), pose_std_px)
+        view = self._views[row]
+        parallax = (
+            resize_map(measure_parallax(view, [self._views[source]]), *view.camera.size)
+            for source in consistent
+        )
+        differences_and_parallax = zip(consistent.values(), parallax, strict=True)
+        consistency = evaluate_consistency(view.shape, differences_and_parallax, pose_std_px)
         constraints = (
-            _measure_constraints(image, consistent, self._views[row], self._options)
+            _measure_constraints(image, consistent, view, self._options)
             if self._poses_use_depth
             else None
         )
@@ -344,6 +355,7 @@ def _store_consistency(
         consistency,
         views=store_array(consistency.views),
         mean_change=store_array(consistency.mean_change),
+        parallax_px=store_array(consistency.parallax_px),
     )
 
 
@@ -372,6 +384,7 @@ def _merge_stereo_depth(
     image, confirmed = matched[row], consistency[row].confirmed
     log_depth = image.log_depth + consistency[row].mean_change
     std = image.log_std(consistency[row].std_px if confirmed.any() else _MATCH_STD_PX)
+    std = np.where(confirmed, consistency[row].log_std, std)
     std = np.maximum(std, np.float32(MIN_STD))
     neighbor_depths = (
         (matched[j].grid, matched[j].log_depth, consistency[j].confirmed)

@@ -39,6 +39,9 @@ class GeometricConsistency:
     a pixel, because two wrong depths are rarely equal."""
     mean_change: Float32
     """(h, w) mean of the consistent log depths of all views minus the log depth of this view."""
+    parallax_px: Float32
+    """(h, w) maximum motion in pixels per unit of log depth of a point's projection in the
+    consistent views, 0 at unconfirmed pixels."""
     match_std_px: float
     """Std of a stereo match in pixels, estimated from depth differences (NaN without consistent
     pixels)."""
@@ -50,6 +53,12 @@ class GeometricConsistency:
     def confirmed(self) -> Bool:
         """(h, w) mask of pixels whose depth at least one other view confirms."""
         return self.views > 0
+
+    @property
+    def log_std(self) -> Float32:
+        """(h, w) std of the mean of consistent log depths, infinite at unconfirmed pixels."""
+        with np.errstate(divide="ignore"):
+            return self.std_px / self.parallax_px
 
     @property
     def std_px(self) -> Float32:
@@ -118,26 +127,32 @@ def compare_depths(reference: PosedDepth, source: PosedDepth) -> DepthDifference
 
 
 def evaluate_consistency(
-    parallax: Float32, differences: Iterable[Float32], pose_std_px: float = 0.0
+    shape: tuple[int, int],
+    differences: Iterable[tuple[Float32, Float32]],
+    pose_std_px: float = 0.0,
 ) -> GeometricConsistency:
     """Merge the depth differences to several views and estimate the std of a match.
 
     The depth difference of two views contains the errors of two stereo matches.
 
     Args:
-        parallax: (h, w) motion in pixels of a point's projection per unit of log depth.
-        differences: Log depth differences (h, w) to each view, see :class:`DepthDifferences`.
+        shape: (h, w) of the depth map.
+        differences: Log depth differences (h, w) to each view, see :class:`DepthDifferences`, and
+            motion (h, w) in pixels of a point's projection in the view per unit of log depth.
         pose_std_px: Std of a stereo match in pixels due to pose errors.
     """
-    views, change, moves_px = np.zeros(parallax.shape, np.uint16), np.zeros_like(parallax), []
-    for difference in differences:
+    views, moves_px = np.zeros(shape, np.uint16), []
+    change, largest_parallax = np.zeros((2, *shape), np.float32)
+    for difference, parallax in differences:
         agree = np.isfinite(difference)
         views += agree
         change[agree] += difference[agree]
+        largest_parallax[agree] = np.maximum(largest_parallax[agree], parallax[agree])
         moves_px.append(np.abs(difference[agree]) * parallax[agree])
     moves = np.concatenate([np.zeros(0, np.float32), *moves_px])
     std = float(np.quantile(moves, ONE_SIGMA)) / math.sqrt(2) if len(moves) else math.nan
-    return GeometricConsistency(views, change / (1 + views.astype(np.float32)), std, pose_std_px)
+    mean_change = change / (1 + views.astype(np.float32))
+    return GeometricConsistency(views, mean_change, largest_parallax, std, pose_std_px)
 
 
 def splat_depth(grid: PosedGrid, sources: Iterable[tuple[PosedGrid, Float32, Bool]]) -> Float32:

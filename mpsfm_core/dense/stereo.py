@@ -90,7 +90,7 @@ def match_stereo_depth(view: DenseView, sources: Sequence[DenseView]) -> StereoD
     for factor in _LEVELS:
         level_view = view.downsample(factor)
         level_sources = [source.downsample(factor) for source in sources]
-        parallax = _measure_parallax(level_view, level_sources)
+        parallax = measure_parallax(level_view, level_sources)
         step = 1 / max(float(np.median(parallax)), 1e-6)
         if factor == _LEVELS[0]:
             log_depth = level_view.log_depth
@@ -187,7 +187,7 @@ def _search_range(view: DenseView) -> Float32:
     return reach
 
 
-def _measure_parallax(view: DenseView, sources: Sequence[DenseView]) -> Float32:
+def measure_parallax(view: DenseView, sources: Sequence[DenseView]) -> Float32:
     """Compute how far projections in the source views move per unit of log depth (8, 8).
 
     The parallax is the maximum over the source views, and at least a small positive value.

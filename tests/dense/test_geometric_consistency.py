@@ -33,7 +33,7 @@ def test_evaluate_consistency_estimates_match_std(std_px: float) -> None:
     rows = np.linspace(50, 400, SHAPE[0], dtype=np.float32)
     parallax = np.repeat(rows[:, None], SHAPE[1], axis=1)
     found = [differences(std_px, parallax, seed, wrong=0.4) for seed in range(3)]
-    agreement = evaluate_consistency(parallax, found)
+    agreement = evaluate_consistency(SHAPE, [(each, parallax) for each in found])
     assert agreement.match_std_px == pytest.approx(std_px, rel=0.03)
     assert agreement.confirmed.mean() == pytest.approx(1 - 0.4**3, abs=0.01)
 
@@ -41,12 +41,13 @@ def test_evaluate_consistency_estimates_match_std(std_px: float) -> None:
 def test_evaluate_consistency_averages_consistent_depths() -> None:
     parallax = np.ones(SHAPE, np.float32)
     one, other = np.full(SHAPE, 0.3, np.float32), np.full(SHAPE, np.nan, np.float32)
-    np.testing.assert_allclose(evaluate_consistency(parallax, [one, other]).mean_change, 0.15)
-    np.testing.assert_allclose(evaluate_consistency(parallax, [one, one]).mean_change, 0.2)
+    for second, change in ((other, 0.15), (one, 0.2)):
+        agreement = evaluate_consistency(SHAPE, [(one, parallax), (second, parallax)])
+        np.testing.assert_allclose(agreement.mean_change, change)
 
 
 def test_evaluate_consistency_without_views_confirms_nothing() -> None:
-    agreement = evaluate_consistency(np.ones(SHAPE, np.float32), [])
+    agreement = evaluate_consistency(SHAPE, [])
     assert not agreement.confirmed.any()
     assert np.isnan(agreement.match_std_px)
 
@@ -58,7 +59,7 @@ def test_std_px_accounts_for_correlated_errors(views: int) -> None:
     common = 0.3**0.5 * rng.normal(size=SHAPE)
     errors = std_px * (common + 0.7**0.5 * rng.normal(size=(1 + max(views, 1), *SHAPE)))
     found = [((each - errors[0]) / 50).astype(np.float32) for each in errors[1:]]
-    agreement = evaluate_consistency(parallax, found)
+    agreement = evaluate_consistency(SHAPE, [(each, parallax) for each in found])
     if not views:  # Without consistent views, only the error of the map remains.
         agreement = replace(agreement, views=np.zeros(SHAPE, np.uint16))
     mean = errors[: 1 + views].mean(axis=0)
@@ -67,7 +68,20 @@ def test_std_px_accounts_for_correlated_errors(views: int) -> None:
 
 def test_std_px_includes_pose_error() -> None:
     parallax, found = np.ones(SHAPE, np.float32), [np.zeros(SHAPE, np.float32)] * 4
-    np.testing.assert_allclose(evaluate_consistency(parallax, found, pose_std_px=0.7).std_px, 0.7)
+    differences = [(each, parallax) for each in found]
+    np.testing.assert_allclose(evaluate_consistency(SHAPE, differences, 0.7).std_px, 0.7)
+
+
+def test_log_std_depends_on_parallax_of_consistent_views() -> None:
+    far = np.full(SHAPE, 100, np.float32)
+    far_difference = np.where(np.arange(SHAPE[1]) < 100, np.float32(0), np.float32(np.nan))
+    found = [
+        (np.zeros(SHAPE, np.float32), np.full(SHAPE, 20, np.float32)),
+        (np.broadcast_to(far_difference, SHAPE), far),
+    ]
+    log_std = evaluate_consistency(SHAPE, found, pose_std_px=1.0).log_std
+    np.testing.assert_allclose(log_std[:, :100], 1 / 100, rtol=1e-6)
+    np.testing.assert_allclose(log_std[:, 100:], 1 / 20, rtol=1e-6)
 
 
 def test_compare_depths_separates_agreement_and_near_miss() -> None:
