@@ -1,9 +1,12 @@
 """Reconstruct rendered walks through several rooms, and compare with COLMAP's mapper.
 
-    python -m benchmarks.walks [--walks 2] [--config sift] [--max-frames 70] [--records DIR]
+    python -m benchmarks.walks [--walks 2] [--look-alike 1] [--fps 20] [--config sift]
+        [--max-frames 70] [--set dense.enabled=false] [--records DIR]
 
-A walk is a video of a loop through four furnished rooms with equal doors. The video has camera
-shake, noise, exposure changes and blurred frames, and its camera poses are known. Each video is
+A walk is a video of a loop through four furnished rooms with equal doors, which ends after 1.15
+rounds. A walk past look-alike rooms ends after three rooms, the first and third of which differ in
+their pictures only. The video has camera shake, noise, exposure changes and blurred frames, and its
+camera poses are known. Each video is
 reconstructed with an unknown focal length, and the poses of all frames are compared with the true
 poses. Frames are also localized between keyframes with true poses, and depth with smooth errors of
 1.4 %. COLMAP extracts and matches SIFT features of the same keyframes (sequential matching without
@@ -46,6 +49,7 @@ from mpsfm_core.evaluation.trajectories import (
     read_trajectory,
 )
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
+from mpsfm_core.geometry.similarity import umeyama
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.inputs.video import read_selection
@@ -66,17 +70,25 @@ ROOM = np.array([4.4, 3.6])
 HEIGHT = 2.6
 DOOR = 1.0
 """Width of the door openings in meters."""
+ROUNDS, OPEN_ROUNDS = 1.15, 0.75
+"""Rounds of a walk that returns to its start, and of a walk past look-alike rooms."""
+START_ROUNDS = 0.3
+"""Part of the first round that is aligned with the true poses to measure the error of the loop."""
 _TEXTURES = 64
 Record = dict[str, Any]
 
 
-def build_rooms(rng: np.random.Generator, texture_factor: float = 1.0) -> tuple[Any, Any, Any]:
+def build_rooms(
+    rng: np.random.Generator, texture_factor: float = 1.0, *, look_alike: bool = False
+) -> tuple[Any, Any, Any]:
     """Build four rooms around the origin, each with doors to two neighbors.
 
     Args:
         rng: Generator of shapes and textures.
         texture_factor: Factor on the size of the textures of floor, ceiling and inner walls, which
             repeat in several rooms with factor 1.
+        look_alike: If true, diagonal rooms have the same walls and furniture, and differ in their
+            pictures.
     """
     from training.synthetic.builder import Builder
     from training.synthetic.furniture import FURNITURE, Frame
@@ -92,7 +104,10 @@ def build_rooms(rng: np.random.Generator, texture_factor: float = 1.0) -> tuple[
     b.box((0, 0, -0.1), (length + 1, width + 1, 0.1), look((0.8, 2)), shadow=False)
     b.box((0, 0, HEIGHT), (length + 1, width + 1, 0.1), look((1, 3)), shadow=False)
     door = b.look((1, 2))
+    seed = int(rng.integers(2**32)) if look_alike else 0
     for side in range(4):
+        if look_alike:
+            b.rng = np.random.default_rng([seed, side % 2])
         along, away = (width, length) if side % 2 == 0 else (length, width)
         yaw = np.pi + side * np.pi / 2
         outward = np.array([np.cos(yaw), np.sin(yaw)]) * -away / 2
@@ -102,7 +117,7 @@ def build_rooms(rng: np.random.Generator, texture_factor: float = 1.0) -> tuple[
             _wall(b, Frame(b, *f.at(half * along / 4, 0, 0)[:2], yaw), along / 2 - 0.4, HEIGHT)
             for offset in (-1.1, 0.2, 1.3):
                 place = f.at(half * along / 4 + offset, 0.03, 0)
-                FURNITURE[rng.integers(len(FURNITURE))](b, place[0], place[1], yaw)
+                FURNITURE[b.rng.integers(len(FURNITURE))](b, place[0], place[1], yaw)
         # An interior wall from the outer wall to the center, with a door opening in its middle.
         inner = Frame(b, *(outward / 2), yaw + np.pi / 2)
         half_length = away / 2
@@ -111,9 +126,11 @@ def build_rooms(rng: np.random.Generator, texture_factor: float = 1.0) -> tuple[
             u = end * (DOOR + part) / 2
             wall = look((0.6, 2))
             b.box(inner.at(u, 0, 0), (0.12, part, HEIGHT), wall, inner.yaw, shadow=False)
+            room_rng, b.rng = b.rng, rng
             for face in (-1, 1):
                 picture = inner.at(u, 0.065 * face, rng.uniform(1.0, 1.4))
                 b.box(picture, (0.02, *rng.uniform(0.4, 0.9, 2)), b.look((0.4, 0.9)), inner.yaw)
+            b.rng = room_rng
             b.box(inner.at(end * (DOOR / 2 - 0.03), 0, 0), (0.16, 0.06, 2.1), door, inner.yaw)
         b.box(inner.at(0, 0, 2.1), (0.12, DOOR, HEIGHT - 2.1), look((0.6, 2)), inner.yaw)
     # Without lamps there are no shadows to compute, which is several times faster.
@@ -122,21 +139,21 @@ def build_rooms(rng: np.random.Generator, texture_factor: float = 1.0) -> tuple[
     return b.arrays(make_textures(rng, _TEXTURES, ()))
 
 
-def make_path(rng: np.random.Generator, rounds: float = 1.15) -> list[Pose]:
+def make_path(rng: np.random.Generator, rounds: float = ROUNDS, fps: float = FPS) -> list[Pose]:
     """Return ``cam_from_world`` of each frame of a walk around the center through all rooms."""
     a, c = ROOM / 2
     perimeter = 4 * (a + c)
-    count = int(rounds * perimeter / SPEED * FPS)
+    count = int(rounds * perimeter / SPEED * fps)
     turn = np.linspace(0, 2 * np.pi * rounds, count)
     # A rounded rectangle through the middle of the door openings.
     stretch = 1.0 / np.maximum(np.abs(np.cos(turn)), np.abs(np.sin(turn))) ** 0.6
     xy = np.column_stack([a * np.cos(turn) * stretch, c * np.sin(turn) * stretch])
-    xy = cv2.GaussianBlur(xy, (1, 0), sigmaX=1e-6, sigmaY=0.25 * FPS, borderType=cv2.BORDER_REFLECT)
+    xy = cv2.GaussianBlur(xy, (1, 0), sigmaX=1e-6, sigmaY=0.25 * fps, borderType=cv2.BORDER_REFLECT)
     heading = np.gradient(xy, axis=0)
     yaw = np.unwrap(np.arctan2(heading[:, 1], heading[:, 0]))
     yaw = yaw - 0.35 + 0.45 * np.sin(4 * turn + rng.uniform(0, 6))
     shake = rng.normal(size=(count, 6))
-    shake = cv2.GaussianBlur(shake, (1, 0), sigmaX=1e-6, sigmaY=0.12 * FPS)
+    shake = cv2.GaussianBlur(shake, (1, 0), sigmaX=1e-6, sigmaY=0.12 * fps)
     shake *= np.array([0.02, 0.02, 0.02, 0.012, 0.012, 0.012]) / shake.std(axis=0)
     poses = []
     for place, angle, (dx, dy, dz, pitch, roll, extra) in zip(xy, yaw, shake, strict=True):
@@ -186,21 +203,25 @@ def render_frames(
         yield frame.clip(0, 255).astype(np.uint8)[:, :, ::-1]
 
 
-def make_walk(seed: int) -> tuple[tuple[Any, Any, Any], list[Pose], np.random.Generator]:
+def make_walk(
+    seed: int, fps: float = FPS, *, look_alike: bool = False
+) -> tuple[tuple[Any, Any, Any], list[Pose], np.random.Generator]:
     """Return the rooms and the true poses of a walk, and the generator of the image noise."""
     rng = np.random.default_rng([seed, 51])
-    world = build_rooms(rng)
-    return world, make_path(rng), rng
+    world = build_rooms(rng, look_alike=look_alike)
+    return world, make_path(rng, OPEN_ROUNDS if look_alike else ROUNDS, fps), rng
 
 
-def write_walk(folder: Path, seed: int) -> tuple[Path, list[Pose]]:
+def write_walk(
+    folder: Path, seed: int, fps: float = FPS, *, look_alike: bool = False
+) -> tuple[Path, list[Pose]]:
     """Write the video of a walk, unless the folder has the video; return video and true poses."""
-    world, poses, rng = make_walk(seed)
-    video = folder / f"walk{seed}.mp4"
+    world, poses, rng = make_walk(seed, fps, look_alike=look_alike)
+    video = folder / f"{'look_alike' if look_alike else 'walk'}{seed}.mp4"
     if not video.is_file():
         folder.mkdir(parents=True, exist_ok=True)
         part = video.with_suffix(".part.mp4")
-        writer = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"mp4v"), FPS, SIZE)
+        writer = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"mp4v"), fps, SIZE)
         for frame in render_frames(world, poses, rng):
             writer.write(np.ascontiguousarray(frame))
         writer.release()
@@ -237,13 +258,13 @@ def write_room(folder: Path) -> tuple[Path, dict[int, Pose]]:
     return video, rows
 
 
-def localize_between_true_keyframes(video: Path, seed: int) -> Record:
+def localize_between_true_keyframes(video: Path, seed: int, fps: float = FPS) -> Record:
     """Localize the frames of a walk between keyframes with true poses; return quantiles of errors.
 
     The quantiles are 0.5 and 0.9 of the position error in meters, of the rotation error in degrees,
     and of the position error in predicted standard deviations (root mean square of three axes).
     """
-    world, poses, _ = make_walk(seed)
+    world, poses, _ = make_walk(seed, fps)
     folder, rng = video.with_suffix("") / "frames", np.random.default_rng(seed)
     selection = read_selection(folder)
     camera = PinholeCamera(*SIZE, FOCAL_PX, FOCAL_PX, SIZE[0] / 2, SIZE[1] / 2)
@@ -285,15 +306,23 @@ def localize_between_true_keyframes(video: Path, seed: int) -> Record:
 
 
 def run_walk(
-    video: Path, poses: Mapping[int, Pose], fps: float, config: str, max_frames: int
+    video: Path, poses: Mapping[int, Pose], fps: float, config: str, settings: Sequence[str]
 ) -> Record:
-    """Reconstruct a video with MP-SfM, and its keyframes with COLMAP; return the errors."""
+    """Reconstruct a video with MP-SfM, and its keyframes with COLMAP; return the errors.
+
+    Args:
+        video: The video.
+        poses: True poses ``cam_from_world`` by frame number.
+        fps: Frame rate.
+        config: Name of the configuration of MP-SfM.
+        settings: Settings that change the configuration.
+    """
     truth = Trajectory(np.array(sorted(poses)) / fps, tuple(poses[n] for n in sorted(poses)))
     output = video.with_suffix("")
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start = time.monotonic()
     arguments = ["reconstruct", str(video), "-o", str(output), "--config", config, "--quiet"]
-    arguments += ["--set", f"inputs.video.max_frames={max_frames}"]
+    arguments += [part for setting in settings for part in ("--set", setting)]
     subprocess.run([*MPSFM, *arguments], check=False)
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     summary = read_summary(output / "summary.json")
@@ -336,32 +365,65 @@ def _evaluate_model(folder: Path, poses: Mapping[int, Pose]) -> Record:
     numbered = {str(int(Path(name).stem[-6:])): pose for name, pose in found.items()}
     truth = {str(number): pose for number, pose in poses.items()}
     errors = trajectory_errors(numbered, truth)
-    return {"registered": len(found), "ate": None if errors is None else errors.ate_rmse}
+    return {
+        "registered": len(found),
+        "ate": None if errors is None else errors.ate_rmse,
+        "max": None if errors is None else float(errors.centers.max()),
+        "loop": measure_loop_error(numbered, truth),
+    }
+
+
+def measure_loop_error(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> float | None:
+    """Measure the median error of the keyframes after the first round of a walk, in meters.
+
+    The model is aligned with the true poses of the keyframes at the start of the first round, so
+    the error is the drift of one round if the loop is not closed.
+
+    Args:
+        found: Estimated poses ``cam_from_world`` by frame number.
+        truth: True poses of all frames of the walk by frame number.
+
+    Returns:
+        The error, or None if too few keyframes at the start and at the end have a pose.
+    """
+    start, end = (rounds / ROUNDS * len(truth) for rounds in (START_ROUNDS, 1.0))
+    first = [name for name in found if name in truth and int(name) < start]
+    last = [name for name in found if name in truth and int(name) >= end]
+    if len(first) < 3 or not last:
+        return None
+    centers, true_centers = (
+        np.stack([camera_center(*poses[name]) for name in [*first, *last]])
+        for poses in (found, truth)
+    )
+    similarity = umeyama(centers[: len(first)], true_centers[: len(first)])
+    offsets = similarity.apply(centers) - true_centers
+    return float(np.median(np.linalg.norm(offsets[len(first) :], axis=1)))
 
 
 def make_table(records: Sequence[Record]) -> str:
     """Format the results of all videos as a Markdown table with one row per video."""
     lines = [
-        "| video | frames | keyframes | placed | ATE all | ATE keyframes | WATE-AUC 10 m, full | "
-        "COLMAP keyframes | ATE | memory GB | CPU s, COLMAP | CPU min per min |",
-        "| --- |" + " ---: |" * 11,
+        "| video | frames | keyframes | placed | ATE all | WATE-AUC 10 m, full | "
+        "keyframes in the model, ATE, maximum, loop | COLMAP | memory GB | CPU s, COLMAP | "
+        "CPU min per min |",
+        "| --- |" + " ---: |" * 10,
     ]
     for record in records:
         video, found = record["video"], record.get("mpsfm")
-        theirs = record.get("colmap", {"registered": 0, "ate": None})
         keyframes, minutes = video["keyframes"], video["duration_s"] / 60
         cells = [record["walk"], video["frames"], keyframes]
         if found is None:
-            cells += ["0 %", *["none"] * 3]
+            cells += ["0 %", *["none"] * 2]
         else:
             areas = found["wate_auc"]
             cells += [
                 f"{100 * found['poses'] / video['frames']:.1f} %",
                 f"{100 * found['ate_rmse']:.1f} cm",
-                f"{_centimeters(record['keyframes']['ate'])}",
                 f"{areas.get('10', float('nan')):.1f}, {areas['full']:.1f}",
             ]
-        cells += [f"{theirs['registered']} of {keyframes}", _centimeters(theirs["ate"])]
+        for model in (record.get("keyframes"), record.get("colmap")):
+            values = [_centimeters((model or {}).get(name)) for name in ("ate", "max", "loop")]
+            cells += [", ".join([f"{(model or {}).get('registered', 0)} of {keyframes}", *values])]
         cells += [f"{record['memory_mb'] / 1024:.1f}"]
         cells += [f"{record['cpu_seconds']:.0f}, {record['colmap_cpu_seconds']:.0f}"]
         cells += [f"{record['cpu_seconds'] / 60 / minutes:.1f}"]
@@ -382,28 +444,33 @@ def main() -> None:
     """Reconstruct all videos and print a table in Markdown."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--walks", type=int, default=2)
+    parser.add_argument("--look-alike", type=int, default=0, help="walks past look-alike rooms")
+    parser.add_argument("--fps", type=float, default=FPS)
     parser.add_argument("--config", default="sift")
     parser.add_argument("--max-frames", type=int, default=70)
+    parser.add_argument("--set", dest="settings", action="append", default=[])
     parser.add_argument("--records", type=Path)
     arguments = parser.parse_args()
+    settings = [f"inputs.video.max_frames={arguments.max_frames}", *arguments.settings]
+    config, fps = arguments.config, arguments.fps
+    walks = [(seed, False) for seed in range(arguments.walks)]
+    walks += [(seed, True) for seed in range(arguments.look_alike)]
     with tempfile.TemporaryDirectory() as temporary:
         folder, records = arguments.records or Path(temporary), []
-        for number in range(arguments.walks + 1):
-            name = f"walk{number}" if number < arguments.walks else "hololens_room"
-            path = folder / f"{name}-{arguments.config}.json"
+        for seed, look_alike in walks:
+            path = folder / f"{'look_alike' if look_alike else 'walk'}{seed}-{config}.json"
             if not path.is_file():
-                if number < arguments.walks:
-                    video, walk = write_walk(folder, number)
-                    record = run_walk(
-                        video, dict(enumerate(walk)), FPS, arguments.config, arguments.max_frames
-                    )
-                    record["true_keyframes"] = localize_between_true_keyframes(video, number)
-                else:
-                    record = run_walk(
-                        *write_room(folder), 4.0, arguments.config, arguments.max_frames
-                    )
+                video, walk = write_walk(folder, seed, fps, look_alike=look_alike)
+                record = run_walk(video, dict(enumerate(walk)), fps, config, settings)
+                if not look_alike:
+                    record["true_keyframes"] = localize_between_true_keyframes(video, seed, fps)
                 path.write_text(json.dumps(record))
             records.append(json.loads(path.read_text()))
+        path = folder / f"hololens_room-{config}.json"
+        if not path.is_file():
+            record = run_walk(*write_room(folder), 4.0, config, settings)
+            path.write_text(json.dumps(record))
+        records.append(json.loads(path.read_text()))
     print(make_table(records))
 
 

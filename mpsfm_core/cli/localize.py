@@ -13,7 +13,9 @@ from mpsfm_core.cli.errors import handle_sigterm
 
 def localize(
     model: Annotated[Path, typer.Argument(help="COLMAP model, or mpsfm result folder.")],
-    photos: Annotated[Path, typer.Argument(help="Folder of the photos to localize, or one photo.")],
+    photos: Annotated[
+        Path, typer.Argument(help="Folder of the photos to localize, one photo, or a video.")
+    ],
     output: Annotated[
         Path, typer.Option("--output", "-o", metavar="DIR", help="Write the poses here.")
     ],
@@ -59,7 +61,8 @@ def localize(
 
     Writes DIR/poses.txt in the format of hloc (NAME qw qx qy qz tx ty tz), DIR/localization.json
     with covariances, inliers and the reason for each photo without pose, and the COLMAP model
-    DIR/sparse. The first call writes the model's points and depth to MODEL/localization.npz.
+    DIR/sparse. The poses of all frames of a video are in DIR/trajectory.txt. The first call writes
+    the model's points and depth to MODEL/localization.npz.
     """
     from mpsfm_core.cli.progress import show_progress
     from mpsfm_core.pipeline.localize import localize as run
@@ -89,5 +92,8 @@ def localize(
     for name, photo in result.photos.items():
         for doubt in photo.doubts:
             typer.echo(f"doubtful: {name}: {explain(doubt).text} {explain(doubt).remedy}")
+    if result.frames:
+        located = sum(frame.pose is not None for frame in result.frames)
+        typer.echo(f"{located} of {len(result.frames)} frames of the video localized")
     total = len(result.photos) + len(result.reasons)
     typer.echo(f"{len(result.photos)} of {total} photos localized; written to {output}")

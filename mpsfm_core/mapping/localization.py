@@ -12,7 +12,8 @@ model that are triangulated or lifted from the depth of a single image of the mo
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +27,8 @@ from mpsfm_core.mapping.events import MappingEvents, NullMappingEvents
 from mpsfm_core.mapping.initialization.initial_pair import InitialPairSelector
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.filtering import filter_points, find_lost_images
+from mpsfm_core.mapping.scene.conversion import convert_scene
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks
 
@@ -180,6 +183,29 @@ class Localizer:
         Returns:
             The localized image or the reason why it has no pose, for each of the images.
         """
+        with self._placed(images) as outcomes:
+            return outcomes
+
+    def localize_sequence(
+        self, images: Sequence[int]
+    ) -> tuple[list[LocalizedImage | Reason], Reconstruction]:
+        """Localize images as :meth:`localize_together`, and copy their points and depth.
+
+        Args:
+            images: Indices of the images in the mapping problem.
+
+        Returns:
+            The outcome for each image, and the reconstruction of the localized images in the world
+            of the model.
+        """
+        with self._placed(images) as outcomes:
+            part = convert_scene(self._component.scene, keep_units=True)
+        localized = tuple(image for image in part.images if image.index in images)
+        return outcomes, replace(part, images=localized)
+
+    @contextmanager
+    def _placed(self, images: Sequence[int]) -> Iterator[list[LocalizedImage | Reason]]:
+        """Register images, yield the outcome for each of them, and restore the model."""
         maintenance, scene = self._component.maintenance, self._component.scene
         before = maintenance.state()
         candidates = scene.mask(list(images))
@@ -196,8 +222,8 @@ class Localizer:
             else self._log.image_reasons[scene.problem.images[image].name]
             for image in images
         ]
+        yield outcomes
         maintenance.restore(before)
-        return outcomes
 
     def _register(self, candidates: Bool) -> None:
         """Register as many of the candidates as possible."""

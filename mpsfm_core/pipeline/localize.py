@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,7 @@ from mpsfm_core.inputs.image_search import check_output_folder, find_images
 from mpsfm_core.inputs.images import ImageSet, SourceImage, load_images
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.models import reconstruction_poses
+from mpsfm_core.inputs.video import extract_frames, is_video, read_selection
 from mpsfm_core.mapping.localization import (
     FixedModel,
     LocalizedImage,
@@ -40,9 +42,11 @@ from mpsfm_core.mapping.localization import (
     snap_to_observations,
     triangulate_model,
 )
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.mapping.state import flatten_state, unflatten_state
 from mpsfm_core.pipeline.provider_resolution import resolve_providers
 from mpsfm_core.pipeline.stages import Stages
+from mpsfm_core.pipeline.trajectory import localize_frames
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.report.reasons import explain
 from mpsfm_core.results.exports.source import ExportSource
@@ -53,6 +57,8 @@ from mpsfm_core.results.localization import (
     find_pose_doubts,
     write_localization,
 )
+from mpsfm_core.results.original_images import OriginalImages
+from mpsfm_core.results.trajectory import TrajectoryFrame
 from mpsfm_core.support.files import lock_output_folder, replace_entries
 from mpsfm_core.support.format_versions import VERSION
 from mpsfm_core.support.npz import read_npz, write_npz
@@ -84,6 +90,8 @@ class LocalizationResult:
     """Copy of the model with the localized photos, or None without the option ``extend``."""
     output: Path | None
     """Folder of the written files, or None if nothing was written."""
+    frames: tuple[TrajectoryFrame, ...] = ()
+    """Frames of the localized video with their poses, empty without a video."""
 
 
 def localize(
@@ -116,8 +124,9 @@ def localize(
 
     Args:
         model: COLMAP model with at least two images, or result folder.
-        photos: Folder of the photos to localize, or one photo.
-        output: Folder for the poses, or None to write nothing.
+        photos: Folder of the photos to localize, one photo, or a video. The keyframes of a video
+            are a sequence, and its other frames are localized between the keyframes.
+        output: Folder for the poses, or None to write nothing. A video needs a folder.
         config: Name of a shipped configuration, a YAML file, or a loaded configuration. The block
             ``fast_pass`` is not used.
         images: Folder of the images of the model, by default the folder that the run of the result
@@ -178,11 +187,17 @@ def localize(
             if Path(photos).is_dir():
                 check_output_folder(folder, Path(photos))
             stack.enter_context(lock_output_folder(folder))
+        video = Path(photos) if is_video(Path(photos)) else None
+        if video is not None and folder is None:
+            raise InputError(f"{video}: the frames of a video need an output folder")
         source = ExportSource.read(Path(model), None if images is None else Path(images))
         with stages.stage("providers"):
             config = config.model_copy(update={"fast_pass": None})
             config = resolve_providers(config, registry, stages).config
         run = _Localization(source, config, registry, stages)
+        if video is not None:
+            assert folder is not None
+            photos, sequence = run.extract_keyframes(video, folder), True
         queries = run.load_queries(Path(photos), given_cameras)
         if extend:
             _require_new_names(source, queries)
@@ -196,14 +211,15 @@ def localize(
                 else:
                     found[name] = outcome
         extended = extend_model(source.model, found) if extend else None
+        frames = [] if video is None else run.localize_frames(video, Path(photos))
         if folder is not None:
             with replace_entries(folder, ENTRIES) as scratch:
                 described = {
                     name: {**reason.to_json(), "text": explain(reason).text}
                     for name, reason in reasons.items()
                 }
-                write_localization(scratch, found, described, extended)
-    return LocalizationResult(found, reasons, extended, folder)
+                write_localization(scratch, found, described, extended, frames)
+    return LocalizationResult(found, reasons, extended, folder, tuple(frames))
 
 
 class _Localization:
@@ -214,6 +230,7 @@ class _Localization:
     ) -> None:
         self._source, self._config = source, config
         self._registry, self._stages = registry, stages
+        self._sequence: tuple[Reconstruction, OriginalImages] | None = None
         with stages.stage("inputs"):
             self._references = self._load_references()
 
@@ -233,6 +250,23 @@ class _Localization:
         with self._stages.stage("inputs"):
             queries = load_images(folder, cameras, options=self._config.inputs, names=names)
         return estimate_focal_lengths(queries, self._config, self._registry, self._stages)
+
+    def extract_keyframes(self, video: Path, output: Path) -> Path:
+        """Write the keyframes of a video into the output folder, and return their folder."""
+        with self._stages.stage("video"):
+            progress = partial(self._stages.stage_progress, "video")
+            return extract_frames({"": video}, output, self._config.inputs.video, progress)
+
+    def localize_frames(self, video: Path, keyframes: Path) -> list[TrajectoryFrame]:
+        """Localize the frames of a video between its keyframes, which are localized before."""
+        every = self._config.inputs.video.trajectory_every
+        if self._sequence is None or not every:
+            return []
+        part, originals = self._sequence
+        with self._stages.stage("trajectory"):
+            progress = partial(self._stages.stage_progress, "trajectory")
+            selection = read_selection(keyframes)
+            return localize_frames(video, selection, [part], originals, every, progress)
 
     def split(self, queries: ImageSet, *, sequence: bool) -> Iterator[ImageSet]:
         """Yield the photos in batches, or all photos of a sequence."""
@@ -279,7 +313,13 @@ class _Localization:
         with self._stages.stage("localization"):
             localizer = Localizer(problem, model, self._config.mapper_options())
             if sequence:
-                outcomes = localizer.localize_together(rows)
+                outcomes, part = localizer.localize_sequence(rows)
+                images = [
+                    replace(image, name=names[image.index - num_references])
+                    for image in part.images
+                ]
+                part = replace(part, images=tuple(images))
+                self._sequence = part, OriginalImages(queries, problem)
             else:
                 outcomes = []
                 for done, row in enumerate(rows):

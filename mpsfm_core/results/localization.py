@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,9 @@ from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Float64, Pose
 from mpsfm_core.data.decisions import DoubtReason, Reason
+from mpsfm_core.data.result_layout import FRAME_TABLE, TRAJECTORY
 from mpsfm_core.results.colmap_model import write_model
+from mpsfm_core.results.trajectory import TrajectoryFrame, write_trajectory
 from mpsfm_core.support.format_versions import VERSION
 
 FORMAT = 1
@@ -27,7 +29,7 @@ MODEL = "sparse"
 """COLMAP model of the localized images."""
 EXTENDED = "extended"
 """COLMAP model in which the images were localized, with the localized images."""
-ENTRIES = (POSES, REPORT, MODEL, EXTENDED)
+ENTRIES = (POSES, REPORT, MODEL, EXTENDED, TRAJECTORY, FRAME_TABLE)
 """All files and folders that localization writes."""
 MAX_DISTANCE_PX = 2.0
 """Largest distance between a matched keypoint and a keypoint of the model that observes a 3D point,
@@ -128,6 +130,7 @@ def write_localization(
     photos: Mapping[str, LocalizedPhoto],
     reasons: Mapping[str, Mapping[str, Any]],
     extended: pycolmap.Reconstruction | None,
+    frames: Sequence[TrajectoryFrame] = (),
 ) -> None:
     """Write poses, COLMAP models and report of localized photos into a folder.
 
@@ -136,6 +139,7 @@ def write_localization(
         photos: Localized photos by name.
         reasons: Code, fields and text of the reason why a photo has no pose, by name.
         extended: Model with the localized photos, or None to write no such model.
+        frames: Frames of the video whose keyframes are the photos, empty without a video.
     """
     rows = [
         " ".join([name, *map(repr, [*photo.quaternion.tolist(), *photo.pose[1].tolist()])])
@@ -151,6 +155,8 @@ def write_localization(
     write_model(folder / MODEL, extend_model(pycolmap.Reconstruction(), photos))
     if extended is not None:
         write_model(folder / EXTENDED, extended)
+    if frames:
+        write_trajectory(folder, frames)
 
 
 def extend_model(

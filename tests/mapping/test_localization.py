@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.data import MappingProblem, PinholeCamera, VerifiedPair
+from mpsfm_core.data import Float64, MappingProblem, PinholeCamera, VerifiedPair
 from mpsfm_core.data.decisions import ImageReason, Reason
-from mpsfm_core.geometry import camera_center, rotation_angle_deg
+from mpsfm_core.geometry import camera_center, project, rotation_angle_deg, transform
 from mpsfm_core.mapping.localization import (
     FixedModel,
     LocalizedImage,
@@ -18,6 +18,7 @@ from mpsfm_core.mapping.localization import (
     triangulate_model,
 )
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -54,6 +55,11 @@ def locate(problem: MappingProblem, model: FixedModel) -> LocalizedImage:
     outcome = Localizer(problem, model, OPTIONS).localize(QUERY)
     assert isinstance(outcome, LocalizedImage)
     return outcome
+
+
+def reprojection(image: RegisteredImage, points: Float64) -> Float64:
+    """Project points (n, 3) in the world to pixels (n, 2) of an image."""
+    return project(image.camera, transform(image.rotation, image.translation, points))
 
 
 def center_error(image: LocalizedImage) -> float:
@@ -177,4 +183,11 @@ def test_localize_together_reaches_an_image_by_another_query(problem: MappingPro
     outcomes = localizer.localize_together([chain, QUERY])
     assert all(isinstance(outcome, LocalizedImage) for outcome in outcomes)
     assert isinstance(outcomes[1], LocalizedImage) and center_error(outcomes[1]) < 0.05
+    _, part = localizer.localize_sequence([chain, QUERY])
+    assert [image.index for image in part.images] == [chain, QUERY]
+    last = part.images[-1]
+    observed = last.point_ids >= 0
+    keypoints = problem.images[QUERY].keypoints[observed]
+    errors = reprojection(last, part.points[last.point_ids[observed]]) - keypoints
+    assert observed.sum() > 30 and np.median(np.linalg.norm(errors, axis=1)) < 2
     assert isinstance(localizer.localize(QUERY), Reason)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +12,13 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
+from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner
 
 import mpsfm_core
 from mpsfm_core import InputError
 from mpsfm_core.cli import build_app
+from mpsfm_core.data import Float64
 from mpsfm_core.data.decisions import DoubtReason, ImageReason
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
 from mpsfm_core.geometry.pycolmap_conversion import pose_from
@@ -146,6 +149,70 @@ def test_extension_by_a_photo_with_the_name_of_an_image_is_refused(
     photo = SAMPLE / "images" / MODEL_NAMES[0]
     with pytest.raises(InputError, match="already has an image 'view_0"):
         mpsfm_core.localize(folder / "model", photo, extend=True, **arguments)
+
+
+def turn(angle_deg: float) -> Float64:
+    """Return the rotation of a camera about its vertical axis."""
+    return Rotation.from_euler("y", angle_deg, degrees=True).as_matrix()
+
+
+def write_turning_camera(folder: Path, angles_deg: Sequence[float]) -> Path:
+    """Write a video of the camera of the query that turns, and the depth of its frames."""
+    image = cv2.imread(str(SAMPLE / "images" / QUERY))
+    depth = np.load(SAMPLE / "priors" / "depth" / QUERY.replace("jpg", "npz"))["depth"]
+    calibration = np.array([[540.0, 0, 320], [0, 540, 240], [0, 0, 1]])
+    small = np.diag([0.5, 0.5, 1]) @ calibration
+    writer = cv2.VideoWriter(
+        str(folder / "turn.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 10, (640, 480)
+    )
+    for number, angle_deg in enumerate(angles_deg):
+        rotation = turn(angle_deg)
+        homography = calibration @ rotation @ np.linalg.inv(calibration)
+        writer.write(cv2.warpPerspective(image, homography, (640, 480)))
+        homography = small @ rotation @ np.linalg.inv(small)
+        warped = cv2.warpPerspective(
+            depth.astype(np.float32), homography, (320, 240), flags=cv2.INTER_NEAREST
+        )
+        # the depth of a pixel is the z coordinate in the turned camera
+        xy = np.stack(
+            [*np.meshgrid(np.arange(320) + 0.5, np.arange(240) + 0.5), np.ones_like(warped)]
+        )
+        before = np.tensordot(rotation.T @ np.linalg.inv(small), xy, 1)[2]
+        warped = np.where(before > 0, warped / before, 0).astype(np.float32)
+        valid = warped > 0
+        np.savez(
+            folder / f"frame_{number:06d}.npz",
+            depth=warped,
+            variance=(0.05 * warped) ** 2,
+            valid=valid,
+        )
+    writer.release()
+    return folder / "turn.avi"
+
+
+def test_frames_of_a_video_get_their_true_poses(
+    folder: Path, arguments: dict[str, Any], tmp_path: Path
+) -> None:
+    angles_deg = np.linspace(-4, 4, 9)
+    video = write_turning_camera(tmp_path, angles_deg)
+    for file in (SAMPLE / "priors" / "depth").iterdir():
+        shutil.copy(file, tmp_path)
+    settings = [f"depth.options.directory={tmp_path}", "inputs.video.motion=0.04"]
+    overrides = {"overrides": [*arguments["overrides"], *settings]}
+    database = tmp_path / "localization.npz"
+    with pytest.raises(InputError, match="need an output folder"):
+        mpsfm_core.localize(folder / "model", video, **{**arguments, **overrides})
+    result = mpsfm_core.localize(
+        folder / "model", video, tmp_path / "out", database=database, **{**arguments, **overrides}
+    )
+    assert 2 <= len(result.photos) < len(angles_deg) and not result.reasons
+    pose = reconstruction_poses(pycolmap.Reconstruction(str(SAMPLE / "gt")))[QUERY]
+    assert len(result.frames) == len(angles_deg)
+    for frame, angle_deg in zip(result.frames, angles_deg, strict=True):
+        assert frame.pose is not None and frame.source in ("keyframe", "tracked")
+        assert rotation_angle_deg(frame.pose[0] @ (turn(angle_deg) @ pose[0]).T) < 0.5
+        assert np.linalg.norm(camera_center(*frame.pose) - camera_center(*pose)) < 0.08
+    assert len((tmp_path / "out" / "trajectory.txt").read_text().splitlines()) == 10
 
 
 def test_command_lists_photos_without_pose(
