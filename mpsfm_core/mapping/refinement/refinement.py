@@ -493,7 +493,8 @@ class Refiner:
         images = [int(i) for i in self.scene.registered_images()]
         complete_and_merge_tracks(self.scene, self.triangulation, create=True)
         lift_low_parallax(self.scene, self.triangulation)
-        if self.can_refine_focals():
+        refines_focals = self.can_refine_focals()
+        if refines_focals:
             self.adjust(images, focal=True)
         for _ in range(MAX_GLOBAL_REFINEMENTS):
             self.estimate_shared_scales()
@@ -501,7 +502,11 @@ class Refiner:
             self._measure_noise()
             if self._alternates:
                 self.integrate(images)
-            self.adjust(images, depth_scale=FINAL_DEPTH_SCALE if final else 1.0)
+            self.adjust(
+                images,
+                focal=refines_focals and not self._alternates,
+                depth_scale=FINAL_DEPTH_SCALE if final else 1.0,
+            )
             changed = filter_points(self.scene, self.triangulation)
             changed += complete_and_merge_tracks(self.scene, self.triangulation)
             if changed < MAX_GLOBAL_CHANGE * max(self._num_observations(), 1):
