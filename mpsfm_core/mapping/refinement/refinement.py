@@ -313,7 +313,7 @@ class Refiner:
             self._scale_losses(),
             ~mask_guessed_focals(scene, bundle.representatives),
             np.array([image.camera.size for image in cameras], dtype=np.float64),
-            self.std_factor / self.noise.std_factor,
+            self.noise.design_effect**-0.5,
         )
         if errors is not None:
             predicted.pose_deg[bundle.images] = errors.pose_deg
