@@ -21,9 +21,11 @@ class VideoOptions(Options):
     overlap: float = expert(0.7, gt=0, lt=1)
     """Share of still tracked points below which the next frame is selected. A larger share of
     tracked points selects more frames."""
-    max_frames: int = Field(300, ge=2)
+    max_frames: int | None = Field(None, ge=2)
     """Maximum number of keyframes of a video. If more keyframes are selected, those with the least
-    motion are dropped. More keyframes take proportionally more time. [ours]"""
+    motion are dropped. Without a maximum (null), keyframes beyond 300 are dropped as long as
+    neighbors still overlap, and keyframes beyond 1000 always. More keyframes take proportionally
+    more time and memory. [ours]"""
     trajectory_every: int = Field(1, ge=0)
     """Interval of the video frames whose poses are written to ``trajectory.txt``; 1 localizes all
     frames, and 0 writes no trajectory."""

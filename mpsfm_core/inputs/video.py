@@ -54,6 +54,12 @@ _MIN_POINTS = 20
 """Minimum number of tracked points to measure the motion of a frame."""
 _MAX_CANDIDATES = 300
 """Maximum number of candidate frames in memory, ten seconds of most videos."""
+_NUM_KEYFRAMES, _MAX_KEYFRAMES = 300, 1000
+"""Number of keyframes from which keyframes are dropped if ``max_frames`` is null, and the maximum
+number if neighbors need more to overlap, which takes about 12 GB of memory. [ours]"""
+_MAX_MOTION = 0.32
+"""Maximum motion between neighbors after keyframes are dropped, relative to the image diagonal.
+[tuned: benchmarks.walks]"""
 _MAX_CUT_RATIO = 0.2
 """Share of the points that are tracked from one frame to the next below which there may be a cut.
 [ours]"""
@@ -117,7 +123,7 @@ class VideoSelection:
     duration_s: float
     """Time stamp of the last frame in seconds."""
     num_over_budget: int = 0
-    """Number of keyframes that were dropped because of ``max_frames``."""
+    """Number of keyframes that were dropped to limit their number."""
 
     @property
     def numbers(self) -> list[int]:
@@ -263,21 +269,44 @@ def choose_frames(
             f"{video}: the camera hardly moves in its {decoded} frames. A reconstruction needs "
             f"images from several places; move the camera while filming"
         )
-    num_over_budget = max(0, len(chosen) - options.max_frames)
-    if num_over_budget:
+    kept = _limit_keyframes(video, chosen, options)
+    return VideoSelection(tuple(kept), decoded, duration_s, len(chosen) - len(kept))
+
+
+def _limit_keyframes(
+    video: Path, frames: Sequence[SelectedFrame], options: VideoOptions
+) -> list[SelectedFrame]:
+    """Drop keyframes beyond ``max_frames``, and warn if neighbors may not overlap any more."""
+    max_gap = max(1.0, _MAX_MOTION / options.motion)
+    needed = thin_keyframes(frames, _NUM_KEYFRAMES, max_gap)
+    limit = options.max_frames or _MAX_KEYFRAMES
+    if options.max_frames is None and len(needed) <= limit:
+        return needed
+    kept = thin_keyframes(frames, limit)
+    num_needed = len(thin_keyframes(frames, 2, max_gap))
+    if len(kept) < num_needed:
         text = (
-            "%s: %d keyframes were selected, and the %d with the least motion are dropped; raise "
-            "inputs.video.max_frames to use all keyframes"
+            "%s: %d keyframes are too few for this video, so neighboring keyframes may not "
+            "overlap, and parts of the video may be missing; raise inputs.video.max_frames to %d, "
+            "or cut the video into clips in one folder"
         )
-        _log.warning(text, video, len(chosen), num_over_budget)
-        chosen = thin_keyframes(chosen, options.max_frames)
-    return VideoSelection(tuple(chosen), decoded, duration_s, num_over_budget)
+        _log.warning(text, video, len(kept), num_needed)
+    return kept
 
 
-def thin_keyframes(frames: Sequence[SelectedFrame], count: int) -> list[SelectedFrame]:
+def thin_keyframes(
+    frames: Sequence[SelectedFrame], count: int, max_motion: float = np.inf
+) -> list[SelectedFrame]:
     """Drop the keyframes with the least motion to both neighbors until ``count`` remain.
 
     The first and the last keyframe of a shot remain as long as other keyframes can be dropped.
+
+    Args:
+        frames: Keyframes of a video, ascending.
+        count: Number of keyframes that remain, or more if ``max_motion`` does not allow to drop
+            them.
+        max_motion: Maximum motion between neighbors in the same shot after a keyframe is dropped,
+            as :attr:`SelectedFrame.motion`.
     """
     motion = [frame.motion for frame in frames]
     before, after = list(range(-1, len(frames) - 1)), list(range(1, len(frames) + 1))
@@ -292,6 +321,8 @@ def thin_keyframes(frames: Sequence[SelectedFrame], count: int) -> list[Selected
     dropped: set[int] = set()
     while len(frames) - len(dropped) > count:
         value, row = heapq.heappop(heap)
+        if value > max_motion:
+            break
         if row in dropped or value != cost(row):
             continue  # the cost has changed since the entry was pushed
         dropped.add(row)
@@ -476,7 +507,8 @@ def read_frames(video: Path, wanted: frozenset[int] | None = None) -> Iterator[V
     with _opened(video) as capture:
         step_s = 1 / (capture.get(cv2.CAP_PROP_FPS) or _DEFAULT_FPS)
         number, time_s = 0, -np.inf
-        while capture.grab() and (wanted is None or number <= max(wanted)):
+        last = np.inf if wanted is None else max(wanted)
+        while capture.grab() and number <= last:
             stamp_s = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000
             time_s = stamp_s if stamp_s > time_s else max(time_s, -step_s) + step_s
             if wanted is None or number in wanted:

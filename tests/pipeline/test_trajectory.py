@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import cv2
@@ -63,9 +63,16 @@ def build_part(
     return part, OriginalImages(loaded, MappingProblem(tuple(images), ()))
 
 
-def localize(video: Path, folder: Path, every: int = 1) -> list[TrajectoryFrame]:
+def localize(
+    video: Path,
+    folder: Path,
+    every: int = 1,
+    numbers: Sequence[int] = KEYFRAMES,
+    cut: int = len(POSES),
+) -> list[TrajectoryFrame]:
+    """Localize the frames of the video, of which the frame ``cut`` starts the second shot."""
     reason = KeyframeReason.FIRST.because()
-    keyframes = tuple(SelectedFrame(n, n / 15, 0, reason, 1.0, 1.0) for n in KEYFRAMES)
+    keyframes = tuple(SelectedFrame(n, n / 15, int(n >= cut), reason, 1.0, 1.0) for n in numbers)
     names = {frame.number: frame.name for frame in keyframes}
     for frame in read_frames(video, frozenset(names)):
         (folder / names[frame.number]).write_bytes(encode_jpeg(frame.image))
@@ -97,6 +104,16 @@ def test_every_third_frame_and_keyframes_are_localized(video: Path, tmp_path: Pa
     frames = localize(video, tmp_path, every=3)
     tracked = {frame.number for frame in frames if frame.source == "tracked"}
     assert tracked and all(number % 3 == 0 for number in tracked)
+
+
+def test_no_pose_is_interpolated_across_a_cut(video: Path, tmp_path: Path) -> None:
+    numbers = (0, 4, BLANK + 1, 10)
+    one_shot = localize(video, tmp_path, numbers=numbers)
+    assert one_shot[BLANK].source == "interpolated"
+    two_shots = localize(video, tmp_path, numbers=numbers, cut=BLANK + 1)
+    assert two_shots[BLANK].source == "none" and two_shots[BLANK].pose is None
+    others = [frame for frame in two_shots if frame.number != BLANK]
+    assert all(frame.source in ("keyframe", "tracked") for frame in others)
 
 
 PANORAMA_SIZE = 640, 320
