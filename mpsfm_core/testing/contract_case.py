@@ -6,7 +6,8 @@ import hashlib
 import importlib
 import pickle
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from copy import deepcopy
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from functools import cached_property, lru_cache
@@ -17,7 +18,7 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from mpsfm_core.data import DepthPrior, Features, MultiViewPrior, PinholeCamera, View
+from mpsfm_core.data import Bool, DepthPrior, Features, MultiViewPrior, PinholeCamera, View
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.providers import (
     PROVIDER_KINDS,
@@ -35,7 +36,13 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.support.lru_cache import LruCache
-from mpsfm_core.testing.examples import Appearance, Example, indoor_example, outdoor_example
+from mpsfm_core.testing.examples import (
+    Appearance,
+    Example,
+    TrueMaps,
+    indoor_example,
+    outdoor_example,
+)
 from mpsfm_core.testing.ground_truth_provider import (
     GROUND_TRUTH_SPECS,
     GroundTruth,
@@ -43,7 +50,7 @@ from mpsfm_core.testing.ground_truth_provider import (
 )
 from mpsfm_core.testing.observed_instance import ObservedInstance, observe_instance
 from mpsfm_core.testing.outcome import CheckSkipped, CheckUnmeasured
-from mpsfm_core.testing.painted_views import depth_unit
+from mpsfm_core.testing.painted_views import depth_unit, normal_colors, paint_normals
 from mpsfm_core.testing.process_state import read_process_settings
 
 TruthSource = Literal["painted", "prepared", "image", "none"]
@@ -247,6 +254,19 @@ class ContractCase:
             provider = self._create(self.registry, self.kind, self.name, options)
             return self.run(self.example, provider)
 
+    def run_with_normal_colors(self, example: Example) -> tuple[Any, TrueMaps]:
+        """Run the provider on a view whose colors encode x, y and z of the normals.
+
+        Returns:
+            The output of the provider and the ground truth of the view.
+        """
+        truth = example.truth()
+        view = replace(example.view, image=paint_normals(truth.normals))
+        with normal_colors(), tempfile.TemporaryDirectory(dir=self._folder) as folder:
+            options = self._make_setup(Path(folder)).options
+            provider = self._create(self.registry, self.kind, self.name, options)
+            return self.run_on_view(view, example, provider), truth
+
     @cached_property
     def provider(self) -> Any:
         """Instance of the provider under test that all checks share."""
@@ -373,6 +393,16 @@ class ContractCase:
         source = "none" if self.truth_source == "prepared" else self.truth_source
         setup = ContractSetup(self.setup.options, source)
         return spec, setup, self._folder, self.kind, self._device
+
+    @contextmanager
+    def received_mask(self, mask: Bool) -> Iterator[None]:
+        """Pass the mask of the input view to the ground-truth provider in a ``with`` block."""
+        assert self._ground_truth is not None
+        self._ground_truth.mask = mask
+        try:
+            yield
+        finally:
+            self._ground_truth.mask = None
 
     def wrong_inputs(self) -> list[str]:
         """Return the errors of views and depth priors that a wrapper passed to its provider."""

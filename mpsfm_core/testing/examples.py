@@ -39,6 +39,8 @@ _SKY = ((120, 170, 235), (200, 220, 245))
 _HOLES = ((-0.42, -0.05, -0.28, 0.12), (0.33, 0.21, 0.52, 0.34), (-0.1, 0.38, 0.04, 0.47))
 """Rectangles (left, top, right, bottom) without ground truth in example views, in normalized image
 coordinates x / z and y / z."""
+_TILT_DEG = 20.0
+"""Upward tilt in degrees of the camera of :func:`tilted_example`."""
 _NUM_CACHED = 96
 """Number of images, and of ground-truth maps, that a process stores. Many contract checks and all
 providers of a kind use the same synthetic views of about 1 MB each."""
@@ -295,6 +297,21 @@ def outdoor_example(
     pose = look_at((0.0, 0.0, 1.6), (4.0, 0.3, 1.6 - 4.0 * np.tan(np.deg2rad(20.0))))
     camera = _off_centre_camera(size, FOCAL_RATIO)
     return Example("outdoor.png", scene, camera, _rolled(pose, 15.0), look, holes=holes)
+
+
+def tilted_example(size: tuple[int, int] = (192, 144)) -> Example:
+    """Return a synthetic view whose camera is tilted upwards above a floor.
+
+    The z component of the normals of the floor is positive, although the floor faces the camera.
+
+    Args:
+        size: Width and height of the view in pixels.
+    """
+    scene = replace(outdoor_example("painted").scene, texture=Texture(waves_per_octave=8))
+    pose = look_at((0.0, 0.0, 1.6), (4.0, 0.3, 1.6 + 4.0 * np.tan(np.deg2rad(_TILT_DEG))))
+    width, height = size
+    camera = PinholeCamera(width, height, 0.4 * width, 0.4 * width, 0.47 * width, 0.45 * height)
+    return Example("tilted.png", scene, camera, _rolled(pose, 10.0), "painted")
 
 
 def distant_example(look: Appearance, size: tuple[int, int] = (192, 144)) -> Example:

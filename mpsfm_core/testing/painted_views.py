@@ -40,6 +40,8 @@ NORMALS_STD = 0.1
 """Std of normals in rad that small test networks and prepared normal files report."""
 
 _HALF = 127.5
+_ZERO = 128
+_DECODES_NORMALS: ContextVar[bool] = ContextVar("colors encode x, y and z", default=False)
 _UNIT_M: ContextVar[float] = ContextVar("unit of decoded depth in meters", default=1.0)
 
 
@@ -55,6 +57,26 @@ def depth_unit(meters: float) -> Iterator[None]:
         yield
     finally:
         _UNIT_M.reset(token)
+
+
+@contextmanager
+def normal_colors() -> Iterator[None]:
+    """Encode x, y and z of normals as colors in a ``with`` block, instead of depth and slopes.
+
+    A test network whose weights :func:`decoder` returns in the block decodes normals of any
+    direction from the images of :func:`paint_normals`.
+    """
+    token = _DECODES_NORMALS.set(True)
+    try:
+        yield
+    finally:
+        _DECODES_NORMALS.reset(token)
+
+
+def paint_normals(normals: NDArray[Any]) -> UInt8:
+    """Encode unit normals (h, w, 3) as RGB colors (h, w, 3), zero as 128."""
+    colors: UInt8 = np.round(_ZERO + _HALF * normals).clip(0, 255).astype(np.uint8)
+    return colors
 
 
 def paint(depth: NDArray[Any], normals: NDArray[Any], valid: Bool) -> UInt8:
@@ -87,6 +109,9 @@ def decoder() -> tuple[Float64, Float64]:
     """
     step = MAX_SLOPE / _HALF
     weights = np.zeros((4, 3))
+    if _DECODES_NORMALS.get():
+        weights[1:] = np.eye(3) / _HALF
+        return weights, np.array([1.0, *np.full(3, -_ZERO / _HALF)])
     weights[0, 0], weights[1, 1], weights[2, 2] = _UNIT_M.get() * MAX_DEPTH / 255, step, step
     return weights, np.array([0.0, -MAX_SLOPE, -MAX_SLOPE, -1.0])
 

@@ -30,8 +30,14 @@ _ENVIRONMENT = "environment variables"
 _THREADS = ("the threads of OpenCV", "the threads of torch")
 """Settings of the number of threads, which a provider may set to the number in its context."""
 _NUM_THREADS = 3
+_TEMPORARY_PREFIX = "mpsfm-temporary-"
+"""Prefix of the temporary folder that an observed provider uses."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _TORCH_NUMBERS = "the random numbers of torch"
+_BACKEND_FLAGS = (True, False, True, False)
+"""Defaults of the flags that :func:`_backend_flags` returns."""
+_PILLOW_LIMIT = 89478485
+"""Default of ``PIL.Image.MAX_IMAGE_PIXELS``."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +86,16 @@ def read_process_settings() -> ProcessSettings:
             "the handlers of the root logger": list(map(id, root.handlers)),
             "the warning filters": [f for f in warnings.filters if _is_blanket(f)],
             "the gradient mode of torch": torch.is_grad_enabled() if is_loaded else True,
+            "the inference mode of torch": (
+                torch.is_inference_mode_enabled() if is_loaded else False
+            ),
             "the default type of torch": (
                 str(torch.get_default_dtype()) if is_loaded else "torch.float32"
             ),
+            "the backend flags of torch": _backend_flags(torch) if is_loaded else _BACKEND_FLAGS,
+            "the image limits of Pillow": _pillow_limits(),
+            "the level of the logger of mpsfm_core": logging.getLogger("mpsfm_core").level,
+            "the switch interval of threads": sys.getswitchinterval(),
             "standard output": id(sys.stdout),
             "standard error": id(sys.stderr),
             "the hook for uncaught exceptions": id(sys.excepthook),
@@ -113,6 +126,7 @@ def read_process_state() -> ProcessSettings:
         "the random numbers of Python": random.getstate(),
         "the files of the working directory": sorted(p.name for p in Path.cwd().iterdir()),
         "the module search path": list(sys.path),
+        "the temporary files": _list_temporary_files(),
         _ENVIRONMENT: None,
     }
     if cv2 is not None:
@@ -149,6 +163,10 @@ def known_process_state(before: ProcessSettings) -> Iterator[None]:
             stack.callback(cv2.setNumThreads, cv2.getNumThreads())
             cv2.setNumThreads(_NUM_THREADS)
         os.chdir(stack.enter_context(tempfile.TemporaryDirectory(prefix="mpsfm-state-")))
+        stack.callback(setattr, tempfile, "tempdir", tempfile.tempdir)
+        tempfile.tempdir = stack.enter_context(
+            tempfile.TemporaryDirectory(prefix=_TEMPORARY_PREFIX)
+        )
         for key in set(environment) - set(before.environment):
             del os.environ[key]
         np.random.seed(_SEED)
@@ -160,6 +178,26 @@ def known_process_state(before: ProcessSettings) -> Iterator[None]:
             os.environ.update(environment)
             np.random.set_state(numbers)
             random.setstate(python_numbers)
+
+
+def _list_temporary_files() -> list[str]:
+    """Return the names of temporary files if this process has a temporary folder of its own."""
+    folder = Path(tempfile.gettempdir())
+    return sorted(p.name for p in folder.iterdir()) if _TEMPORARY_PREFIX in folder.name else []
+
+
+def _backend_flags(torch: Any) -> tuple[bool, ...]:
+    """Return the flags of torch that choose algorithms and precision."""
+    backends = torch.backends
+    cudnn = backends.cudnn
+    return cudnn.enabled, cudnn.benchmark, cudnn.allow_tf32, backends.cuda.matmul.allow_tf32
+
+
+def _pillow_limits() -> tuple[Any, ...]:
+    """Return the limits of Pillow for the size of images and for truncated files."""
+    image, file = sys.modules.get("PIL.Image"), sys.modules.get("PIL.ImageFile")
+    limit = getattr(image, "MAX_IMAGE_PIXELS", _PILLOW_LIMIT)
+    return limit, getattr(file, "LOAD_TRUNCATED_IMAGES", False)
 
 
 def _is_blanket(rule: Any) -> bool:

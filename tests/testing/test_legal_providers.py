@@ -24,6 +24,7 @@ from mpsfm_core import (
     SparseMatches,
     View,
 )
+from mpsfm_core.data import PinholeCamera
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.providers import Capability, Kind
 from mpsfm_core.providers.builtin.mutual_nearest import mutual_nearest
@@ -34,7 +35,13 @@ from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import ContractSetup, run_checks
 from mpsfm_core.testing.contract import schedule_checks
 from mpsfm_core.testing.painted_views import read_depth, read_normals
-from tests.support.reference_providers import PaintedDepth, PaintedMask, Thumbnail, depth_prior
+from tests.support.reference_providers import (
+    PaintedDepth,
+    PaintedMask,
+    Thumbnail,
+    Wrapper,
+    depth_prior,
+)
 
 SLOW_CHECKS = {"second-process", "memory-released", "offline", "speed"}
 """Checks of the process, which are omitted because other tests cover them."""
@@ -254,6 +261,20 @@ class CautiousMask(PaintedMask):
         return cv2.erode(whole, np.ones((5, 5), np.uint8), borderValue=1) > 0
 
 
+class RotatesPortrait(Wrapper):
+    """Correct wrapper that rotates portrait views to landscape format and the map back."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        camera = view.camera
+        if camera.height <= camera.width:
+            return super().predict(view, depth)
+        size, focal = (camera.height, camera.width), (camera.fy, camera.fx)
+        turned = PinholeCamera(*size, *focal, camera.cy, camera.width - camera.cx)
+        prior = super().predict(View(view.name, np.ascontiguousarray(np.rot90(view.image)), turned))
+        maps = ((None if m is None else np.rot90(m, -1)) for m in (prior.depth, prior.variance))
+        return DepthPrior.from_arrays(*maps, np.rot90(prior.valid, -1), metric=prior.metric)
+
+
 DEPTH: tuple[Capability, ...] = ("metric", "variance")
 
 
@@ -280,6 +301,7 @@ DEPTH: tuple[Capability, ...] = ("metric", "variance")
         ("multiview", RelativeGroup, ("variance",)),
         ("retrieval", ShortDescriptor, ()),
         ("mask", CautiousMask, ()),
+        ("wrapper", RotatesPortrait, ("wraps-depth",)),
     ],
 )
 def test_legal_provider_passes_all_checks(

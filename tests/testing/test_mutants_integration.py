@@ -38,6 +38,7 @@ from tests.testing import (
     test_mutants_matching,
     test_mutants_multiview,
     test_mutants_sizes,
+    test_mutants_views,
 )
 
 PAINTED = ContractSetup(truth_source="painted")
@@ -491,6 +492,7 @@ def test_every_check_has_a_mutant(named: Callable[..., set[str]]) -> None:
         test_mutants_matching,
         test_mutants_multiview,
         test_mutants_sizes,
+        test_mutants_views,
     )
     tests = [
         test

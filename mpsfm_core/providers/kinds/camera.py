@@ -131,6 +131,7 @@ def compare_with_true_camera(
     text = f"the focal length is {prior.focal_px:.1f} px, the truth is {true_px:.1f} px"
     if error > MAX_ERROR_STD * prior.focal_std_px:
         raise DataError("focal_px", f"{text}, and the std is {prior.focal_std_px:.2g} px only")
+    _require_true_gravity(prior, example)
     return f"{text}, with a std of {prior.focal_std_px:.1f} px"
 
 
@@ -217,13 +218,7 @@ def check_camera_gravity(case: CheckedProvider) -> str:
     case.require_capability("estimates-gravity")
     case.require_truth("painted", "prepared", "image")
     prior = _require_estimate(case.run(case.example))
-    assert prior.gravity is not None and prior.gravity_std_deg is not None
-    true = -np.asarray(case.example.pose)[:, 2]
-    angle = _angle_deg(prior.gravity, true)
-    if angle > max(_GRAVITY_TOLERANCE_DEG, MAX_ERROR_STD * prior.gravity_std_deg):
-        up = "; the vector points up" if _angle_deg(-prior.gravity, true) < angle / 3 else ""
-        raise DataError("gravity", f"gravity is {angle:.0f} degrees off{up}")
-    return f"gravity is {angle:.2g} degrees off"
+    return _require_true_gravity(prior, case.example)
 
 
 def check_camera_radial(case: CheckedProvider) -> str:
@@ -251,6 +246,18 @@ CHECKS = (
 def _two_sizes(case: CheckedProvider) -> tuple[Any, Any]:
     width, height = case.example.camera.size
     return case.example.sized(width // 2, height // 2), case.example
+
+
+def _require_true_gravity(prior: CameraPrior, example: Any) -> str:
+    """Require that gravity, if a network estimates it, points along the true direction."""
+    if prior.gravity is None or prior.gravity_std_deg is None:
+        return "no gravity"
+    true = -np.asarray(example.pose)[:, 2]
+    angle = _angle_deg(prior.gravity, true)
+    if angle > max(_GRAVITY_TOLERANCE_DEG, MAX_ERROR_STD * prior.gravity_std_deg):
+        up = "; the vector points up" if _angle_deg(-prior.gravity, true) < angle / 3 else ""
+        raise DataError("gravity", f"gravity is {angle:.0f} degrees off{up}")
+    return f"gravity is {angle:.2g} degrees off"
 
 
 def _require_estimate(output: CameraPrior | None) -> CameraPrior:

@@ -24,7 +24,14 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.data import DepthPrior, MultiViewPrior, NormalPrior, PairMatches, UInt8, View
+from mpsfm_core.data import (
+    Features,
+    MultiViewPrior,
+    NormalPrior,
+    PairMatches,
+    UInt8,
+    View,
+)
 from mpsfm_core.providers import ENTRY_POINT_GROUP
 from mpsfm_core.providers.discovery import find_spec_fault
 from mpsfm_core.testing.accuracy import compare_with_truth, require_correct_matches
@@ -45,6 +52,14 @@ MAX_IMPORT_S = 2.0
 slow imports takes milliseconds; the time limit allows for a busy machine."""
 _MAX_ROUNDS = 20
 """Largest number of parallel calls in the check ``threads``."""
+_STEP_OF_EQUAL_PIXELS = 8
+"""Distance of the rows and columns at which two different views in the check ``no-state`` have
+equal pixels."""
+_PANORAMA_RATIO = 5
+"""Ratio between the sides of the views in the check ``panorama``."""
+_STRIP_SIZE = (2048, 320)
+"""Width and height in pixels of a painted view as wide as photos, whose height limits the run
+time."""
 _THREADS_TIME_S = 0.2
 """Time in seconds after which the check ``threads`` makes no further calls."""
 
@@ -154,8 +169,9 @@ def check_name_does_not_matter(case: ContractCase) -> None:
         raise CheckSkipped("the provider reads one prepared file per view name")
     example = case.small_example
     # The new name sorts after the name of the partner, the old one before.
-    renamed = replace(example.view, name="zoo/another-name.jpg", orientation=6)
-    _require_same(case.run(example), case.run_on_view(renamed, example), "of a renamed view")
+    for orientation in (6, 3, 8):
+        renamed = replace(example.view, name="zoo/another-name.jpg", orientation=orientation)
+        _require_same(case.run(example), case.run_on_view(renamed, example), "of a renamed view")
     same_name = replace(example.partner.view, name=example.name)
     auxiliary = case.make_auxiliary_input(same_name, example.partner)
     _require_same(
@@ -282,12 +298,28 @@ def check_portrait(case: ContractCase) -> str:
     return _run_and_compare(case, case.example.sized(height, width))
 
 
+def check_panorama(case: ContractCase) -> str:
+    """Require an accurate depth, normal or mask map for views with an aspect ratio of 5:1 and 1:5.
+
+    A network may stretch a panorama to its input size, but its map has to cover the whole view.
+    """
+    if not case.description.predicts_maps:
+        raise CheckSkipped("the check applies to providers of maps only")
+    width, height = case.example.camera.size
+    large = case.example.sized(2 * width, 2 * height)
+    row, column = height - height // 4, width // 2
+    wide = large.crop(0, row, 2 * width, 2 * width // _PANORAMA_RATIO)
+    tall = large.crop(column, 0, 2 * height // _PANORAMA_RATIO, 2 * height)
+    return " and ".join(_run_and_compare(case, example) for example in (wide, tall))
+
+
 def check_large_view(case: ContractCase) -> str:
     """Require accurate output for a view of 12.2 megapixels (masks) or 2.2 megapixels (others).
 
     Photos of users are usually larger than the input of a network. The large view repeats the
-    pixels of a small view, so that the ground truth is known. A view in portrait format has 0.7
-    megapixels. Wrappers and providers that read files receive a view of 0.4 megapixels.
+    pixels of a small view, so that the ground truth is known. Two painted views do not repeat
+    pixels: one in portrait format with 0.7 megapixels, and a strip of 2048 x 320 pixels for depth.
+    Wrappers and providers that read files receive a view of 0.4 megapixels.
     """
     width, height = case.example.camera.size
     if case.kind in ("features", "matcher", "retrieval"):
@@ -297,6 +329,9 @@ def check_large_view(case: ContractCase) -> str:
     # The portrait view first, because a failure of the larger view has the same cause.
     if case.truth_source == "painted":
         _run_and_compare(case, case.example.sized(5 * height, 5 * width))
+        if case.kind in ("depth", "multiview"):
+            large = case.example.sized(_STRIP_SIZE[0], _STRIP_SIZE[0] * height // width)
+            _run_and_compare(case, large.crop(0, large.camera.height // 2, *_STRIP_SIZE))
     factor = 21 if case.kind == "mask" else 9
     small, auxiliary = case.example, case.make_auxiliary_input(case.example.view, case.example)
     image = small.view.image.repeat(factor, axis=0).repeat(factor, axis=1)
@@ -349,8 +384,8 @@ def check_flat(case: ContractCase) -> None:
 def check_masked(case: ContractCase) -> None:
     """Require valid output for a view whose mask is partly or completely False.
 
-    A depth or normal map must keep at least half of its valid pixels where the mask is True.
-    Matches must remain correct.
+    A depth, normal or mask map must keep at least half of its valid pixels where the mask is True,
+    and a detector half of its keypoints. Matches must remain correct.
     """
     whole = case.run(case.example)
     for num_visible_columns in (case.example.camera.width // 2, 0):
@@ -359,10 +394,15 @@ def check_masked(case: ContractCase) -> None:
         answer = case.run_on_view(replace(case.example.view, mask=mask), case.example)
         if isinstance(answer, PairMatches):
             require_correct_matches(case, answer)
-        if not isinstance(answer, (DepthPrior, NormalPrior)) or answer.shape != whole.shape:
+        if isinstance(answer, Features):
+            _require_visible_keypoints(answer, whole, num_visible_columns)
+        valid, valid_before = (getattr(output, "valid", output) for output in (answer, whole))
+        if not isinstance(valid, np.ndarray) or valid.dtype != np.bool_:
             continue
-        columns = answer.shape[1] * num_visible_columns // case.example.camera.width
-        kept, before = answer.valid[:, :columns].sum(), whole.valid[:, :columns].sum()
+        if valid.shape != valid_before.shape:
+            continue
+        columns = valid.shape[1] * num_visible_columns // case.example.camera.width
+        kept, before = valid[:, :columns].sum(), valid_before[:, :columns].sum()
         if kept < before / 2:
             raise CheckFailed("most values are invalid at pixels where the mask is True")
 
@@ -382,6 +422,7 @@ COMMON = (
     *PROCESS_CHECKS,
     check_odd_size,
     check_portrait,
+    check_panorama,
     check_one_pixel,
     check_thin_view,
     check_large_view,
@@ -391,6 +432,15 @@ COMMON = (
     check_masked,
 )
 """Contract checks that call the provider under test, in the order to run them."""
+
+
+def _require_visible_keypoints(
+    features: Features, before: Features, num_visible_columns: int
+) -> None:
+    """Require half of the keypoints of the unmasked view in the columns where the mask is True."""
+    kept, expected = ((f.keypoints[:, 0] < num_visible_columns).sum() for f in (features, before))
+    if kept < expected / 2:
+        raise CheckFailed(f"only {kept} of {expected} keypoints remain where the mask is True")
 
 
 def _require_same(expected: object, answer: object, when: str) -> None:
@@ -410,7 +460,7 @@ def _select_valid_in_both(first: NormalPrior, second: NormalPrior) -> tuple[obje
 
 
 def _require_no_stale_output(case: ContractCase) -> None:
-    """Require another output for a view that has the borders of the example view only.
+    """Require another output for a view that has some pixels of the example view only.
 
     A provider may take both for the same view if it compares their sizes and a few pixels.
     """
@@ -422,9 +472,12 @@ def _require_no_stale_output(case: ContractCase) -> None:
         return
     image = np.array(example.view.image)
     image[2:-2, 2:-2] = other.view.image[2:-2, 2:-2]
+    image[::_STEP_OF_EQUAL_PIXELS, ::_STEP_OF_EQUAL_PIXELS] = example.view.image[
+        ::_STEP_OF_EQUAL_PIXELS, ::_STEP_OF_EQUAL_PIXELS
+    ]
     answer = case.run_on_view(replace(other.view, image=image), example, case.provider)
     if not describe_difference(before, answer):
-        raise CheckFailed("the output is that of another view with the same borders")
+        raise CheckFailed("the output is that of another view with some equal pixels")
 
 
 def _run_and_compare(case: ContractCase, example: Example) -> str:

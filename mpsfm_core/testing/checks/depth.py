@@ -281,7 +281,8 @@ def check_depth_joint(case: ContractCase) -> str:
     if not case.declares("joint-normals"):
         raise CheckSkipped("the provider does not declare 'joint-normals'")
     width, height = case.example.camera.size
-    sizes = (height, width), (149, 107), (3 * width, 3 * height)
+    sizes = (height, width), (149, 107), (3 * width, 3 * height), (5 * height, 5 * width)
+    _require_equal_masked_depth(case)
     texts = []
     for example in (case.example, *(case.example.sized(*size) for size in sizes)):
         case.prepare(example)
@@ -304,7 +305,8 @@ def check_depth_focal(case: ContractCase) -> str:
     width, height = case.example.camera.size
     common = case.example.with_common_camera()
     larger = (common.sized(factor * width, factor * height) for factor in (2, 7))
-    examples = (common, *larger, common.turned())
+    low = common.crop(0, height // 4, width, height // 2)
+    examples = (common, *larger, common.turned(), low)
     found = []
     for example in examples:
         case.prepare(example)
@@ -398,6 +400,18 @@ def _require_proportional_depth(case: ContractCase, factor: float) -> str:
                 f"{np.median(stds) * unit:.2g} times"
             )
     return f"relative error {error:.2g} at {factor:g} times the distance"
+
+
+def _require_equal_masked_depth(case: ContractCase) -> None:
+    """Require that ``predict_joint`` treats the mask of a view as ``predict`` does."""
+    mask = np.ones(case.example.view.image.shape[:2], np.bool_)
+    mask[:, : case.example.camera.width // 2] = False
+    view = replace(case.example.view, mask=mask)
+    case.prepare(case.example)
+    depth = run_joint(case.spec, case.provider, view)[0]
+    changed = describe_difference(first_depth(case.run_on_view(view, case.example)), depth)
+    if changed:
+        raise CheckFailed(f"predict_joint and predict differ for a view with a mask: {changed}")
 
 
 def _compare_joint_normals(case: ContractCase, example: Example, normals: NormalPrior) -> str:

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mpsfm_core.data import Features, Float32, Float64, Int64, View
+from mpsfm_core.data import Features, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUndecided
@@ -19,6 +19,20 @@ at most 0.08 for XFeat."""
 LARGE_SIZE = (4096, 256)
 """Width and height in pixels of a view as wide as phone photos. Networks limit the longer side; the
 small height limits the run time."""
+_CORNER_SIZE = (704, 128)
+"""Width and height in pixels of the two textured corners of the large view. The distance of both
+corners is a multiple of 64 pixels, so that both look alike to a network with a stride."""
+_MIN_MUTUAL = 30
+"""Smallest number of mutual nearest neighbors from which two equal parts of a view are compared.
+Networks with random weights have fewer."""
+_MAX_PART_SHIFT_PX = 2.0
+"""Largest accepted shift in pixels, or in median absolute deviations, between the keypoints of two
+equal parts of a view. The shift is at most 0.5 pixels for tested detectors."""
+_MAX_ROUNDING_PX = 0.5
+"""Largest accepted smallest distance between the positions of keypoints on one axis, unless the
+keypoints in another part of the view are as coarse."""
+_BLOB_STD_PX = 4.0
+"""Std in pixels of the Gaussian blob of a view with one or few keypoints."""
 _SAME_KEYPOINT_PX = 2.5
 """Largest distance in pixels between a keypoint and its repetition in the rotated view. A
 half-pixel mistake in x and y moves a keypoint and its repetition apart by 1.4 pixels."""
@@ -73,9 +87,10 @@ shuffled descriptors."""
 
 
 def check_features_axes(case: ContractCase) -> str:
-    """Require keypoints (x, y) inside the textured part of views of four sizes.
+    """Require keypoints (x, y) inside the textured part of views of six sizes.
 
-    The textured part is a wide rectangle in one corner of a landscape, portrait or odd-sized view.
+    The textured part is a rectangle in one corner of a landscape, portrait, odd-sized or narrow
+    view.
     Keypoints with swapped x and y are outside of the rectangle. Keypoints of a resized, padded,
     cropped or rotated image that are not mapped back to the view are outside as well.
     """
@@ -87,6 +102,8 @@ def check_features_axes(case: ContractCase) -> str:
         ((height, width), False),
         ((211, 149), True),
         ((149, 211), False),
+        ((width // 2, 2 * height), False),
+        ((2 * width, height // 2), True),
     ):
         example = case.example.sized(*size)
         view, part = _blank_outside(example.view, upper_right=is_upper_right)
@@ -223,20 +240,23 @@ def check_features_pixel_convention(case: ContractCase) -> str:
 def check_features_large_view(case: ContractCase) -> str:
     """Require keypoints in pixels of a large view, even if the provider reduces the image.
 
-    Only two opposite corners of the view of 4096 x 256 pixels have texture. Both corners contain
-    few keypoints if keypoints of a reduced image are not scaled back. All keypoints are shifted if
-    they are scaled back with integer pixel centers. The shift is measured against the keypoints of
-    a view of a quarter of the size.
+    Only two opposite corners of the view of 4096 x 256 pixels have texture, which is the same in
+    both. Both corners contain few keypoints if keypoints of a reduced image are not scaled back.
+    All keypoints are shifted if they are scaled back with integer pixel centers. The shift is
+    measured against the keypoints of a view of a quarter of the size. The features of both corners
+    have to agree, which detects wrong offsets of tiles, wrong factors for one axis, descriptors of
+    other pixels, and keypoints in half precision.
     """
     case.require_truth("image")
     import cv2  # The import is local, because pytest loads this module when it collects tests.
 
     width, height = LARGE_SIZE
-    part_width, part_height = width // 6, height // 2
+    part_width, part_height = _CORNER_SIZE
     tile = cv2.resize(case.example.view.image, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+    row = (tile.shape[0] - part_height) // 2
     image = np.full((height, width, 3), 128, np.uint8)
-    image[:part_height, :part_width] = tile[:part_height, :part_width]
-    image[-part_height:, -part_width:] = tile[-part_height:, -part_width:]
+    image[:part_height, :part_width] = tile[row : row + part_height, :part_width]
+    image[-part_height:, -part_width:] = image[:part_height, :part_width]
     view = View("large.png", image, case.example.camera.resized(width, height))
     features = case.run_on_view(view, case.example)
     _require_enough(features)
@@ -254,10 +274,13 @@ def check_features_large_view(case: ContractCase) -> str:
             f"the keypoints of a reduced image back"
         )
     small: Features = case.run(case.example)
-    corner = np.array([width - tile.shape[1], height - tile.shape[0]])
-    parts = [4 * small.keypoints, 4 * small.keypoints + corner]
-    _require_no_scaling_shift(keypoints, parts)
-    _require_four_times_the_scales(features, small, parts[0])
+    corner = np.array(LARGE_SIZE) - _CORNER_SIZE
+    in_first_part = 4 * small.keypoints - (0, row)
+    _require_no_scaling_shift(keypoints, [in_first_part, in_first_part + corner])
+    _require_four_times_the_scales(features, small, in_first_part)
+    second = features.select((keypoints >= corner).all(axis=1))
+    first_part = features.select((keypoints <= _CORNER_SIZE).all(axis=1))
+    _require_equal_parts(first_part, replace(second, keypoints=second.keypoints - corner))
     return f"{sum(ratios):.0%} of {len(features)} keypoints are on the textured corners"
 
 
@@ -276,11 +299,16 @@ def check_features_descriptors(case: ContractCase) -> str:
 def check_features_dimension(case: ContractCase) -> str:
     """Require the same descriptor length for every view.
 
-    The descriptor array (0, d) of a view without keypoints must have the same length d.
+    The descriptor array (0, d) of a view without keypoints must have the same length d. Other views
+    show one blob and one corner, where detectors find one or few keypoints.
     """
-    flat = replace(case.example.view, image=np.zeros_like(case.example.view.image))
-    some, none = case.run(case.example), case.run_on_view(flat, case.example)
-    lengths = {features.descriptors.shape[1] for features in (some, none)}
+    flat = np.zeros_like(case.example.view.image)
+    outputs = [
+        case.run_on_view(replace(case.example.view, image=image), case.example)
+        for image in (case.example.view.image, flat, *_simple_images(case.example.camera.size))
+    ]
+    some, none = outputs[:2]
+    lengths = {features.descriptors.shape[1] for features in outputs}
     if len(lengths) > 1:
         raise CheckFailed(f"descriptors have {' and '.join(map(str, sorted(lengths)))} values")
     return f"{len(some)} keypoints with {lengths.pop()} values; {len(none)} on a flat view"
@@ -412,7 +440,7 @@ def _require_no_scaling_shift(keypoints: Float64, expected: Sequence[Float64]) -
 
 def _require_four_times_the_scales(large: Features, small: Features, expected: Float64) -> None:
     """Require that keypoint scales are in pixels of the large view, not of a reduced one."""
-    if large.scales is None or small.scales is None or np.ptp(small.scales) == 0:
+    if large.scales is None or small.scales is None:
         return
     distance = np.linalg.norm(large.keypoints[:, None] - expected[None], axis=2)
     ratios = [large.scales[row] / small.scales[near] for row, near in enumerate(distance < 4.0)]
@@ -425,6 +453,57 @@ def _require_four_times_the_scales(large: Features, small: Features, expected: F
         raise CheckFailed(
             f"scales in a view of four times the size are {factor:.2g} times as large"
         )
+
+
+def _require_equal_parts(first: Features, second: Features) -> None:
+    """Require equal features in two parts of a view with the same texture.
+
+    Args:
+        first: Features of the first part.
+        second: Features of the second part, with positions relative to that part.
+    """
+    if min(len(first), len(second)) < _MIN_COUNT:
+        return
+    rows, columns = _mutual_nearest(first, second)
+    offset = second.keypoints[columns] - first.keypoints[rows]
+    shift = np.median(offset, axis=0) if len(rows) else np.zeros(2)
+    is_equal = (np.abs(offset - shift) <= _MAX_ERROR_PX).all(axis=1)
+    if len(rows) >= _MIN_MUTUAL and is_equal.mean() < _MIN_CORRECT_RATIO:
+        raise CheckFailed(
+            f"only {is_equal.mean():.0%} of the descriptors in two equal parts of a large view "
+            "belong to the same keypoint"
+        )
+    if is_equal.sum() >= max(_MIN_COUNT, len(rows) / 2):
+        deviation = np.median(np.abs(offset - shift), axis=0)
+        if (np.abs(shift) > np.maximum(_MAX_PART_SHIFT_PX, 2 * deviation)).any():
+            raise CheckFailed(
+                f"the keypoints of two equal parts of a large view differ by ({shift[0]:+.1f}, "
+                f"{shift[1]:+.1f}) px"
+            )
+    for axis, name in enumerate("xy"):
+        steps = [_smallest_step(part.keypoints[:, axis]) for part in (first, second)]
+        if steps[1] > max(_MAX_ROUNDING_PX, 4 * steps[0]):
+            raise CheckFailed(
+                f"{name} of the keypoints at the end of a large view is rounded to {steps[1]:.2g} "
+                f"px, at the start to {steps[0]:.2g} px"
+            )
+
+
+def _smallest_step(values: Float64) -> float:
+    """Return the smallest distance between different values, up to rounding errors."""
+    return float(np.diff(np.unique(values.round(2))).min(initial=np.inf))
+
+
+def _simple_images(size: tuple[int, int]) -> list[UInt8]:
+    """Return images (h, w, 3) of one Gaussian blob, and of one corner between four squares."""
+    width, height = size
+    y, x = np.mgrid[:height, :width] + 0.5
+    blob = np.exp(-((x - width / 2) ** 2 + (y - height / 2) ** 2) / 2 / _BLOB_STD_PX**2)
+    corner = (x < width / 2) == (y < height / 2)
+    return [
+        np.repeat((60 + 120 * part)[..., None], 3, axis=2).astype(np.uint8)
+        for part in (blob, corner)
+    ]
 
 
 def _continue_by_reflection(view: View, size: tuple[int, int]) -> View:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from mpsfm_core.data import (
+    Bool,
     DenseMatches,
     DepthPrior,
     Features,
@@ -39,6 +41,21 @@ _MANY_SIZE = (480, 360)
 because some matchers resize all views to one size and are not invariant to scale."""
 _LARGE_FACTOR = 21
 """Factor of the size of views with 12 megapixels for sparse matchers, which see features only."""
+_SMALL_SIZE, _WIDE_SIZE = (256, 192), (2048, 256)
+"""Widths and heights in pixels of views below and above the input size of dense matchers. The
+height of the wide view limits the run time."""
+_WIDE_SHIFT = np.array([256.0, 0.0])
+"""Position in pixels of the second wide view in the texture of the first, a multiple of the cells
+of a network that reduces the view to 32 or 40 columns."""
+_MIXED_TOLERANCE_PX = 0.3
+"""Largest accepted shift of matches to the same side in x and y, in pixels or multiples of
+``std_px``. Integer pixel centers shift matches by 0.5 pixels if one view is reduced to half the
+size, and the shift is 0.0 for correct matchers."""
+_MIN_AGREEING_RATIO = 0.3
+"""Smallest ratio of matches that agree on a scale and shift, from which both are compared with the
+truth."""
+_NUM_LINES = 200
+"""Number of lines through two random matches, of which the best is taken."""
 _NUM_FOREIGN = 40
 """Number of features of another scene in ``check_matcher_feature_order``."""
 _MIN_SCORE_CORRELATION = 0.3
@@ -109,6 +126,31 @@ def check_matcher_sizes(case: ContractCase) -> str:
     if failures and (len(failures) == len(pairs) or not case.declares("dense")):
         raise CheckFailed(f"views of different sizes: {failures[0]}")
     return texts[0]
+
+
+def check_matcher_mixed_sizes(case: ContractCase) -> str:
+    """Require dense matches in pixels of each view if one or both views are very wide.
+
+    Two views of 256 x 192 and 2048 x 256 pixels show the same random texture. A matcher may fail
+    for views of such different sizes. If most of its matches agree on a scale and shift, the scale
+    has to be 1, and the shift the true one. Networks reduce the wide view only, so that factors of
+    the other view, of the other axis or of no view are wrong.
+    """
+    if not case.declares("dense"):
+        raise CheckSkipped("sparse matches have no positions of their own")
+    case.require_truth("image")
+    texts = []
+    for size_a, size_b, shift in (
+        (_SMALL_SIZE, _WIDE_SIZE, np.zeros(2)),
+        (_WIDE_SIZE, _SMALL_SIZE, np.zeros(2)),
+        (_WIDE_SIZE, _WIDE_SIZE, _WIDE_SHIFT),
+    ):
+        matches = point_matches(case.run_on_views(_noise_views(shift, size_a, size_b)), None)
+        texts.append(_require_true_scale(matches, shift, f"{size_a} and {size_b} pixels"))
+    found = [text for text in texts if text]
+    if not found:
+        raise CheckUnmeasured("the matcher finds too few consistent matches of these views")
+    return f"{len(found)} of {len(texts)} pairs: {found[0]}"
 
 
 def check_matcher_coverage(case: ContractCase) -> str:
@@ -218,7 +260,7 @@ def check_matcher_many_features(case: ContractCase) -> str:
     if not case.declares("sparse"):
         raise CheckSkipped("the matcher needs no features")
     shift = np.array([31.0, 17.0])
-    views = _noise_views(shift)
+    views = _noise_views(shift, _MANY_SIZE, _MANY_SIZE)
     is_known = case.truth_source == "image"
     small_views = case.example.view, case.example.partner.view
     found = case.extract_features(*(views if is_known else small_views))
@@ -389,28 +431,25 @@ def check_matcher_scores(case: ContractCase) -> str:
 
 
 def check_matcher_pair_depth(case: ContractCase) -> str:
-    """Require z-depth of the first view in ``depth_a`` and of the second in ``depth_b``."""
+    """Require z-depth of the first view in ``depth_a`` and of the second in ``depth_b``.
+
+    In further pairs, the first or the second view has twice the size of the other view.
+    """
     if not case.declares("pair-depth"):
         raise CheckSkipped("the matcher does not declare 'pair-depth'")
     case.require_truth("painted", "prepared")
     a, b = case.example, case.example.partner
-    depth = case.run(a).depth
-    error = max(_depth_error(depth.depth_a, a), _depth_error(depth.depth_b, b))
-    if max(_depth_error(depth.depth_a, b), _depth_error(depth.depth_b, a)) < 0.5 * error:
-        raise CheckFailed("depth_a and depth_b are swapped")
-    for prior, example in ((depth.depth_a, a), (depth.depth_b, b)):
-        power = map_errors.estimate_ray_exponent(prior, example)
-        if abs(power) > RAY_TOLERANCE:
-            raise CheckFailed(f"depth is proportional to z * (ray length / z) ** {power:.2f}")
-    if error > DEPTH_TOLERANCE:
-        raise CheckFailed(f"the depth of the image pair has a relative error of {error:.2g}")
-    return f"relative error {error:.2g}"
+    width, height = a.camera.size
+    larger = b.sized(2 * width, 2 * height)
+    errors = [_require_own_depth(case, *pair) for pair in ((a, b), (a, larger), (larger, a))]
+    return f"relative error {max(errors):.2g}"
 
 
 CHECKS = (
     check_matcher_sides,
     check_matcher_order,
     check_matcher_sizes,
+    check_matcher_mixed_sizes,
     check_matcher_coverage,
     check_matcher_pixel_convention,
     check_matcher_no_features,
@@ -453,6 +492,21 @@ def _measure_outer_quarters(xy: Float64, camera: PinholeCamera) -> Float64:
     position = xy / camera.size
     ratios: Float64 = np.concatenate([(position < 0.25).mean(0), (position > 0.75).mean(0)])
     return ratios
+
+
+def _require_own_depth(case: ContractCase, a: Example, b: Example) -> float:
+    """Require the z-depth of the view in the depth prior of each view of a pair."""
+    depth = case.run_on_examples(a, b).depth
+    error = max(_depth_error(depth.depth_a, a), _depth_error(depth.depth_b, b))
+    if max(_depth_error(depth.depth_a, b), _depth_error(depth.depth_b, a)) < 0.5 * error:
+        raise CheckFailed("depth_a and depth_b are swapped")
+    for prior, example in ((depth.depth_a, a), (depth.depth_b, b)):
+        power = map_errors.estimate_ray_exponent(prior, example)
+        if abs(power) > RAY_TOLERANCE:
+            raise CheckFailed(f"depth is proportional to z * (ray length / z) ** {power:.2f}")
+    if error > DEPTH_TOLERANCE:
+        raise CheckFailed(f"the depth of the image pair has a relative error of {error:.2g}")
+    return error
 
 
 def _depth_error(prior: DepthPrior, example: Example) -> float:
@@ -556,20 +610,76 @@ def _match_with_noise(case: ContractCase, a: Example, b: Example, amplitude: int
     return point_matches(answer, features)
 
 
-def _noise_views(shift: Float64) -> tuple[View, View]:
-    """Return two views of 480 x 360 pixels of one random texture, shifted by ``shift``."""
+def _noise_views(
+    shift: Float64, size_a: tuple[int, int], size_b: tuple[int, int]
+) -> tuple[View, View]:
+    """Return two views of one random texture, of which the second starts at ``shift``."""
     import cv2  # The import is local, because pytest loads this module when it collects tests.
 
-    width, height = _MANY_SIZE
     x, y = map(int, shift)
-    noise = np.random.default_rng(0).normal(size=(height + y, width + x, 3))
+    width, height = max(size_a[0], size_b[0] + x), max(size_a[1], size_b[1] + y)
+    noise = np.random.default_rng(0).normal(size=(height, width, 3))
     fine, coarse = (cv2.GaussianBlur(noise, (0, 0), sigma) * sigma for sigma in (1.5, 5.0))
     image = np.clip(128 + 90 * (fine + coarse), 0, 255).astype(np.uint8)
-    camera = PinholeCamera(width, height, 1000.0, 900.0, 560.0, 470.0)
-    return (
-        View("many/a.png", np.ascontiguousarray(image[:height, :width]), camera),
-        View("many/b.png", np.ascontiguousarray(image[y:, x:]), camera),
-    )
+    views = []
+    for name, (left, top), (columns, rows) in (("a", (0, 0), size_a), ("b", (x, y), size_b)):
+        part = np.ascontiguousarray(image[top : top + rows, left : left + columns])
+        camera = PinholeCamera(columns, rows, 1000.0, 900.0, 560.0, 470.0)
+        views.append(View(f"noise/{name}.png", part, camera))
+    return views[0], views[1]
+
+
+def _require_true_scale(matches: DenseMatches, shift: Float64, where: str) -> str:
+    """Require scale 1 and the true shift of matches, or return "" if the matches do not agree."""
+    if len(matches) < 2 * MIN_MATCHES:
+        return ""
+    limit = MATCH_TOLERANCE_STD * max(1.0, matches.std_px)
+    axes = zip(matches.points_a.T, matches.points_b.T, strict=True)
+    fits = [_fit_line(a, b, limit) for a, b in axes]
+    agree = np.logical_and(*(fit.inliers for fit in fits))
+    if agree.sum() < max(2 * MIN_MATCHES, _MIN_AGREEING_RATIO * len(matches)):
+        return ""
+    points = matches.points_a[agree]
+    scales, offsets = np.array([(fit.scale, fit.offset) for fit in fits]).T
+    error = scales * points + offsets - (points - shift)
+    if np.quantile(np.abs(error), 0.9) > limit:
+        raise CheckFailed(
+            f"most matches of views of {where} have a scale of {scales[0]:.2g} and "
+            f"{scales[1]:.2g} in x and y, up to "
+            f"{np.abs(error).max():.0f} px off"
+        )
+    residual = (matches.points_b - matches.points_a + shift)[agree]
+    middle = np.median(residual, axis=0)
+    noise = 3 * np.median(np.abs(residual - middle), axis=0) / np.sqrt(len(residual))
+    # Integer pixel centers shift matches by the same amount in x and y.
+    smallest = max(middle.min(), -middle.max())
+    if smallest > max(_MIXED_TOLERANCE_PX * max(1.0, matches.std_px), noise.max()):
+        raise CheckFailed(
+            f"matches of views of {where} are shifted by ({middle[0]:+.2f}, {middle[1]:+.2f}) px"
+        )
+    return f"{agree.mean():.0%} of {len(matches)} matches are correct"
+
+
+class _Line(NamedTuple):
+    """Line ``scale * a + offset`` through most points (a, b)."""
+
+    scale: float
+    offset: float
+    inliers: Bool
+
+
+def _fit_line(a: Float64, b: Float64, limit: float) -> _Line:
+    """Fit a line to coordinates (n,) of matches, most of which are correct, by RANSAC."""
+    rng = np.random.default_rng(0)
+    first, second = rng.integers(len(a), size=(2, _NUM_LINES))
+    is_apart = np.abs(a[first] - a[second]) > 0.1 * np.ptp(a)
+    first, second = first[is_apart], second[is_apart]
+    scales = (b[first] - b[second]) / (a[first] - a[second])
+    offsets = b[first] - scales * a[first]
+    distance = np.abs(scales[:, None] * a + offsets[:, None] - b)
+    inliers = distance[(distance < limit).sum(axis=1).argmax()] < limit
+    scale, offset = np.polyfit(a[inliers], b[inliers], 1)
+    return _Line(float(scale), float(offset), inliers)
 
 
 def _require_many_correct(rows: Int64, features: tuple[Features, Features], shift: Float64) -> None:

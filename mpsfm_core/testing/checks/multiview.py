@@ -181,6 +181,8 @@ def check_multiview_group_sizes(case: ContractCase) -> str:
         spread = float(np.ptp(_log_factors(group, examples)))
         if spread > DEPTH_TOLERANCE:
             raise CheckFailed(f"the units of the maps in a group of {size} differ")
+        if case.truth_source != "painted":
+            _require_true_cameras(group, examples)
     return f"relative error {worst:.2g}" if worst else "the truth is unknown"
 
 
@@ -233,6 +235,28 @@ CHECKS = (
 def _make_group(case: ContractCase) -> tuple[Example, ...]:
     """Return three synthetic views that overlap."""
     return case.example, case.example.partner, case.example.partner.partner
+
+
+def _require_true_cameras(group: MultiViewPrior, examples: tuple[Example, ...]) -> None:
+    """Require correct poses and intrinsics of all views of a group, if the group has any."""
+    for index in range(1, len(examples)) if group.poses is not None else ():
+        assert group.poses is not None
+        error = _rotation_error_deg(
+            _relative(group.poses, index), _relative(_true_poses(examples), index)
+        )
+        if error > ROTATION_TOLERANCE_DEG:
+            raise CheckFailed(
+                f"the rotation of view {index + 1} of a group of {len(examples)} is off by "
+                f"{error:.1f} degrees"
+            )
+    if group.intrinsics is not None:
+        true = np.array([example.camera.params for example in examples])
+        errors = np.abs(np.log(np.maximum(group.intrinsics, 1e-12) / true)).max(axis=1)
+        if errors.max() > FOCAL_TOLERANCE:
+            raise CheckFailed(
+                f"the intrinsics of view {int(errors.argmax()) + 1} of a group of {len(examples)} "
+                f"are {np.expm1(errors.max()):.0%} off"
+            )
 
 
 def _pairs(

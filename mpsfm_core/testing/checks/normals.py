@@ -18,10 +18,14 @@ from mpsfm_core.testing.checks.maps import (
     swap_painted_channels,
 )
 from mpsfm_core.testing.contract_case import ContractCase
+from mpsfm_core.testing.examples import tilted_example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.painted_views import read_normals
 from mpsfm_core.testing.std_errors import require_normals_std
 
+_MIN_POSITIVE_Z = 0.1
+"""Smallest z component of normals in ``check_normals_away_from_axis``, larger than the error of
+encoded colors."""
 FLIP_TOLERANCE_DEG = 15.0
 """Largest accepted angle in degrees between normals of a view and of the mirrored view if the
 ground truth is unknown. Trained networks are not exactly symmetric."""
@@ -118,6 +122,34 @@ def check_normals_same_in_larger_view(case: ContractCase) -> str:
     return f"angle {angle:.2f} degrees"
 
 
+def check_normals_away_from_axis(case: ContractCase) -> str:
+    """Require normals whose z component is positive, as those of a floor at the image border.
+
+    The test network is constructed with weights for colors that encode x, y and z of the normal. A
+    normal faces the camera if its dot product with the viewing ray is negative, so z may be
+    positive. A normal must not be negated, changed or dropped because of its z component.
+    """
+    case.require_truth("painted")
+    import cv2  # The import is local, because pytest loads this module when it collects tests.
+
+    prior, truth = case.run_with_normal_colors(tilted_example())
+    if prior.shape != truth.valid.shape:
+        raise CheckSkipped("the map has another size than the view")
+    toward = truth.valid & (truth.normals[..., 2] < -_MIN_POSITIVE_Z) & prior.valid
+    angle = _angle_error_deg(prior.normals[toward], truth.normals[toward])
+    if angle > NORMALS_TOLERANCE_DEG:
+        raise CheckSkipped("the test network does not use the weights of painted_views.decoder()")
+    is_away = (truth.normals[..., 2] > _MIN_POSITIVE_Z).astype(np.uint8)
+    away = cv2.erode(is_away, np.ones((5, 5), np.uint8)) > 0
+    kept = away & prior.valid
+    if kept.sum() < away.sum() / 2:
+        raise CheckFailed(f"only {kept.sum()} of {away.sum()} normals with positive z are valid")
+    angle = _angle_error_deg(prior.normals[kept], truth.normals[kept])
+    if angle > NORMALS_TOLERANCE_DEG:
+        raise CheckFailed(f"normals with positive z are {angle:.0f} degrees off")
+    return f"angle {angle:.2f} degrees"
+
+
 def check_normals_depth_input(case: ContractCase) -> str:
     """Require the same normals for depth in another unit and for a depth map of half the size.
 
@@ -172,6 +204,7 @@ CHECKS = (
     check_normals_validity,
     check_normals_flip,
     check_normals_same_in_larger_view,
+    check_normals_away_from_axis,
     check_normals_depth_input,
     check_normals_variance,
     check_normals_calibration,

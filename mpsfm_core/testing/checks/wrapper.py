@@ -5,6 +5,7 @@ A wrapper has to pass the checks of this module and all checks of the provider k
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -152,16 +153,24 @@ def check_wrapper_validity(case: ContractCase) -> str:
 
 
 def check_wrapper_inputs(case: ContractCase) -> None:
-    """Require that the wrapped provider receives the camera and depth prior of its input view.
+    """Require that the wrapped provider receives camera, mask and depth prior of its input view.
 
-    If a wrapper mirrors the view, the principal point and the depth prior have to be mirrored.
+    If a wrapper mirrors, rotates, crops or resizes the view, the intrinsics, the mask and the depth
+    prior have to change in the same way. The wrapper may drop the mask. The check uses a landscape
+    and a portrait view, because a wrapper may rotate only one of them.
     """
     provider = case.create_provider()
-    case.wrong_inputs().clear()
-    case.run(case.example, provider)
-    wrong = case.wrong_inputs()
-    if wrong:
-        raise CheckFailed(f"the wrapped provider receives a wrong input: {wrong[0]}")
+    width, height = case.example.camera.size
+    for example in (case.example, case.example.sized(height, width)):
+        case.wrong_inputs().clear()
+        mask = np.ones(example.view.image.shape[:2], np.bool_)
+        mask[: height // 2, : width // 3] = False
+        case.prepare(example)
+        with case.received_mask(mask):
+            case.run_on_view(replace(example.view, mask=mask), example, provider)
+        wrong = case.wrong_inputs()
+        if wrong:
+            raise CheckFailed(f"the wrapped provider receives a wrong input: {wrong[0]}")
 
 
 CHECKS = (
