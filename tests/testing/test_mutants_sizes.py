@@ -143,7 +143,7 @@ class NeedsItsName(Wrapper):
         ("depth", Millimeters16, "depth-range", "9 times as far", PAINTED, ("metric",)),
         ("depth", BorderOfTiles, "depth-edges", "no surface near has", PAINTED, ("metric",)),
         ("depth", RotatesAgain, "name-does-not-matter", "renamed view", PAINTED, ("metric",)),
-        ("depth", CachedByCorners, "no-state", "differs|same borders", PAINTED, ("metric",)),
+        ("depth", CachedByCorners, "no-state", "differs|some equal pixels", PAINTED, ("metric",)),
         ("mask", SkyIsMinority, "mask-place", "wrong value", PAINTED, ()),
         ("retrieval", Faint, "retrieval-self-similarity", "lengths of descriptors", None, ()),
         ("wrapper", MeanWithZeros, "wrapper-validity", "no surface near", None, ("wraps-depth",)),

@@ -299,7 +299,7 @@ def check_portrait(case: ContractCase) -> str:
 
 
 def check_panorama(case: ContractCase) -> str:
-    """Require an accurate depth, normal or mask map for views with an aspect ratio of 5:1 and 1:5.
+    """Require accurate maps of views with an aspect ratio of 5:1 and 1:5.
 
     A network may stretch a panorama to its input size, but its map has to cover the whole view.
     """
