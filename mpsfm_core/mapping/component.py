@@ -346,8 +346,8 @@ class Component:
         reason = ImageReason.LOST_POINTS.because(step="re-registration")
         maintenance.deregister(find_lost_images(self.scene), reason)
         maintenance.history.clear()
-        image, reference = detection.supporting_pairs.T
-        maintenance.history.excluded_references[image, reference] = True
+        for image, reference in detection.supporting_pairs.tolist():
+            maintenance.history.excluded_references[image].add(reference)
 
     def _detect_misregistrations(self) -> list[Misregistration]:
         """Detect misregistered images, except those whose known pose must not change.

@@ -53,7 +53,7 @@ class IncrementalRegistration:
         """
         options = self._options.registration
         while True:
-            scores = np.where(self._history.excluded_references, 0, self._scores)
+            scores = self._history.select_scores(self._scores, excluded=False)
             ranked = rank_next_images(self._scene, scores, candidates, options)
             if self._register_first_possible(ranked, wide=False):
                 return True
@@ -106,10 +106,10 @@ class IncrementalRegistration:
         False if global refinement makes the depth of no image consistent.
         """
         self._thresholds.reset()
-        scores = np.where(self._history.excluded_references, self._scores, 0)
+        scores = self._history.select_scores(self._scores, excluded=True)
         options = self._options.registration
         for image, best_match in rank_next_images(self._scene, scores, candidates, options):
-            self._history.excluded_references[image] = False
+            del self._history.excluded_references[image]
             references = self._select_references(image, best_match)
             if self._register_image(image, references, refine_globally=True) is None:
                 self._maintenance.confirm(image)
@@ -125,12 +125,14 @@ class IncrementalRegistration:
         """
         scores, options = self._scores, self._options.registration
         if wide:
-            matching = np.flatnonzero(self._scene.registered & (scores[image] > 0))
-            order = np.argsort(-scores[image, matching], kind="stable")
+            score = scores[[image]].toarray()[0]
+            matching = np.flatnonzero(self._scene.registered & (score > 0))
+            order = np.argsort(-score[matching], kind="stable")
             references = matching[order[:NUM_WIDE_REFERENCES]].tolist()
         else:
             references = find_local_bundle(self._scene, best_match, options.num_neighbors, scores)
-        return [k for k in references if not self._history.excluded_references[image, k]]
+        excluded = self._history.excluded_references.get(image, ())
+        return [k for k in references if k not in excluded]
 
     def _would_fail_again(self, image: int, references: list[int]) -> bool:
         """Return whether an attempt to register an image would repeat its last failed attempt."""
@@ -264,6 +266,5 @@ class IncrementalRegistration:
         for reference in map(int, np.unique(correspondences.references)):
             rows = correspondences.references == reference
             scored = score_pose(self._scene, correspondences.select(rows), pose.hypothesis, options)
-            self._history.excluded_references[image, reference] |= (
-                scored.inlier_ratio >= options.min_pose_inlier_ratio
-            )
+            if scored.inlier_ratio >= options.min_pose_inlier_ratio:
+                self._history.excluded_references[image].add(reference)

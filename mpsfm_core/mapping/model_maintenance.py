@@ -44,7 +44,7 @@ class ModelMaintenance:
 
     Attributes:
         scene: Camera poses, 3D points and depth maps of the model.
-        scores: (n, n) float64 summed match scores of each two images.
+        scores: (n, n) sparse matrix of the summed match scores of each two images.
         refiner: Object that runs bundle adjustment and depth integration.
         history: Record of failed and successful image registration attempts.
         thresholds: Acceptance thresholds of image registration, which relax if no image can be
@@ -58,7 +58,7 @@ class ModelMaintenance:
         self.scene = Scene(problem, weigh_by_score=options.weigh_by_score)
         self.scores = compute_pair_scores(self.scene, options.registration.next_view)
         self.refiner = Refiner(self.scene, options, self.scores)
-        self.history = RegistrationHistory(self.scene.num_images, options.registration)
+        self.history = RegistrationHistory(options.registration)
         self.thresholds = ThresholdSchedule(options.registration)
         self._depth_check = DepthConsistencyCheck(self.scene, options.consistency)
         self._last_size = (0, 0)

@@ -136,22 +136,27 @@ class DepthConsistencyCheck:
         Returns:
             Images to deregister, each with its largest violation ratio.
         """
-        scene = self._scene
-        ratios = np.full((scene.num_images, scene.num_images), np.nan)
+        scene, num_views = self._scene, self._options.num_views
+        candidates = _select_images_with_depth(scene)
+        measured: dict[tuple[int, int], float] = {}
         for image in map(int, images):
-            for other in find_overlapping_images(scene, image, self._options.num_views):
-                if np.isnan(ratios[image, other]):
-                    ratio = self.measure_violation_ratio(
+            for other in find_overlapping_images(scene, image, num_views, candidates):
+                pair = min(image, other), max(image, other)
+                if pair not in measured:
+                    measured[pair] = self.measure_violation_ratio(
                         image, other, std_factor, limit, by_target_area=True
                     )
-                    ratios[image, other] = ratios[other, image] = ratio
-        ratios = np.nan_to_num(ratios)
+        pairs = np.array(list(measured), dtype=np.int64).reshape(-1, 2)
+        ratios = np.nan_to_num(np.array(list(measured.values())))
         removed = []
         while (ratios > limit).any():
-            num_conflicts = (ratios > limit).sum(axis=1)
-            worst = int(np.lexsort((ratios.sum(axis=1), num_conflicts))[-1])
-            removed.append((worst, float(ratios[worst].max())))
-            ratios[worst] = ratios[:, worst] = 0
+            ends = pairs.ravel()
+            num_conflicts = np.bincount(ends, np.repeat(ratios > limit, 2), scene.num_images)
+            sums = np.bincount(ends, np.repeat(ratios, 2), scene.num_images)
+            worst = int(np.lexsort((sums, num_conflicts))[-1])
+            is_of_worst = (pairs == worst).any(axis=1)
+            removed.append((worst, float(ratios[is_of_worst].max())))
+            ratios[is_of_worst] = 0
         return removed
 
     def measure_violation_ratio(
@@ -268,10 +273,10 @@ def find_overlapping_images(
         scene: The scene.
         image: Registered image with the depth map.
         max_images: Maximum number of returned images.
-        candidates: Registered images to choose from, by default all.
+        candidates: Registered images with depth to choose from, by default all.
     """
-    others = scene.registered_images() if candidates is None else candidates
-    others = others[(others != image) & np.array([scene.maps[i].active for i in others])]
+    others = _select_images_with_depth(scene) if candidates is None else candidates
+    others = others[others != image]
     depth_map = scene.maps[image]
     rows, columns = depth_map.prior.shape
     xy = pixel_centers(OVERLAP_GRID, OVERLAP_GRID) * [columns, rows] / OVERLAP_GRID
@@ -279,17 +284,23 @@ def find_overlapping_images(
     depth = depth_map.scale * depth_map.prior.depth[at].astype(np.float64)
     points = unproject(depth_map.camera, xy, depth)
     world = (points[depth_map.valid[at]] - scene.translations[image]) @ scene.rotations[image]
-    sizes = np.array([scene.problem.images[i].camera.size for i in others]).reshape(-1, 2)
     counts = count_visible_points(
         world,
         scene.rotations[others],
         scene.translations[others],
         scene.intrinsics[others],
-        sizes.astype(np.float64),
+        scene.image_sizes[others],
     )
     overlap = counts / OVERLAP_GRID**2
     order = np.argsort(-overlap, kind="stable")[:max_images]
     return [int(others[k]) for k in order if overlap[k] >= MIN_OVERLAP_RATIO]
+
+
+def _select_images_with_depth(scene: Scene) -> Int64:
+    """Return the registered images whose depth scale is known."""
+    registered = scene.registered_images()
+    is_active = [scene.maps[image].active for image in registered.tolist()]
+    return registered[np.array(is_active, dtype=np.bool_)]
 
 
 @jit.kernel()
@@ -309,10 +320,31 @@ def count_visible_points(
         (n,) int64.
     """
     counts = np.zeros(len(rotations), np.int64)
+    center, radius = np.zeros(3), 0.0  # bounding sphere of all points, times 1 + 1e-9
+    for k in range(len(points)):
+        for a in range(3):
+            center[a] += points[k, a] / len(points)
+    for k in range(len(points)):
+        x, y, z = points[k, 0] - center[0], points[k, 1] - center[1], points[k, 2] - center[2]
+        radius = max(radius, math.sqrt(x * x + y * y + z * z) * (1.0 + 1e-9))
     for image in range(len(rotations)):
         r, t = rotations[image], translations[image]
         fx, fy, cx, cy = intrinsics[image]
         width, height = sizes[image]
+        x, y, z = center
+        u = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]
+        v = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]
+        depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
+        # the sphere is behind the camera, or beyond one of the four planes of the view frustum
+        right, bottom = width - cx, height - cy
+        if (
+            depth < -radius
+            or fx * u + cx * depth < -radius * math.hypot(fx, cx)
+            or right * depth - fx * u < -radius * math.hypot(fx, right)
+            or fy * v + cy * depth < -radius * math.hypot(fy, cy)
+            or bottom * depth - fy * v < -radius * math.hypot(fy, bottom)
+        ):
+            continue
         for k in range(len(points)):
             x, y, z = points[k]
             depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]

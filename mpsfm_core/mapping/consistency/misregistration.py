@@ -15,7 +15,8 @@ Misregistered images are detected in three ways.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from itertools import combinations
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -74,6 +75,37 @@ class ContradictedCut(NamedTuple):
         return self.num_supporting_pairs == 1 and self.num_contradicting_pairs > 1
 
 
+class PairCounts(NamedTuple):
+    """Numbers of matches of image pairs, each pair once.
+
+    The pairs are sorted by both images.
+    """
+
+    a: Int64
+    """(p,) index of the first image of each pair."""
+    b: Int64
+    """(p,) index of the second image of each pair, larger than ``a``."""
+    explained: Int64
+    """(p,) number of matches whose keypoints observe the same 3D point."""
+    contradicting: Int64
+    """(p,) number of matches if they contradict the poses of both images, else 0."""
+    is_explained: Bool
+    """(p,) bool mask of the pairs whose matches support the poses of both images."""
+
+    def between(self, images: Bool) -> PairCounts:
+        """Return the counts of the pairs of which both images are in the mask (n,)."""
+        rows = images[self.a] & images[self.b]
+        fields: list[Any] = [values[rows] for values in self]
+        return PairCounts(*fields)
+
+    def graph(self, values: Any, num_images: int) -> csr_array:
+        """Return a symmetric sparse matrix (n, n) with a value (p,) of each pair."""
+        ends = np.concatenate([self.a, self.b]), np.concatenate([self.b, self.a])
+        matrix = csr_array((np.tile(values, 2), ends), shape=(num_images, num_images))
+        matrix.eliminate_zeros()
+        return matrix
+
+
 def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistration]:
     """Detect groups of registered images whose matches mostly contradict their poses.
 
@@ -85,13 +117,24 @@ def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistrat
         Sets of images that may be misregistered together, the largest excess of contradicting
         matches first.
     """
-    matches, explained = count_pair_matches(scene)
-    is_explained = explained > MAX_EXPLAINED_RATIO * matches
-    contradicting = np.where(is_explained | (matches < min_matches), 0, matches)
-    separating = _count_separating_matches(scene.registered, contradicting)
-    if not separating.any():
+    return find_misregistrations(count_pair_matches(scene, min_matches), scene.registered)
+
+
+def find_misregistrations(counts: PairCounts, registered: Bool) -> list[Misregistration]:
+    """Find groups of registered images whose matches mostly contradict their poses.
+
+    Args:
+        counts: Numbers of matches of all image pairs.
+        registered: (n,) bool mask of the registered images.
+
+    Returns:
+        See :func:`detect_misregistrations`.
+    """
+    separating = _count_separating_matches(counts, registered)
+    if not separating:
         return []
-    capacities = csr_array(explained.astype(np.int32))
+    capacities = counts.graph(counts.explained.astype(np.int32), len(registered))
+    supporting = counts.graph(counts.is_explained, len(registered)).tocoo()
     detected: dict[tuple[int, ...], Misregistration] = {}
 
     def add(inside: Bool, margin: int, splits: bool = False) -> None:
@@ -99,101 +142,113 @@ def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistrat
         previous = detected.get(images)
         if previous is not None:
             margin, splits = max(margin, previous.margin), splits or previous.splits
-        outside = scene.registered & ~inside
-        pairs = np.argwhere(is_explained & inside[:, None] & outside)
+        leaves = inside[supporting.row] & (registered & ~inside)[supporting.col]
+        pairs = np.stack([supporting.row, supporting.col], axis=1)[leaves].astype(np.int64)
         detected[images] = Misregistration(images, pairs, margin, splits)
 
-    for image, margin in _find_contradicted_images(scene.registered, contradicting, explained):
-        add(scene.mask([image]), margin)
-    for cut in find_contradicted_cuts(scene.registered, contradicting, explained):
+    among_registered = counts.between(registered)
+    for image, margin in _find_contradicted_images(among_registered, len(registered)):
+        add(_mask([image], registered), margin)
+    for cut in find_contradicted_cuts(among_registered, registered):
         is_group = bool(np.count_nonzero(cut.inside) > 1)
         add(cut.inside, cut.margin, splits=is_group and cut.has_one_link)
-    for a, b in np.argwhere(np.triu(separating > compute_widest_paths(explained))):
-        flow = maximum_flow(capacities, int(a), int(b))
+    pairs = np.array(sorted(separating), dtype=np.int64)
+    widths = compute_widest_paths(counts, pairs, len(registered))
+    for (a, b), width in zip(pairs.tolist(), widths, strict=True):
+        if separating[a, b] <= width:
+            continue
+        flow = maximum_flow(capacities, a, b)
         margin = int(separating[a, b] - flow.flow_value)
         if margin <= 0:
             continue
         residual_graph = capacities - flow.flow
         residual_graph.eliminate_zeros()
-        side = breadth_first_order(residual_graph, int(a), return_predecessors=False)
-        inside = scene.mask(side)
-        if 2 * inside.sum() > scene.registered.sum():
-            inside = scene.registered & ~inside
+        side = breadth_first_order(residual_graph, a, return_predecessors=False)
+        inside = _mask(side, registered)
+        if 2 * inside.sum() > registered.sum():
+            inside = registered & ~inside
         add(inside, margin)
     if not detected:
         # a wrong relative pose also explains the matches of its own image pair, however many there
         # are
-        for cut in find_contradicted_cuts(scene.registered, contradicting, explained, 0.0):
+        for cut in find_contradicted_cuts(among_registered, registered, 0.0):
             if cut.has_one_link and np.count_nonzero(cut.inside) > 1:
                 add(cut.inside, cut.margin, splits=True)
     return sorted(detected.values(), key=lambda group: (-group.margin, group.images))
 
 
-def count_pair_matches(scene: Scene) -> tuple[Int64, Int64]:
-    """Count the matches (n, n) and the explained matches (n, n) of each two images."""
-    graph, n = scene.graph, scene.num_images
-    a, b = graph.image_of[graph.source], graph.image_of[graph.target]
-    pairs = a * n + b
-    matches, explained = (
-        np.bincount(edges, minlength=n * n).reshape(n, n)
-        for edges in (pairs, pairs[scene.explained_edges()])
-    )
-    return matches, explained
-
-
-def compute_widest_paths(capacities: Int64) -> Int64:
-    """Compute the capacity of the widest path between each two graph nodes (Kruskal).
-
-    The capacity of a path is the smallest capacity of its edges, and a lower bound of the maximum
-    flow.
+def count_pair_matches(scene: Scene, min_matches: int = 0) -> PairCounts:
+    """Count the explained and the contradicting matches of each pair of images.
 
     Args:
-        capacities: (n, n) symmetric capacities of the graph edges, 0 without an edge.
+        scene: The scene with the registered images.
+        min_matches: Smallest number of matches of a pair that can contradict poses.
+    """
+    graph, n = scene.graph, scene.num_images
+    a, b = graph.image_of[graph.source], graph.image_of[graph.target]
+    once = a < b
+    keys, pair_of, matches = np.unique(
+        a[once] * n + b[once], return_inverse=True, return_counts=True
+    )
+    explained = np.bincount(pair_of[scene.explained_edges()[once]], minlength=len(keys))
+    is_explained = explained > MAX_EXPLAINED_RATIO * matches
+    contradicting = np.where(is_explained | (matches < min_matches), 0, matches)
+    return PairCounts(keys // n, keys % n, explained, contradicting, is_explained)
+
+
+def compute_widest_paths(counts: PairCounts, pairs: Int64, num_images: int) -> Int64:
+    """Compute the capacity of the widest path of explained matches between images.
+
+    The capacity of a path is the smallest number of explained matches of its edges, and a lower
+    bound of the maximum flow. The widest path is in the maximum spanning tree.
+
+    Args:
+        counts: Numbers of matches of all image pairs.
+        pairs: (q, 2) pairs of different images.
+        num_images: Number of images.
 
     Returns:
-        (n, n) symmetric path capacities, 0 for nodes that are not connected.
+        (q,) path capacities, 0 for images that are not connected.
     """
-    widest = np.zeros_like(capacities)
-    component = [np.array([node]) for node in range(len(capacities))]
-    a, b = np.nonzero(np.triu(capacities))
-    for edge in np.argsort(-capacities[a, b], kind="stable"):
-        component_a, component_b = component[a[edge]], component[b[edge]]
-        if component_a is component_b:
-            continue
-        capacity = capacities[a[edge], b[edge]]
-        widest[np.ix_(component_a, component_b)] = capacity
-        widest[np.ix_(component_b, component_a)] = capacity
-        merged = np.concatenate([component_a, component_b])
-        for node in merged:
-            component[node] = merged
-    return widest
+    tree = _find_spanning_forest(counts, num_images).tocoo()
+    parent, root, depth, _ = _root_forest(np.stack([tree.row, tree.col], axis=1), num_images)
+    capacity = np.zeros(num_images, dtype=np.int64)  # of the edge to the parent
+    child = np.where(parent[tree.row] == tree.col, tree.row, tree.col)
+    capacity[child] = np.rint(1.0 / tree.data)
+    is_connected = root[pairs[:, 0]] == root[pairs[:, 1]]
+    widths = np.zeros(len(pairs), dtype=np.int64)
+    widths[is_connected] = _climb(pairs[is_connected], parent, depth, capacity)[1]
+    return widths
 
 
-def _find_contradicted_images(
-    registered: Bool, contradicting: Int64, explained: Int64
-) -> list[tuple[int, int]]:
+def _mask(images: Any, registered: Bool) -> Bool:
+    """Return a bool mask (n,) of the given images."""
+    mask = np.zeros_like(registered)
+    mask[images] = True
+    return mask
+
+
+def _find_contradicted_images(counts: PairCounts, num_images: int) -> list[tuple[int, int]]:
     """Return registered images with clearly more contradicting than explained matches.
 
     Args:
-        registered: (n,) bool.
-        contradicting: (n, n) number of unexplained matches of each contradicting image pair.
-        explained: (n, n) number of matches of each image pair that observe common points.
+        counts: Numbers of matches of the pairs of registered images.
+        num_images: Number of images.
 
     Returns:
         Images, each with its excess of contradicting matches.
     """
-    contradicting = np.where(registered[:, None] & registered, contradicting, 0)
-    margin = (contradicting - explained).sum(axis=1)
-    std = np.sqrt((contradicting**2 + explained**2).sum(axis=1))
+    ends = np.concatenate([counts.a, counts.b])
+    excess = np.tile(counts.contradicting - counts.explained, 2)
+    squares = np.tile(counts.contradicting**2 + counts.explained**2, 2)
+    margin = np.bincount(ends, excess, num_images)
+    std = np.sqrt(np.bincount(ends, squares, num_images))
     images = np.flatnonzero(margin > MIN_SIGNIFICANCE * std)
     return [(int(image), int(margin[image])) for image in images]
 
 
 def find_contradicted_cuts(
-    registered: Bool,
-    contradicting: Int64,
-    explained: Int64,
-    min_significance: float = MIN_SIGNIFICANCE,
+    counts: PairCounts, registered: Bool, min_significance: float = MIN_SIGNIFICANCE
 ) -> list[ContradictedCut]:
     """Find cuts of the match graph whose matches mostly contradict the poses of the images.
 
@@ -202,36 +257,39 @@ def find_contradicted_cuts(
     rest. The matches of all image pairs across a cut are counted.
 
     Args:
-        registered: (n,) bool.
-        contradicting: (n, n) number of unexplained matches of each contradicting image pair.
-        explained: (n, n) number of matches of each image pair that observe common points.
+        counts: Numbers of matches of the pairs of registered images.
+        registered: (n,) bool mask of the registered images.
         min_significance: Minimum excess of contradicting matches in standard deviations.
     """
-    images = np.flatnonzero(registered)
-    explained = explained[np.ix_(images, images)]
-    contradicting = contradicting[np.ix_(images, images)]
-    costs = np.where(explained > 0, 1.0 / np.maximum(explained, 1), 0)
-    edges = np.argwhere(minimum_spanning_tree(csr_array(costs)).toarray() > 0)
-    a, b = np.nonzero(np.triu(explained + contradicting))
-    against, support = contradicting[a, b], explained[a, b]
-    counts = [against, support, against**2 + support**2, support > 0, against > 0]
-    sums = sum_across_tree_cuts(edges, np.stack([a, b], axis=1), np.stack(counts, 1), len(images))
+    num_images = len(registered)
+    forest = _find_spanning_forest(counts, num_images).tocoo()
+    edges = np.stack([forest.row, forest.col], axis=1)
+    against, support = counts.contradicting, counts.explained
+    values = [against, support, against**2 + support**2, support > 0, against > 0]
+    pairs = np.stack([counts.a, counts.b], axis=1)
+    sums = sum_across_tree_cuts(edges, pairs, np.stack(values, axis=1), num_images)
     margins, stds = sums[:, 0] - sums[:, 1], np.sqrt(sums[:, 2])
     cuts = []
     for row in np.flatnonzero(margins > min_significance * stds):
         others = np.delete(edges, row, axis=0)
-        forest = csr_array((np.ones(len(others)), others.T), shape=explained.shape)
-        part_of = connected_components(forest, directed=False)[1]
+        rest = csr_array((np.ones(len(others)), others.T), shape=forest.shape)
+        part_of = connected_components(rest, directed=False)[1]
         inside = part_of == part_of[edges[row, 0]]
-        if 2 * inside.sum() > len(images):
-            inside = ~inside
-        smaller_part = np.zeros_like(registered)
-        smaller_part[images[inside]] = True
+        if 2 * inside.sum() > registered.sum():
+            inside = registered & ~inside
         num_supporting, num_contradicting = map(int, sums[row, 3:])
-        cuts.append(
-            ContradictedCut(smaller_part, int(margins[row]), num_supporting, num_contradicting)
-        )
+        cuts.append(ContradictedCut(inside, int(margins[row]), num_supporting, num_contradicting))
     return cuts
+
+
+def _find_spanning_forest(counts: PairCounts, num_images: int) -> csr_array:
+    """Find the maximum spanning forest of the numbers of explained matches.
+
+    Returns:
+        (n, n) sparse matrix with the inverse number of explained matches of each forest edge.
+    """
+    costs = np.where(counts.explained > 0, 1.0 / np.maximum(counts.explained, 1), 0.0)
+    return csr_array(minimum_spanning_tree(counts.graph(costs, num_images)))
 
 
 def sum_across_tree_cuts(edges: Int64, pairs: Int64, values: Int64, num_nodes: int) -> Int64:
@@ -249,20 +307,9 @@ def sum_across_tree_cuts(edges: Int64, pairs: Int64, values: Int64, num_nodes: i
     Returns:
         (e, k) sums for each edge.
     """
-    forest = csr_array((np.ones(len(edges)), edges.T), shape=(num_nodes, num_nodes))
-    parent, root = np.full(num_nodes, -1), np.full(num_nodes, -1)
-    order = np.zeros(0, dtype=np.int64)
-    for first in range(num_nodes):
-        if root[first] < 0:
-            nodes, parents = breadth_first_order(forest, first, directed=False)
-            parent[nodes[1:]], root[nodes] = parents[nodes[1:]], first
-            order = np.concatenate([order, nodes])
-    depth = np.zeros(num_nodes, dtype=np.int64)
-    for node in order:
-        if parent[node] >= 0:
-            depth[node] = depth[parent[node]] + 1
+    parent, root, depth, order = _root_forest(edges, num_nodes)
     is_inner = root[pairs[:, 0]] == root[pairs[:, 1]]
-    ancestor = _find_common_ancestors(pairs[is_inner], parent, depth)
+    ancestor, _ = _climb(pairs[is_inner], parent, depth, np.zeros(num_nodes, dtype=np.int64))
     # sums over subtrees of: the pairs of each node, those within its tree, and pairs in the subtree
     ends = np.zeros((3, num_nodes, values.shape[1]), dtype=np.int64)
     for column in range(2):
@@ -284,31 +331,79 @@ def sum_across_tree_cuts(edges: Int64, pairs: Int64, values: Int64, num_nodes: i
     return sums
 
 
-def _find_common_ancestors(pairs: Int64, parent: Int64, depth: Int64) -> Int64:
-    """Return the lowest common ancestor (p,) of each pair (p, 2) of nodes of the same tree."""
+def _root_forest(edges: Int64, num_nodes: int) -> tuple[Int64, Int64, Int64, Int64]:
+    """Root each tree of a forest at its first node.
+
+    Args:
+        edges: (e, 2) edges of the forest.
+        num_nodes: Number of nodes.
+
+    Returns:
+        Parent (n,) of each node, -1 for roots, root (n,) of each node, depth (n,) of each node, and
+        all nodes in an order that has parents before children.
+    """
+    forest = csr_array((np.ones(len(edges)), edges.T), shape=(num_nodes, num_nodes))
+    # an extra root node joins all trees, so that one traversal visits all nodes
+    label = connected_components(forest, directed=False)[1]
+    first = np.unique(label, return_index=True)[1]
+    joined = np.concatenate([edges, np.stack([np.full(len(first), num_nodes), first], axis=1)])
+    graph = csr_array((np.ones(len(joined)), joined.T), shape=(num_nodes + 1,) * 2)
+    order, parent = breadth_first_order(graph, num_nodes, directed=False)
+    order, parent = order[1:].astype(np.int64), parent[:-1].astype(np.int64)
+    parent[first] = -1
+    depth = np.zeros(num_nodes, dtype=np.int64)
+    for node in order:
+        if parent[node] >= 0:
+            depth[node] = depth[parent[node]] + 1
+    return parent, first[label], depth, order
+
+
+def _climb(pairs: Int64, parent: Int64, depth: Int64, capacity: Int64) -> tuple[Int64, Int64]:
+    """Climb a tree from both nodes of each pair (p, 2) to their lowest common ancestor.
+
+    Args:
+        pairs: (p, 2) pairs of nodes of the same tree.
+        parent: (n,) parent of each node.
+        depth: (n,) depth of each node.
+        capacity: (n,) capacity of the edge from each node to its parent.
+
+    Returns:
+        Common ancestors (p,), and smallest capacities (p,) of the edges of the path.
+    """
     a: Int64 = pairs[:, 0].copy()
     b: Int64 = pairs[:, 1].copy()
+    width = np.full(len(pairs), np.iinfo(np.int64).max)
     active = np.flatnonzero(a != b)
     while len(active):
         a_active, b_active = a[active], b[active]
         a_moves = depth[a_active] >= depth[b_active]
         b_moves = depth[b_active] >= depth[a_active]
+        for nodes, moves in ((a_active, a_moves), (b_active, b_moves)):
+            width[active[moves]] = np.minimum(width[active[moves]], capacity[nodes[moves]])
         a[active] = np.where(a_moves, parent[a_active], a_active)
         b[active] = np.where(b_moves, parent[b_active], b_active)
         active = active[a[active] != b[active]]
-    return a
+    return a, width
 
 
-def _count_separating_matches(registered: Bool, contradicting: Int64) -> Int64:
-    """Count the matches that contradict the poses of two images, as a table (n, n) of pairs.
+def _count_separating_matches(counts: PairCounts, registered: Bool) -> dict[tuple[int, int], int]:
+    """Count the matches that contradict the poses of two registered images, by pair ``a < b``.
 
     A pair has at least the number of its unexplained matches. If an unregistered image matches both
     images of the pair, the pair has at least the smaller of these two numbers of matches.
     """
-    both_registered = registered[:, None] & registered
-    separating = np.where(both_registered, contradicting, 0)
-    for image in np.flatnonzero(~registered):
-        counts = np.where(registered, contradicting[image], 0)
-        separating = np.maximum(separating, np.minimum(counts[:, None], counts))
-    np.fill_diagonal(separating, 0)
+    rows = np.flatnonzero(counts.contradicting > 0)
+    a, b, matches = (values[rows].tolist() for values in (counts.a, counts.b, counts.contradicting))
+    separating: dict[tuple[int, int], int] = {}
+    partners: dict[int, list[tuple[int, int]]] = {}
+    for first, second, number in zip(a, b, matches, strict=True):
+        if registered[first] and registered[second]:
+            separating[first, second] = number
+        elif registered[first] or registered[second]:
+            image, other = (second, first) if registered[first] else (first, second)
+            partners.setdefault(image, []).append((other, number))
+    for matched in partners.values():
+        for (first, number_a), (second, number_b) in combinations(sorted(matched), 2):
+            number = min(number_a, number_b)
+            separating[first, second] = max(separating.get((first, second), 0), number)
     return separating

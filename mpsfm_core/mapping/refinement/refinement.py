@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.data.camera_models import IntrinsicParameter
@@ -116,7 +117,7 @@ class Refiner:
             matches.
     """
 
-    def __init__(self, scene: Scene, options: MapperOptions, scores: Float64) -> None:
+    def __init__(self, scene: Scene, options: MapperOptions, scores: csr_array) -> None:
         self.scene = scene
         self.options = options.refinement
         self.triangulation = options.triangulation

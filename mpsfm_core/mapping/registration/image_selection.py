@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import csr_array
 
-from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.data import Bool, Int64
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.scene.scene import Scene
 
 
-def compute_pair_scores(scene: Scene, criterion: str) -> Float64:
+def compute_pair_scores(scene: Scene, criterion: str) -> csr_array:
     """Compute the matching score of every two images.
 
     Args:
@@ -18,18 +19,24 @@ def compute_pair_scores(scene: Scene, criterion: str) -> Float64:
             counts the matches.
 
     Returns:
-        (n, n) symmetric float64 matching scores, 0 for images without verified matches.
+        (n, n) symmetric sparse matrix of float64 matching scores.
     """
-    scores = np.zeros((scene.num_images, scene.num_images))
-    for row, pair in enumerate(scene.problem.pairs):
-        use_match_scores = criterion == "match-scores"
-        score = scene.graph.pair_scores[row] if use_match_scores else float(len(pair))
-        scores[pair.image_a, pair.image_b] = scores[pair.image_b, pair.image_a] = score
+    pairs = scene.problem.pairs
+    counts = np.array([len(pair) for pair in pairs], dtype=np.float64)
+    values = scene.graph.pair_scores if criterion == "match-scores" else counts
+    a = np.array([pair.image_a for pair in pairs], dtype=np.int64)
+    b = np.array([pair.image_b for pair in pairs], dtype=np.int64)
+    ends = np.concatenate([a, b]), np.concatenate([b, a])
+    scores = csr_array((np.tile(values, 2), ends), shape=(scene.num_images, scene.num_images))
+    scores.sort_indices()
     return scores
 
 
 def rank_next_images(
-    scene: Scene, scores: Float64, candidates: Bool, options: RegistrationOptions
+    scene: Scene,
+    scores: csr_array,
+    candidates: Bool,
+    options: RegistrationOptions,
 ) -> list[tuple[int, int]]:
     """Rank the unregistered candidate images, best first (COLMAP's ``FindNextImages``).
 
@@ -42,16 +49,17 @@ def rank_next_images(
     Returns:
         Candidate images, best first, each with its best matching registered image.
     """
-    images = np.flatnonzero(candidates & ~scene.registered)
-    registered = scene.registered_images()
-    if not len(images) or not len(registered):
-        return []
-    pair_scores = scores[np.ix_(images, registered)]
-    rank = pair_scores.max(axis=1)
-    if options.next_view == "visible-points":
-        rank = np.where(rank > 0, _count_visible_points(scene)[images], 0)
-    order = [int(k) for k in np.argsort(-rank, kind="stable") if rank[k] > 0]
-    return [(int(images[k]), int(registered[pair_scores[k].argmax()])) for k in order]
+    visible = _count_visible_points(scene) if options.next_view == "visible-points" else None
+    ranked = []
+    for image in map(int, np.flatnonzero(candidates & ~scene.registered)):
+        row = slice(*scores.indptr[image : image + 2])
+        matching, values = scores.indices[row], scores.data[row]
+        usable = scene.registered[matching] & (values > 0)
+        if usable.any():
+            best = int(np.where(usable, values, 0).argmax())
+            rank = float(values[best] if visible is None else visible[image])
+            ranked.append((-rank, image, int(matching[best])))
+    return [(image, best_match) for _, image, best_match in sorted(ranked)]
 
 
 def _count_visible_points(scene: Scene) -> Int64:

@@ -6,6 +6,7 @@ from collections import defaultdict
 from typing import NamedTuple
 
 import numpy as np
+from scipy.sparse import csr_array
 
 from mpsfm_core.data import Bool
 from mpsfm_core.data.decisions import ImageReason, Reason, reason_from_json
@@ -29,12 +30,12 @@ class RegistrationHistory:
     """Record of the registration attempts within one component.
 
     Attributes:
-        excluded_references: (n, n) bool mask of the images ``i`` that must not be registered with
-            reference image ``j``, because their matches led to a pose with contradicting depth.
+        excluded_references: Reference images with which each image must not be registered, because
+            their matches led to a pose with contradicting depth.
     """
 
-    def __init__(self, num_images: int, options: RegistrationOptions) -> None:
-        self.excluded_references: Bool = np.zeros((num_images, num_images), dtype=np.bool_)
+    def __init__(self, options: RegistrationOptions) -> None:
+        self.excluded_references: dict[int, set[int]] = defaultdict(set)
         self._options = options
         self._num_searches: dict[int, int] = defaultdict(int)
         self._last_attempts: dict[int, _Attempt] = {}
@@ -110,16 +111,27 @@ class RegistrationHistory:
         """Allow rejected poses again after poses or points of the scene have changed."""
         self._rejected_poses.clear()
 
+    def select_scores(self, scores: csr_array, *, excluded: bool) -> csr_array:
+        """Select the matching scores (n, n) of the excluded, or of all other, reference images."""
+        is_excluded = np.zeros(len(scores.data), dtype=np.bool_)
+        for image, references in self.excluded_references.items():
+            row = slice(*scores.indptr[image : image + 2])
+            is_excluded[row] = np.isin(scores.indices[row], list(references))
+        selected = np.where(is_excluded == excluded, scores.data, 0.0)
+        return csr_array((selected, scores.indices, scores.indptr), shape=scores.shape)
+
     def clear(self) -> None:
         """Allow all registration attempts again after the scene was refined or corrected."""
-        self.excluded_references[:] = False
+        self.excluded_references.clear()
         self._last_attempts.clear()
         self.clear_pose_rejections()
 
     def state_dict(self) -> StateDict:
         """Return the recorded registration attempts and rejections for a checkpoint."""
         return {
-            "excluded_references": self.excluded_references,
+            "excluded_references": [
+                (image, sorted(excluded)) for image, excluded in self.excluded_references.items()
+            ],
             "num_searches": list(self._num_searches.items()),
             "last_attempts": [
                 {"image": image, "references": references, "pose": pose and {**vars(pose)}}
@@ -137,7 +149,9 @@ class RegistrationHistory:
 
     def load_state_dict(self, state: StateDict) -> None:
         """Restore the recorded registration attempts and rejections from a checkpoint."""
-        self.excluded_references = state["excluded_references"]
+        self.excluded_references.update(
+            (image, set(excluded)) for image, excluded in state["excluded_references"]
+        )
         self._num_searches.update(state["num_searches"])
         for attempt in state["last_attempts"]:
             pose = attempt["pose"] and ScoredPose(**attempt["pose"])

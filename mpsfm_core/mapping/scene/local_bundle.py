@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import csr_array
 
-from mpsfm_core.data import Float64
 from mpsfm_core.mapping.scene.scene import Scene
 
 
-def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: Float64) -> list[int]:
+def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: csr_array) -> list[int]:
     """Return an image and the registered images that share most 3D points with the image.
 
     If fewer than ``num_neighbors`` images share points, the images with the most matches are added.
@@ -22,8 +22,9 @@ def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: Floa
     observations = np.flatnonzero(tracks.point_of >= 0)
     shared = is_observed[tracks.point_of[observations]]
     counts = np.bincount(graph.image_of[observations[shared]], minlength=scene.num_images)
-    order = np.lexsort((-scores[image], -counts))
-    usable = scene.registered & ((counts > 0) | (scores[image] > 0))
+    score = scores[[image]].toarray()[0]
+    order = np.lexsort((-score, -counts))
+    usable = scene.registered & ((counts > 0) | (score > 0))
     usable[image] = False
     neighbors = [int(k) for k in order if usable[k]]
     return [image, *neighbors[:num_neighbors]]

@@ -63,6 +63,7 @@ class Scene:
         distorted_keypoints: (k, 2) float64 keypoints of all images in pixels, with the radial
             distortion of the lens.
         keypoints: (k, 2) float64 keypoints of all images in pixels, without radial distortion.
+        image_sizes: (n, 2) float64 width and height of each image in pixels.
         keypoint_std_px: (n,) float64 standard deviation of the keypoint positions of each image, in
             pixels.
         maps: Depth map of each image.
@@ -79,6 +80,9 @@ class Scene:
             [np.zeros((0, 2)), *(image.keypoints for image in problem.images)]
         )
         self.distorted_keypoints: Float64 = self.keypoints.copy()
+        self.image_sizes: Float64 = np.array(
+            [image.camera.size for image in problem.images], dtype=np.float64
+        ).reshape(-1, 2)
         self.keypoint_std_px: Float64 = np.array([i.keypoint_std_px for i in problem.images])
         self.intrinsics: Float64 = np.array([image.camera.params for image in problem.images])
         self.distortion: Float64 = np.array([image.distortion for image in problem.images])
