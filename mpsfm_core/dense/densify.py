@@ -17,10 +17,9 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, View
 from mpsfm_core.dense.dense_view import DenseView, PosedGrid
@@ -56,9 +55,9 @@ from mpsfm_core.dense.stereo import (
 from mpsfm_core.dense.view_selection import select_source_views
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.support.disk_arrays import ArrayStore, store_fields, store_in_memory
 from mpsfm_core.support.threads import thread_limit
 
-_T = TypeVar("_T", bound=np.generic)
 _NUM_SOURCES = 5
 """Maximum number of source views per reference view. More source views give more complete depth,
 but stereo takes longer [ours]."""
@@ -97,19 +96,6 @@ class DenseReport:
     def describe(self) -> dict[str, Any]:
         """Return the densification entries of `summary.json`."""
         return {"sources": self.sources, "confirmed": self.confirmed}
-
-
-class ArrayStore(Protocol):
-    """Callable that stores a large array in memory or on disk."""
-
-    def __call__(self, array: NDArray[_T]) -> NDArray[_T]:
-        """Store an array in memory or on disk, and return a stored array with equal values."""
-        ...
-
-
-def store_in_memory(array: NDArray[_T]) -> NDArray[_T]:
-    """Return the array unchanged, as an :class:`ArrayStore` without files."""
-    return array
 
 
 class StereoCheckpoints(Protocol):
@@ -412,6 +398,4 @@ def _replace_depth(
     depth = np.exp(posterior.log_depth)
     variance = (posterior.log_std**2 + np.float32(scale_std**2)) * depth**2
     prior = DepthPrior.from_arrays(depth, variance, view.usable, metric=image.depth.metric)
-    assert prior.variance is not None
-    maps = store_array(prior.depth), store_array(prior.variance), store_array(prior.valid)
-    return replace(image, depth=DepthPrior(*maps, metric=prior.metric))
+    return replace(image, depth=store_fields(prior, store_array))

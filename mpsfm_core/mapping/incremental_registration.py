@@ -205,8 +205,6 @@ class IncrementalRegistration:
                 self._history.reject_pose(image, pose, reason)
                 scene.restore(snapshot)
                 self._refiner.noise = noise
-                for member in scene.rigs.images_of(image):
-                    self._refiner.discard_integrator(member)
         return reason
 
     def _extend_model(

@@ -241,7 +241,6 @@ class ModelMaintenance:
                 continue
             self._checked[image] = False
             self.scene.deregister(image)
-            self.refiner.discard_integrator(image)
             self.history.clear_pose_rejections()
             self.event_log.rejected(image, reason)
 

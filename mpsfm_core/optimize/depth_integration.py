@@ -188,6 +188,12 @@ class DepthIntegrator:
             )
             self._coarse = DepthIntegrator(*parts, options)
 
+    @property
+    def nbytes(self) -> int:
+        """Size of the arrays of the integrator in bytes, without those of the priors."""
+        own: int = self._active.nbytes + self._precision.nbytes + self._log_depth.nbytes
+        return own + (self._coarse.nbytes if self._coarse else 0)
+
     def refine(
         self,
         anchors: Anchors = NO_ANCHORS,

@@ -299,7 +299,8 @@ class _Run:
             self._fail(images, extraction, mapping, originals)
         self._warn_of_uncalibrated_rigs(mapping.reconstructions[0])
         with self._stages.stage("mapping"):
-            compute_depth_maps(mapping.reconstructions)
+            computed = compute_depth_maps(mapping.reconstructions, self._disk_arrays().store)
+            mapping = replace(mapping, reconstructions=computed)
         mapping = self._georeference(images, mapping)
         mapping = self._densify(hold_out(mapping, self._config.dense.hold_out_every), originals)
         self._localize_frames(mapping, originals)
@@ -501,7 +502,7 @@ class _Run:
         if not config.dense.enabled:
             return mapping
         dense_parts, self._dense_reports = [], []
-        disk = DiskArrays(cache_folder(config.runtime.cache_dir))
+        disk = self._disk_arrays()
         with self._stages.stage("dense"):
             for part in mapping.reconstructions:
                 dense, report = densify(
@@ -517,6 +518,10 @@ class _Run:
                 dense_parts.append(dense)
                 self._dense_reports.append(report.describe())
         return replace(mapping, reconstructions=tuple(dense_parts))
+
+    def _disk_arrays(self) -> DiskArrays:
+        """Return a storage of depth maps, in memory up to a limit and then in temporary files."""
+        return DiskArrays(cache_folder(self._config.runtime.cache_dir))
 
     def _localize_frames(self, mapping: MappingResult, originals: OriginalImages) -> None:
         """Estimate the poses of the frames of each video between its keyframes."""

@@ -7,14 +7,16 @@ import mmap
 import tempfile
 import threading
 import weakref
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T", bound=np.generic)
+_Item = TypeVar("_Item")
 
 MEMORY_LIMIT = 2**29
 """Maximum bytes of arrays in memory, enough for about 80 images of the dense stage [ours]."""
@@ -22,6 +24,27 @@ _MIN_FILE_BYTES = 2**26
 """Minimum size of a temporary file in bytes, because a process may open only 1024 files."""
 _ALIGNMENT = 64
 """Alignment of arrays in a file, in bytes."""
+
+
+class ArrayStore(Protocol):
+    """Callable that stores a large array in memory or on disk."""
+
+    def __call__(self, array: NDArray[_T]) -> NDArray[_T]:
+        """Store an array in memory or on disk, and return a stored array with equal values."""
+        ...
+
+
+def store_in_memory(array: NDArray[_T]) -> NDArray[_T]:
+    """Return the array unchanged, as an :class:`ArrayStore` without files."""
+    return array
+
+
+def store_fields(item: _Item, store: ArrayStore) -> _Item:
+    """Return a copy of a dataclass instance whose arrays are stored."""
+    values = {field.name: getattr(item, field.name) for field in fields(item)}  # type: ignore[arg-type]
+    arrays = {name: store(value) for name, value in values.items() if isinstance(value, np.ndarray)}
+    copied: _Item = replace(item, **arrays)  # type: ignore[type-var]
+    return copied
 
 
 class DiskArrays:

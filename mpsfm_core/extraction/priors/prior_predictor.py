@@ -7,6 +7,7 @@ import numpy as np
 from mpsfm_core.config import Config
 from mpsfm_core.data import DepthPrior, NormalPrior
 from mpsfm_core.data.errors import ConfigError
+from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.matching.pair_matching import CandidateMatches, PairMatcher
 from mpsfm_core.extraction.priors import prior_maps as priors
@@ -16,6 +17,7 @@ from mpsfm_core.providers import Kind
 from mpsfm_core.providers.provider_config import FROM_MATCHER, FROM_MULTIVIEW
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
+from mpsfm_core.support.disk_arrays import DiskArrays, store_fields
 
 
 class PriorPredictor:
@@ -46,10 +48,14 @@ class PriorPredictor:
         assert isinstance(normal_calibration, NormalCalibration)
         self._depth_calibration = depth_calibration
         self._normal_calibration = normal_calibration
+        self._disk = DiskArrays(cache_folder(config.runtime.cache_dir))
         self._best = _best_pairs(candidates) if config.depth.use == FROM_MATCHER else None
 
     def run(self) -> list[tuple[DepthPrior, NormalPrior]]:
-        """Compute depth and normals of each image on the mapper's grid, with variances."""
+        """Compute depth and normals of each image on the mapper's grid, with variances.
+
+        The maps of many images are in temporary files of the cache folder.
+        """
         images = range(len(self._context.images))
         depth = self._raw.depth
         if not depth.can("uncached"):
@@ -63,8 +69,10 @@ class PriorPredictor:
         self.predicted(index)
 
     def _prepare_maps(self, index: int) -> tuple[DepthPrior, NormalPrior]:
-        depth, normals = self.full_size(index)
-        return self._on_grid(index, depth, self._normal_calibration.apply(normals))
+        raw_depth, raw_normals = self.full_size(index)
+        raw_normals = self._normal_calibration.apply(raw_normals)
+        depth, normals = self._on_grid(index, raw_depth, raw_normals)
+        return store_fields(depth, self._disk.store), store_fields(normals, self._disk.store)
 
     def full_size(self, index: int) -> tuple[DepthPrior, NormalPrior]:
         """Return full-size calibrated depth and uncalibrated normals of an image from the cache."""

@@ -65,6 +65,8 @@ PIXEL_STRIDE = 2
 MIN_SIGNIFICANCE = 3.0
 """Difference between the violation ratio of a quarter of the pixels and its limit, in standard
 deviations of the ratio, beyond which the other pixels are skipped. [ours]"""
+CACHED_BYTES = 1 << 29
+"""Size limit of the cached subsampled depth maps of all images, bytes. [ours]"""
 OVERLAP_GRID = 16
 """Columns and rows of the pixel grid that measures the overlap of two images. [ours]"""
 MIN_OVERLAP_RATIO = 0.05
@@ -98,6 +100,7 @@ class DepthConsistencyCheck:
         self._options = options
         self._fill_holes = fill_holes
         self._grids: dict[tuple[int, bool], tuple[_DepthMapState, _DepthGrid]] = {}
+        self._num_bytes = 0
 
     def check_image(
         self,
@@ -228,7 +231,7 @@ class DepthConsistencyCheck:
             refinement = self._scene.maps[image].refinement if cached["has_refinement"] else None
             camera = PinholeCamera(**cached["camera"])
             key = _DepthMapState(refinement, cached["scale"], camera, cached["std_factor"])
-            self._grids[image, cached["refined"]] = key, _DepthGrid(**cached["grid"])
+            self._add_grid((image, cached["refined"]), (key, _DepthGrid(**cached["grid"])))
 
     def _get_grid(self, image: int, std_factor: float, *, refined: bool) -> _DepthGrid:
         """Return the subsampled depth map of an image, from the cache if the map is unchanged."""
@@ -237,9 +240,17 @@ class DepthConsistencyCheck:
         cached = self._grids.get((image, refined))
         if cached is None or cached[0] != state:
             depth = depth_map.depth if refined else depth_map.scaled_prior
-            grid = self._make_grid(image, depth, std_factor)
-            cached = self._grids[image, refined] = state, grid
+            cached = state, self._make_grid(image, depth, std_factor)
+            self._add_grid((image, refined), cached)
         return cached[1]
+
+    def _add_grid(self, key: tuple[int, bool], cached: tuple[_DepthMapState, _DepthGrid]) -> None:
+        """Add a subsampled depth map to the cache, and remove the oldest above a total size."""
+        replaced = self._grids.pop(key, None)
+        self._num_bytes += cached[1].nbytes - (replaced[1].nbytes if replaced else 0)
+        self._grids[key] = cached
+        while self._num_bytes > CACHED_BYTES and len(self._grids) > 2:
+            self._num_bytes -= self._grids.pop(next(iter(self._grids)))[1].nbytes
 
     def _make_grid(self, image: int, depth: Float32, std_factor: float) -> _DepthGrid:
         depth_map = self._scene.maps[image]
@@ -369,6 +380,11 @@ class _DepthGrid(NamedTuple):
     """(h, w) smallest depth in the 3 x 3 neighborhood, in world units."""
     intrinsics: Float64
     """(4,) intrinsics fx, fy, cx, cy in pixels of the subsampled grid."""
+
+    @property
+    def nbytes(self) -> int:
+        """Size of all arrays in bytes."""
+        return sum(array.nbytes for array in self)
 
 
 class _DepthMapState(NamedTuple):

@@ -8,13 +8,13 @@ Therefore bundle adjustment uses the scaled depth priors, unless the option ``bu
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_array
 
-from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.data import Bool, DepthPrior, Float64, Int64, NormalPrior, PinholeCamera
 from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.depth_noise import DepthNoise, measure_depth_noise
@@ -42,14 +42,20 @@ from mpsfm_core.optimize.covariance import (
     compute_pose_covariance,
     propagate_depth_variance,
 )
-from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator
-from mpsfm_core.optimize.options import SOFT_L1_OPTIONS, BundleOptions, Loss
+from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator, RefinedDepth
+from mpsfm_core.optimize.options import (
+    SOFT_L1_OPTIONS,
+    BundleOptions,
+    IntegrationOptions,
+    Loss,
+)
 from mpsfm_core.optimize.subsampling import (
     compute_subsampling_step,
     subsample_camera,
     subsample_pixels,
     subsample_prior,
 )
+from mpsfm_core.support.lru_cache import LruCache
 
 MAX_LOCAL_TRACK_LENGTH = 15
 """Track length above which a point stays fixed in local bundle adjustment.
@@ -80,6 +86,8 @@ MIN_SCALE_POINTS = 20
 """Smallest number of well triangulated points for which the depth scale shared by several images is
 estimated again. [ours]"""
 
+CACHED_BYTES = 1 << 28
+"""Size limit of the cached depth integrators of all images, bytes. [ours]"""
 MEDIAN_ERROR = float(np.sqrt(2 * np.log(2)))
 """Median length of a vector of two standard normal variables, such as a reprojection error."""
 _OBSERVATION_FIELDS = (
@@ -90,6 +98,41 @@ _OBSERVATION_FIELDS = (
     "obs_log_depth",
     "obs_std_log_depth",
 )
+
+
+@dataclass(frozen=True, eq=False)
+class _CachedIntegrator:
+    """Depth integrator of an image, which is created when used and may be evicted from a cache."""
+
+    cache: LruCache[tuple[int, PinholeCamera], DepthIntegrator]
+    image: int
+    prior: DepthPrior
+    normals: NormalPrior
+    camera: PinholeCamera
+    """Camera of the subsampled depth map."""
+    step: int
+    """Subsampling step of the depth map."""
+    std_factor: float
+    """Factor on the declared standard deviation of the depth prior."""
+    options: IntegrationOptions
+
+    def refine(self, anchors: Anchors, *, scale: float, start: RefinedDepth | None) -> RefinedDepth:
+        """Refine the depth map, see :meth:`DepthIntegrator.refine`."""
+        integrator = self.cache.get((self.image, self.camera), self._create)
+        return integrator.refine(anchors, scale=scale, start=start)
+
+    def _create(self) -> DepthIntegrator:
+        prior = subsample_prior(self.prior, self.step)
+        assert prior.variance is not None  # MappingImage checks it
+        variance = prior.variance * np.float32(self.std_factor**2)
+        normals = subsample_prior(self.normals, self.step)
+        return DepthIntegrator(
+            replace(prior, variance=variance), normals, self.camera, self.options
+        )
+
+
+def _create_cache() -> LruCache[tuple[int, PinholeCamera], DepthIntegrator]:
+    return LruCache(CACHED_BYTES, lambda integrator: integrator.nbytes)
 
 
 class _Bundle(NamedTuple):
@@ -129,7 +172,7 @@ class Refiner:
         self.loss_scale = options.refinement.bundle.reprojection_scale
         self.adapts_reprojection_loss = False
         self._integrator_noise = DepthNoise()
-        self._integrators: dict[int, DepthIntegrator] = {}
+        self._integrators = _create_cache()
 
     @property
     def _alternates(self) -> bool:
@@ -515,13 +558,9 @@ class Refiner:
         if depth_maps:
             self.integrate(images)
 
-    def discard_integrator(self, image: int) -> None:
-        """Discard the cached depth integrator of a deregistered image."""
-        self._integrators.pop(image, None)
-
     def reset(self) -> None:
         """Discard all noise measurements and depth integrators, for an empty scene."""
-        self._integrators.clear()
+        self._integrators = _create_cache()
         self.noise = self._integrator_noise = DepthNoise()
         self.loss_scale = self.options.bundle.reprojection_scale
         self.adapts_reprojection_loss = False
@@ -584,28 +623,26 @@ class Refiner:
         ratio = self.noise.multiplier / self._integrator_noise.multiplier
         if not 1 / MAX_NOISE_CHANGE < ratio < MAX_NOISE_CHANGE:
             self._integrator_noise = self.noise
-            self._integrators.clear()
+            self._integrators = _create_cache()
 
-    def _integrator(self, image: int) -> DepthIntegrator:
+    def _integrator(self, image: int) -> _CachedIntegrator:
         """Return the depth integrator of an image, with variance scaled by the measured noise."""
-        depth_map, step = self.scene.maps[image], self._step(image)
+        depth_map, step, noise = self.scene.maps[image], self._step(image), self._integrator_noise
         camera = subsample_camera(depth_map.camera, step)
-        integrator = self._integrators.get(image)
-        if integrator is not None and integrator.camera == camera:
-            return integrator
-        prior, noise = subsample_prior(depth_map.prior, step), self._integrator_noise
-        assert prior.variance is not None  # MappingImage checks it
         options = self.options.integration
         independent_depths = max(
-            noise.independent_pixels(prior.depth.size), options.independent_depths
+            noise.independent_pixels(camera.width * camera.height), options.independent_depths
         )
-        integrator = self._integrators[image] = DepthIntegrator(
-            replace(prior, variance=prior.variance * np.float32(noise.multiplier**2)),
-            subsample_prior(depth_map.normals, step),
+        return _CachedIntegrator(
+            self._integrators,
+            image,
+            depth_map.prior,
+            depth_map.normals,
             camera,
+            step,
+            noise.multiplier,
             options.model_copy(update={"independent_depths": independent_depths}),
         )
-        return integrator
 
     def _step(self, image: int) -> int:
         """Return the subsampling step of the depth map of an image."""

@@ -2,15 +2,42 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from threading import Lock
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage, PinholeCamera
 from mpsfm_core.geometry import sample_bilinear, scale_pixels
-from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator, RefinedDepth
+from mpsfm_core.optimize.depth_integration import NO_ANCHORS, Anchors, RefinedDepth
 from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, upsample
+
+
+class RefinesDepth(Protocol):
+    """Object that refines the depth map of one image, such as a depth integrator."""
+
+    def refine(self, anchors: Anchors, *, scale: float, start: RefinedDepth | None) -> RefinedDepth:
+        """Refine the depth map, see :meth:`DepthIntegrator.refine`."""
+
+
+@dataclass(frozen=True, eq=False)
+class StoredDepth:
+    """Refined depth map of an earlier reconstruction, from which a refinement starts."""
+
+    depth: DepthPrior
+    """Refined depth in world units, on the pixel grid of the depth prior."""
+    width: int
+    """Width to which depth maps are subsampled for refinement."""
+
+    def refine(self, anchors: Anchors, *, scale: float, start: RefinedDepth | None) -> RefinedDepth:
+        """Return the subsampled depth map; ``anchors`` and ``start`` have no effect."""
+        step = compute_subsampling_step(self.depth.shape[1], self.width)
+        values, valid = subsample(self.depth.depth, step), subsample(self.depth.valid, step)
+        known = values[valid].astype(np.float64)
+        log_depth = np.full(values.shape, np.log(np.median(known)) if len(known) else 0.0)
+        log_depth[valid] = np.log(known)
+        return RefinedDepth.from_log_depth(log_depth, valid, scale)
 
 
 class DepthRefinement:
@@ -28,13 +55,13 @@ class DepthRefinement:
 
     def __init__(
         self,
-        integrator: DepthIntegrator,
+        integrator: RefinesDepth,
         anchors: Anchors,
         scale: float,
         previous: DepthRefinement | None = None,
     ) -> None:
         self.scale = scale
-        self._inputs: tuple[DepthIntegrator, Anchors, DepthRefinement | None] | None
+        self._inputs: tuple[RefinesDepth, Anchors, DepthRefinement | None] | None
         self._inputs = integrator, anchors, previous
         self._result: RefinedDepth | None = None
         self._lock = Lock()
@@ -93,7 +120,7 @@ class LazyDepth(DepthPrior):
     The object then becomes an ordinary :class:`~mpsfm_core.data.DepthPrior`.
 
     Args:
-        prior: Unscaled depth prior with variance.
+        prior: Unscaled depth prior, or the depth map of a reconstruction in other units.
         refinement: Refinement of the depth map, or None to use the scaled prior.
         scale: Scale of the depth prior, in world units per unit of the prior.
         metric: True if the world unit is the meter.
@@ -125,9 +152,8 @@ class LazyDepth(DepthPrior):
             depth, scale = refinement.depth(prior), scale / refinement.scale
         depth = depth * np.float32(scale)
         ratio = depth / np.where(prior.valid, prior.depth, np.float32(1))
-        result = DepthPrior.from_arrays(
-            depth, prior.variance * ratio**2, prior.valid, metric=self.metric
-        )
+        variance = None if prior.variance is None else prior.variance * ratio**2
+        result = DepthPrior.from_arrays(depth, variance, prior.valid, metric=self.metric)
         vars(self).update(vars(result))
         del vars(self)["_inputs"], vars(self)["_lock"]
         object.__setattr__(self, "__class__", DepthPrior)
@@ -147,7 +173,6 @@ class DepthMap:
         scale: Scale of the depth prior, in world units per unit of the prior.
         active: True if the scale of the depth prior has been estimated.
         refinement: Last refinement of the depth map, or None before refinement.
-        log_std: (h, w) float32 standard deviation of the log depth prior, 0 where invalid.
         keypoints: (n, 2) float64 keypoints in pixels of the depth map.
         keypoint_valid: (n,) bool mask of the keypoints around which the depth prior is valid.
         keypoint_log_std: (n,) float64 standard deviation of the log depth at the keypoints.
@@ -160,11 +185,6 @@ class DepthMap:
         rows, columns = image.depth.shape
         self.camera = image.camera.resized(columns, rows)
         self.keypoints: Float64 = scale_pixels(image.keypoints, image.camera.size, self.camera.size)
-        variance = image.depth.variance
-        assert variance is not None  # MappingImage checks it
-        self.log_std: Float32 = np.where(
-            image.depth.valid, np.sqrt(variance) / np.maximum(image.depth.depth, 1e-12), 0
-        ).astype(np.float32)
         self._prior_at, self.keypoint_valid = self._sample(image.depth.depth)
         self.keypoint_log_std: Float64 = self._sample(self.log_std)[0]
         known = self.keypoint_log_std[self.keypoint_valid]
@@ -172,8 +192,15 @@ class DepthMap:
         self.scale = 1.0
         self.active = False
         self.refinement: DepthRefinement | None = None
-        self._best: Float32 | None = None
-        self._best_at: Float64 | None = None
+        self._refined_at: Float64 | None = None
+
+    @property
+    def log_std(self) -> Float32:
+        """(h, w) float32 standard deviation of the log depth prior, 0 where invalid."""
+        variance = self.prior.variance
+        assert variance is not None  # MappingImage checks it
+        std = np.sqrt(variance) / np.maximum(self.prior.depth, 1e-12)
+        return np.where(self.prior.valid, std, 0).astype(np.float32)
 
     @property
     def valid(self) -> Bool:
@@ -185,7 +212,8 @@ class DepthMap:
         """(h, w) float32 refined depth, or scaled depth prior, in world units."""
         if self.refinement is None:
             return self.scaled_prior
-        depth: Float32 = self._refined * np.float32(self.scale / self.refinement.scale)
+        refined = self.refinement.depth(self.prior)
+        depth: Float32 = refined * np.float32(self.scale / self.refinement.scale)
         return depth
 
     @property
@@ -208,9 +236,9 @@ class DepthMap:
         """Return the depth (m,) in world units at keypoints with a valid depth prior."""
         if self.refinement is None:
             return self._prior_at[rows] * self.scale
-        if self._best_at is None:
-            self._best_at = self._sample(self._refined)[0]
-        return self._best_at[rows] * (self.scale / self.refinement.scale)
+        if self._refined_at is None:
+            self._refined_at = self._sample(self.refinement.depth(self.prior))[0]
+        return self._refined_at[rows] * (self.scale / self.refinement.scale)
 
     def set_scale(self, scale: float) -> None:
         """Set the scale of the depth prior, and rescale the refined depth by the same factor."""
@@ -218,7 +246,7 @@ class DepthMap:
 
     def set_refinement(self, refinement: DepthRefinement) -> None:
         """Replace the scaled depth prior by the result of a refinement."""
-        self.refinement, self._best, self._best_at = refinement, None, None
+        self.refinement, self._refined_at = refinement, None
         self.set_scale(refinement.scale)
 
     def resume(self, depth: DepthPrior, scale: float, width: int) -> None:
@@ -229,13 +257,7 @@ class DepthMap:
             scale: Scale of the depth prior.
             width: Width to which depth maps are subsampled for refinement.
         """
-        step = compute_subsampling_step(depth.shape[1], width)
-        values, valid = subsample(depth.depth, step), subsample(depth.valid, step)
-        known = values[valid].astype(np.float64)
-        log_depth = np.full(values.shape, np.log(np.median(known)) if len(known) else 0.0)
-        log_depth[valid] = np.log(known)
-        refined = RefinedDepth.from_log_depth(log_depth, valid, scale)
-        self.set_refinement(DepthRefinement.from_result(refined))
+        self.set_refinement(DepthRefinement(StoredDepth(depth, width), NO_ANCHORS, scale))
 
     def set_camera(self, camera: PinholeCamera) -> None:
         """Set the intrinsics of the depth map from a camera in pixels of the image."""
@@ -245,15 +267,7 @@ class DepthMap:
     def reset(self) -> None:
         """Discard the scale and the refined depth of the depth map."""
         self.scale, self.active, self.refinement = 1.0, False, None
-        self._best = self._best_at = None
-
-    @property
-    def _refined(self) -> Float32:
-        """(h, w) float32 refined depth, with the scale of its refinement."""
-        if self._best is None:
-            assert self.refinement is not None
-            self._best = self.refinement.depth(self.prior)
-        return self._best
+        self._refined_at = None
 
     def _sample(self, values: Float32) -> tuple[Float64, Bool]:
         return sample_bilinear(values, self.prior.valid, self.keypoints)

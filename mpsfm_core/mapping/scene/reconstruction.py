@@ -21,11 +21,13 @@ from mpsfm_core.data import (
 from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel, IntrinsicParameter
 from mpsfm_core.data.decisions import CameraReason, Reason, reason_from_json
 from mpsfm_core.mapping.problem_state import rig_from_state, rig_to_state
+from mpsfm_core.mapping.scene.depth_map import LazyDepth
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     CalibrationOutcome,
     IntrinsicEstimate,
 )
 from mpsfm_core.mapping.state import StateDict, reasons_from_json, reasons_to_json
+from mpsfm_core.support.disk_arrays import ArrayStore, store_fields, store_in_memory
 from mpsfm_core.support.threads import parallel_map
 
 _NO_ROWS = np.zeros(0, np.int64)
@@ -257,10 +259,25 @@ class MappingResult:
     report: MappingReport
 
 
-def compute_depth_maps(reconstructions: Iterable[Reconstruction]) -> None:
-    """Compute the depth maps of reconstructions that were not read before, in parallel threads."""
-    images = [image for part in reconstructions for image in part.images]
-    parallel_map(lambda image: image.depth.depth, images)
+def compute_depth_maps(
+    reconstructions: Iterable[Reconstruction], store: ArrayStore = store_in_memory
+) -> tuple[Reconstruction, ...]:
+    """Compute the depth maps of reconstructions in parallel threads.
+
+    Args:
+        reconstructions: Reconstructions, whose depth maps are computed when they are first read.
+        store: Function that stores an array in memory or on disk, and returns an equal array.
+
+    Returns:
+        The reconstructions with stored depth maps.
+    """
+
+    def compute(image: RegisteredImage) -> RegisteredImage:
+        return replace(image, depth=store_fields(image.depth, store))
+
+    return tuple(
+        replace(part, images=tuple(parallel_map(compute, part.images))) for part in reconstructions
+    )
 
 
 def hold_out(mapping: MappingResult, every: int | None) -> MappingResult:
@@ -322,14 +339,12 @@ def transform_reconstruction(
     images = []
     for image in reconstruction.images:
         rotated = image.rotation @ rotation.T
-        depth = image.depth
-        variance = None if depth.variance is None else depth.variance * np.float32(scale**2)
         images.append(
             replace(
                 image,
                 rotation=rotated,
                 translation=scale * image.translation - rotated @ translation,
-                depth=replace(depth, depth=depth.depth * np.float32(scale), variance=variance),
+                depth=LazyDepth(image.depth, None, scale, metric=image.depth.metric),
                 scale=image.scale * scale,
             )
         )

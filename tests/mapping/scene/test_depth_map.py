@@ -38,7 +38,7 @@ def test_reading_the_depth_of_a_reconstruction_refines_it() -> None:
     (priors,) = reconstruct(
         problem, MapperOptions.model_validate({"refinement": {"integrate": False}})
     ).reconstructions
-    compute_depth_maps([eager])
+    (eager,) = compute_depth_maps([eager])
     for image, other, unrefined in zip(model.images, eager.images, priors.images, strict=True):
         assert image.depth.metric == other.depth.metric
         assert type(other.depth) is DepthPrior
