@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -118,11 +118,14 @@ class Component:
             self.maintenance.confirm(image)
         return True
 
-    def initialize_from_model(self, model: Reconstruction) -> bool:
+    def initialize_from_model(self, model: Reconstruction, compared: Sequence[Int64]) -> bool:
         """Register the images of a joined reconstruction, and complete tracks across its parts.
 
-        The depth maps of the parts are kept. The depth of all images is checked, because the parts
-        compared only their own images.
+        The depth maps of the parts are kept. Depth is checked between images of different parts.
+
+        Args:
+            model: Joined reconstruction.
+            compared: Indices of the images of each part, whose depth was compared with each other.
 
         Returns:
             False if fewer than two images observe enough points.
@@ -133,7 +136,7 @@ class Component:
         if self.refiner.can_refine_focals():
             # each part has estimated another focal length, so poses and points were distorted
             self.maintenance.refine_globally()
-        self.maintenance.check_all_images(MAX_FINAL_VIOLATIONS, "final-check")
+        self.maintenance.check_all_images(MAX_FINAL_VIOLATIONS, "final-check", compared)
         if self.size < 2:
             return False
         for image in self._first_images():
@@ -364,9 +367,10 @@ class Component:
 
     def _detect_wrong_focals(self) -> list[Misregistration]:
         """Detect images with their own camera whose points support another focal length."""
-        if not self._options.refinement.refine_focal or not self.size:
-            return []
         problem, options = self.maintenance.problem, self._options
+        is_guessed = any(not image.focal_known for image in problem.images)
+        if not is_guessed or not options.refinement.refine_focal or not self.size:
+            return []
         focals = find_deviating_focals(
             problem, convert_scene(self.scene), options.registration, options.seed, is_shared=False
         )

@@ -31,10 +31,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Float64, MappingProblem
+from mpsfm_core.data import Bool, Float64, Int64, MappingProblem
 from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.checkpoints import Checkpointer, CheckpointStore
 from mpsfm_core.mapping.component import Component, do_nothing
@@ -69,12 +70,24 @@ MIN_ABSORBING_RATIO = 0.25
 components. [ours]"""
 
 
+class JoinedParts(NamedTuple):
+    """Joined reconstructions of overlapping parts, with which the mapper continues."""
+
+    models: Sequence[Reconstruction] = ()
+    """Joined reconstructions, the largest first."""
+    compared: Sequence[Int64] = ()
+    """Indices of the images of each part, whose depth was compared with each other."""
+
+
+NO_PARTS = JoinedParts()
+
+
 def reconstruct(
     problem: MappingProblem,
     options: MapperOptions | None = None,
     events: MappingEvents | None = None,
     checkpoints: CheckpointStore | None = None,
-    initial_models: Sequence[Reconstruction] = (),
+    parts: JoinedParts = NO_PARTS,
 ) -> MappingResult:
     """Reconstruct poses, points and refined depth of all images that can be verified.
 
@@ -91,8 +104,8 @@ def reconstruct(
         options: Options of the mapper.
         events: Receiver of progress events.
         checkpoints: Storage of checkpoints.
-        initial_models: Reconstructions of some images, from which the first components start. With
-            initial models, there is one mapper run.
+        parts: Joined reconstructions of parts, from which the first components start. With parts,
+            there is one mapper run.
 
     Returns:
         Connected components, sorted by decreasing number of images, and the report.
@@ -105,8 +118,8 @@ def reconstruct(
     is_complete = bool(runs) and interrupted is None
     pair_weights = None
     distinct = remove_duplicates(problem, options)
-    if initial_models:
-        initial_problem = calibrate_rigs(distinct, initial_models) or distinct
+    if parts.models:
+        initial_problem = calibrate_rigs(distinct, parts.models) or distinct
     else:
         initial_problem = _calibrate_view_graph(distinct, options)
     for count in range(1, len(runs) + 1):  # completed mapper runs, oldest first
@@ -114,7 +127,7 @@ def reconstruct(
         initial_problem = next_problem or initial_problem
     for number in range(len(runs), 0 if is_complete else options.max_runs):
         run_options = options.model_copy(update={"seed": options.seed + number})
-        mapper = Mapper(initial_problem, run_options, events, pair_weights, initial_models)
+        mapper = Mapper(initial_problem, run_options, events, pair_weights, parts)
         if interrupted is not None:
             mapper.load_state_dict(interrupted)
             interrupted = None
@@ -124,7 +137,7 @@ def reconstruct(
 
         runs.append(mapper.run(save_checkpoint))
         pair_weights = mapper.pair_weights
-        if mapper.is_deterministic or initial_models:
+        if mapper.is_deterministic or parts.models:
             break
         next_problem = _improve_problem(initial_problem, runs, options)
         is_refuted = has_refuted_rigs(initial_problem, runs)
@@ -195,7 +208,7 @@ class Mapper:
         options: MapperOptions,
         events: MappingEvents,
         pair_weights: Float64 | None = None,
-        initial_models: Sequence[Reconstruction] = (),
+        parts: JoinedParts = NO_PARTS,
     ) -> None:
         self.problem = problem
         self.options = options
@@ -203,7 +216,7 @@ class Mapper:
         self.models: list[Reconstruction] = []
         self.unregistered: Bool = np.ones(len(problem.images), dtype=np.bool_)
         self._pair_selector = InitialPairSelector(options)
-        self._initial_models = tuple(initial_models)
+        self._parts = parts
         self._num_components = 0
         self._is_growing = False
         self._uses_known_poses = sum(image.known_pose is not None for image in problem.images) >= 2
@@ -294,7 +307,7 @@ class Mapper:
             self.component.register_images(candidates, save_checkpoint)
             self.component.reregister_images(candidates)
         self._is_growing = False
-        if self._uses_known_poses or self._initial_models or not self._absorb_components():
+        if self._uses_known_poses or self._parts.models or not self._absorb_components():
             self.component.finalize()
         self._store_component()
         if self.is_deterministic:
@@ -322,10 +335,11 @@ class Mapper:
         return self.component.initialize_from_pair(self.unregistered)
 
     def _initialize_from_model(self) -> bool:
-        """Start the component from the next initial model, if one remains."""
-        if self._num_components >= len(self._initial_models):
+        """Start the component from the next joined reconstruction of parts, if one remains."""
+        models, compared = self._parts
+        if self._num_components >= len(models):
             return False
-        if self.component.initialize_from_model(self._initial_models[self._num_components]):
+        if self.component.initialize_from_model(models[self._num_components], compared):
             return True
         self.component = self._create_component()
         return False
@@ -333,7 +347,7 @@ class Mapper:
     def _select_candidates(self) -> Bool:
         """Return the unregistered images (n,), without those of the remaining initial models."""
         candidates: Bool = self.unregistered.copy()
-        for model in self._initial_models[self._num_components + 1 :]:
+        for model in self._parts.models[self._num_components + 1 :]:
             candidates[[image.index for image in model.images]] = False
         return candidates
 
@@ -391,7 +405,9 @@ class Mapper:
         if size >= min_size:
             # known poses define the world and its unit, unless they are only an initial guess
             keep_units = self._uses_known_poses and self.options.known_poses != "guess"
-            errors = self.component.refiner.predict_calibration_errors()
+            refiner = self.component.refiner
+            predicts = self.options.predict_errors
+            errors = refiner.predict_calibration_errors() if predicts else None
             self.models.append(convert_scene(scene, errors, keep_units=keep_units))
         else:
             reason = ImageReason.COMPONENT_TOO_SMALL.because(num_images=size, min_images=min_size)

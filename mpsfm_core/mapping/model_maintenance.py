@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -143,7 +143,9 @@ class ModelMaintenance:
         self.deregister_disconnected(ImageReason.DISCONNECTED.because(step="global-refinement"))
         self.event_log.scene_changed(self.scene)
 
-    def check_all_images(self, max_violations: float, step: str) -> None:
+    def check_all_images(
+        self, max_violations: float, step: str, compared: Sequence[Int64] = ()
+    ) -> None:
         """Deregister images until no two registered images contradict each other's depth.
 
         Image pairs whose depth was compared before are not compared again.
@@ -151,10 +153,11 @@ class ModelMaintenance:
         Args:
             max_violations: Largest accepted share of pixels with contradicting depth.
             step: Name of the mapper step that the recorded rejection reason contains.
+            compared: Sets of images whose depth was compared with each other.
         """
         images = self.scene.registered & ~self._checked
         self._checked |= images
-        conflicting = self._find_conflicts(np.flatnonzero(images), max_violations)
+        conflicting = self._find_conflicts(np.flatnonzero(images), max_violations, compared)
         conflicting = self._select_conflicting_frames(conflicting)
         for image, violation_ratio in conflicting:
             ratio = round(float(violation_ratio), 4)
@@ -260,9 +263,13 @@ class ModelMaintenance:
         if not num_conflicts > len(self._find_conflicts(images, limit)):
             self.scene.restore(after)
 
-    def _find_conflicts(self, images: Int64, limit: float) -> list[tuple[int, float]]:
+    def _find_conflicts(
+        self, images: Int64, limit: float, compared: Sequence[Int64] = ()
+    ) -> list[tuple[int, float]]:
         """Find images to deregister so that no depth map contradicts the depth of ``images``."""
         if not self.options.consistency.enabled:
             return []
         with self.event_log.timed("depth check"):
-            return self._depth_check.find_conflicting_images(images, limit, self.refiner.std_factor)
+            return self._depth_check.find_conflicting_images(
+                images, limit, self.refiner.std_factor, compared
+            )

@@ -219,6 +219,9 @@ class MappingOptions(Options):
     register_tentatively: bool = False
     """Register images that cannot be verified in the best supported poses. Unverified images
     observe no points, and ``summary.json`` lists these images as unconfirmed."""
+    predict_errors: bool = expert(True)
+    """Predict the errors of poses and intrinsics for the report. Parts of a reconstruction are
+    mapped without predictions, because the last refinement predicts the errors of all images."""
     initialization: InitializationOptions = InitializationOptions()
     """Options of the initialization."""
     registration: RegistrationOptions = RegistrationOptions()

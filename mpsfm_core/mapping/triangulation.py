@@ -71,9 +71,7 @@ def extend_tracks(
     keypoints, points = source[continues], tracks.point_of[target[continues]]
     errors_px, _ = scene.project(keypoints, tracks.xyz[points])
     observed = tracks.point_of[scene.graph.keypoints_of(image)]
-    is_observed = np.zeros(len(tracks.xyz), dtype=np.bool_)
-    is_observed[observed[observed >= 0]] = True
-    order = np.flatnonzero((errors_px <= max_error_px) & ~is_observed[points])
+    order = np.flatnonzero((errors_px <= max_error_px) & ~np.isin(points, observed))
     order = order[np.lexsort((points[order], errors_px[order]))]
     order = order[_first_occurrences(keypoints[order])]
     order = order[_first_occurrences(points[order])]

@@ -54,6 +54,9 @@ CG_TOLERANCE = 1e-2
 minimum earlier. [tuned: benchmarks.scale]"""
 MAX_CG_ITERATIONS = 500
 """Maximum number of conjugate-gradient iterations per Levenberg-Marquardt step. [ours]"""
+MAX_RIG_POSES = 500
+"""Maximum number of variable poses for the standard deviation of the scale of a rig, which needs a
+dense factorization. [ours]"""
 MIN_GAIN = 1e-3
 """Smallest ratio of the actual and the predicted decrease of the cost for a step to be accepted.
 [Ceres min_relative_decrease]"""
@@ -87,7 +90,7 @@ class BundleResult:
     rig."""
     std_rig_scale: float = np.inf
     """Posterior standard deviation of the scale of the rig in world units per meter, infinite if
-    the scale is constant or undetermined, or if conjugate gradients solve the reduced system."""
+    the scale is constant or undetermined, or with more than ``MAX_RIG_POSES`` poses."""
 
 
 def start_at(problem: BundleProblem, result: BundleResult) -> BundleProblem:
@@ -299,8 +302,8 @@ class SchurComplementSolver:
 
     def compute_rig_scale_std(self, state: kernels.BundleParameters) -> float:
         """Compute the posterior standard deviation of the scale of the rig, or infinity."""
-        basis = self.basis
-        if basis is None or basis.scale_column is None or not self.dense:
+        basis, num_poses = self.basis, len(self.p.bundle.layout.pair)
+        if basis is None or basis.scale_column is None or num_poses > MAX_RIG_POSES:
             return np.inf
         self.linearize(state, MIN_DAMPING)
         diagonal = self.total.diagonal

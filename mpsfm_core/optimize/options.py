@@ -40,10 +40,9 @@ class BundleOptions(Options):
     max_iterations: int = expert(50, ge=1)
     """Maximum number of Levenberg-Marquardt steps, accepted or rejected. [Ceres
     max_num_iterations]"""
-    dense_poses: int = expert(500, ge=0)
+    dense_poses: int = expert(300, ge=0)
     """Maximum number of variable poses for a dense Cholesky factorization of the reduced camera
-    system. Conjugate gradients solve systems with more poses. [tuned:
-    benchmarks.bundle_adjustment]"""
+    system. Conjugate gradients solve systems with more poses. [tuned: benchmarks.scale]"""
     threads: int | None = expert(None, ge=1)
     """Number of threads of bundle adjustment (null uses all threads of the run). The number of
     threads does not change the result of bundle adjustment."""

@@ -69,6 +69,8 @@ CACHED_BYTES = 1 << 29
 """Size limit of the cached subsampled depth maps of all images, bytes. [ours]"""
 OVERLAP_GRID = 16
 """Columns and rows of the pixel grid that measures the overlap of two images. [ours]"""
+POINT_GROUP = 16
+"""Number of points with a common bounding sphere in the count of visible points. [ours]"""
 MIN_OVERLAP_RATIO = 0.05
 """Minimum share of grid pixels that project into another image for a comparison of both images.
 [ours]"""
@@ -101,6 +103,7 @@ class DepthConsistencyCheck:
         self._fill_holes = fill_holes
         self._grids: dict[tuple[int, bool], tuple[_DepthMapState, _DepthGrid]] = {}
         self._num_bytes = 0
+        self._angles_deg: Float64 | None = None  # of all points, while many images are compared
 
     def check_image(
         self,
@@ -125,7 +128,11 @@ class DepthConsistencyCheck:
         return max(violations, default=DepthViolation(0.0, -1))
 
     def find_conflicting_images(
-        self, images: Sequence[int] | Int64, limit: float, std_factor: float = 1.0
+        self,
+        images: Sequence[int] | Int64,
+        limit: float,
+        std_factor: float = 1.0,
+        compared: Sequence[Int64] = (),
     ) -> list[tuple[int, float]]:
         """Find registered images to deregister such that no contradiction with ``images`` remains.
 
@@ -135,20 +142,26 @@ class DepthConsistencyCheck:
             images: Images whose depth is compared with all overlapping images.
             limit: Violation ratio above which two images contradict each other.
             std_factor: See :meth:`check_image`.
+            compared: Sets of images that are not compared with each other again.
 
         Returns:
             Images to deregister, each with its largest violation ratio.
         """
         scene, num_views = self._scene, self._options.num_views
         candidates = _select_images_with_depth(scene)
+        self._angles_deg = scene.track_angles_deg()
         measured: dict[tuple[int, int], float] = {}
+        in_set = np.zeros((len(compared), scene.num_images), dtype=np.bool_)
+        for members, is_member in zip(compared, in_set, strict=True):
+            is_member[members] = True
         for image in map(int, images):
             for other in find_overlapping_images(scene, image, num_views, candidates):
                 pair = min(image, other), max(image, other)
-                if pair not in measured:
+                if pair not in measured and not (in_set[:, image] & in_set[:, other]).any():
                     measured[pair] = self.measure_violation_ratio(
                         image, other, std_factor, limit, by_target_area=True
                     )
+        self._angles_deg = None
         pairs = np.array(list(measured), dtype=np.int64).reshape(-1, 2)
         ratios = np.nan_to_num(np.array(list(measured.values())))
         removed = []
@@ -261,9 +274,8 @@ class DepthConsistencyCheck:
         ).copy()  # kernels compile again for read-only arrays
         std = subsample(depth_map.log_std, step) * np.float32(std_factor)
         if self._options.weigh_evidence:
-            local = measure_local_depth_noise(
-                self._scene, image, find_well_constrained_keypoints(self._scene, image), std_factor
-            )
+            constrained = find_well_constrained_keypoints(self._scene, image, self._angles_deg)
+            local = measure_local_depth_noise(self._scene, image, constrained, std_factor)
             std = subsample(depth_map.log_std, step) * subsample(local, step)
         # A projection error of one pixel changes the depth at edges and at grazing angles.
         kernel = np.ones((3, 3))
@@ -290,7 +302,8 @@ def find_overlapping_images(
     others = others[others != image]
     depth_map = scene.maps[image]
     rows, columns = depth_map.prior.shape
-    xy = pixel_centers(OVERLAP_GRID, OVERLAP_GRID) * [columns, rows] / OVERLAP_GRID
+    tiles = pixel_centers(OVERLAP_GRID, OVERLAP_GRID).reshape(4, OVERLAP_GRID // 4, 4, -1, 2)
+    xy = tiles.swapaxes(1, 2).reshape(-1, 2) * [columns, rows] / OVERLAP_GRID
     at = xy[..., 1].astype(np.int64), xy[..., 0].astype(np.int64)
     depth = depth_map.scale * depth_map.prior.depth[at].astype(np.float64)
     points = unproject(depth_map.camera, xy, depth)
@@ -321,7 +334,9 @@ def count_visible_points(
     """Count the 3D points that project into each image.
 
     Args:
-        points: (p, 3) points in the world frame.
+        points: (p, 3) points in the world frame. Neighbors should be close to each other, because
+            groups of ``POINT_GROUP`` points are skipped if an image does not see their bounding
+            sphere.
         rotations: (n, 3, 3) rotations ``cam_from_world``.
         translations: (n, 3) ``cam_from_world``.
         intrinsics: (n, 4) intrinsics fx, fy, cx, cy of each image in pixels.
@@ -330,40 +345,48 @@ def count_visible_points(
     Returns:
         (n,) int64.
     """
+    num_groups = (len(points) + POINT_GROUP - 1) // POINT_GROUP
+    spheres = np.zeros((num_groups, 4))  # center and radius
+    for group in range(num_groups):
+        first, end = group * POINT_GROUP, min((group + 1) * POINT_GROUP, len(points))
+        for k in range(first, end):
+            for a in range(3):
+                spheres[group, a] += points[k, a] / (end - first)
+        for k in range(first, end):
+            x, y, z = points[k]
+            x, y, z = x - spheres[group, 0], y - spheres[group, 1], z - spheres[group, 2]
+            radius = math.sqrt(x * x + y * y + z * z) * (1.0 + 1e-9)
+            spheres[group, 3] = max(spheres[group, 3], radius)
     counts = np.zeros(len(rotations), np.int64)
-    center, radius = np.zeros(3), 0.0  # bounding sphere of all points, times 1 + 1e-9
-    for k in range(len(points)):
-        for a in range(3):
-            center[a] += points[k, a] / len(points)
-    for k in range(len(points)):
-        x, y, z = points[k, 0] - center[0], points[k, 1] - center[1], points[k, 2] - center[2]
-        radius = max(radius, math.sqrt(x * x + y * y + z * z) * (1.0 + 1e-9))
     for image in range(len(rotations)):
         r, t = rotations[image], translations[image]
         fx, fy, cx, cy = intrinsics[image]
         width, height = sizes[image]
-        x, y, z = center
-        u = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]
-        v = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]
-        depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
-        # the sphere is behind the camera, or beyond one of the four planes of the view frustum
         right, bottom = width - cx, height - cy
-        if (
-            depth < -radius
-            or fx * u + cx * depth < -radius * math.hypot(fx, cx)
-            or right * depth - fx * u < -radius * math.hypot(fx, right)
-            or fy * v + cy * depth < -radius * math.hypot(fy, cy)
-            or bottom * depth - fy * v < -radius * math.hypot(fy, bottom)
-        ):
-            continue
-        for k in range(len(points)):
-            x, y, z = points[k]
+        to_left, to_right = math.hypot(fx, cx), math.hypot(fx, right)
+        to_top, to_bottom = math.hypot(fy, cy), math.hypot(fy, bottom)
+        for group in range(num_groups):
+            x, y, z, radius = spheres[group]
+            u = fx * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0])
+            v = fy * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1])
             depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
-            if depth <= 1e-9:
+            # the sphere is behind the camera, or beyond one of the four planes of the view frustum
+            if (
+                depth < -radius
+                or u + cx * depth < -radius * to_left
+                or right * depth - u < -radius * to_right
+                or v + cy * depth < -radius * to_top
+                or bottom * depth - v < -radius * to_bottom
+            ):
                 continue
-            u = fx * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]) / depth + cx
-            v = fy * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) / depth + cy
-            counts[image] += 0 <= u < width and 0 <= v < height
+            for k in range(group * POINT_GROUP, min((group + 1) * POINT_GROUP, len(points))):
+                x, y, z = points[k]
+                depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
+                if depth <= 1e-9:
+                    continue
+                u = fx * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]) / depth + cx
+                v = fy * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) / depth + cy
+                counts[image] += 0 <= u < width and 0 <= v < height
     return counts
 
 

@@ -11,7 +11,7 @@ then registered again.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -73,17 +73,17 @@ def find_deviating_focals(
     distortions = {
         problem.images[i.index].shared_camera: to_distortion(i.distortion) for i in model.images
     }
-    correspondences = _collect_correspondences(problem, model)
+    examined = {
+        index
+        for index, image in enumerate(problem.images)
+        if not image.focal_known
+        and not image.camera_model.is_fisheye
+        and (num_images[image.shared_camera] > 1) == is_shared
+    }
     focals = {}
-    for index, (keypoints, points) in correspondences.items():
+    for index, (keypoints, points) in _collect_correspondences(problem, model, examined).items():
         image = problem.images[index]
         camera = cameras.get(image.shared_camera, image.camera)
-        if (
-            image.focal_known
-            or image.camera_model.is_fisheye
-            or (num_images[image.shared_camera] > 1) != is_shared
-        ):
-            continue
         if len(keypoints) < options.min_inliers:
             continue
         step = max(1, len(keypoints) // MAX_FOCAL_CORRESPONDENCES)
@@ -125,21 +125,22 @@ def split_cameras(
 
 
 def _collect_correspondences(
-    problem: MappingProblem, model: Reconstruction
+    problem: MappingProblem, model: Reconstruction, examined: Collection[int]
 ) -> dict[int, tuple[Int64, Int64]]:
-    """Return the 2D-3D matches of each image, as rows of keypoints (m,) and of 3D points (m,)."""
+    """Return the 2D-3D matches of images, as rows of keypoints (m,) and of 3D points (m,)."""
+    if not examined:
+        return {}
     point_ids = {image.index: image.point_ids for image in model.images}
-    num_points = len(model.points)
-    num_observers = np.zeros(num_points, dtype=np.int64)
-    for ids in point_ids.values():
-        num_observers += np.bincount(np.unique(ids[ids >= 0]), minlength=num_points)
+    observed = [np.unique(ids[ids >= 0]) for ids in point_ids.values()]
+    no_points = np.zeros(0, dtype=np.int64)
+    num_observers = np.bincount(np.concatenate([no_points, *observed]), minlength=len(model.points))
     matches: dict[int, list[Int64]] = {}
     for pair in problem.pairs:
         for image, other, column in (
             (pair.image_a, pair.image_b, 0),
             (pair.image_b, pair.image_a, 1),
         ):
-            if other not in point_ids:
+            if other not in point_ids or image not in examined:
                 continue
             points = point_ids[other][pair.matches[:, 1 - column]]
             rows = np.stack([pair.matches[:, column], points], axis=1)[points >= 0]
@@ -147,10 +148,8 @@ def _collect_correspondences(
     correspondences = {}
     for image, parts in matches.items():
         keypoints, points = np.unique(np.concatenate(parts), axis=0).T
-        ids = point_ids.get(image, np.zeros(0, dtype=np.int64))
-        is_own = np.zeros(num_points, dtype=np.int64)
-        is_own[ids[ids >= 0]] = 1
-        is_used = (num_observers - is_own)[points] >= MIN_OTHER_IMAGES
+        is_own = np.isin(points, point_ids.get(image, no_points))
+        is_used = num_observers[points] - is_own >= MIN_OTHER_IMAGES
         correspondences[image] = keypoints[is_used], points[is_used]
     return correspondences
 

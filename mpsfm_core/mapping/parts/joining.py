@@ -40,6 +40,12 @@ MAX_CONFLICT_RATIO = 0.25
 """Share of overlapping images with contradicting depth above which a join is refused. [tuned:
 benchmarks.scale]"""
 
+MAX_COMPARED_IMAGES = 64
+"""Maximum number of images of each reconstruction whose depth is compared for a join, which limits
+the time of a join of large reconstructions. [ours]"""
+MAX_SAMPLED_POINTS = 4096
+"""Maximum number of points by which images with overlapping views are selected. [ours]"""
+
 _log = logging.getLogger(__name__)
 
 
@@ -51,7 +57,8 @@ class JoinEvidence(NamedTuple):
     num_common: int
     """Number of common images with common observations."""
     num_overlapping: int
-    """Number of images of the smaller reconstruction that overlap images of the larger one."""
+    """Number of compared images of the smaller reconstruction that overlap images of the larger
+    one."""
     num_conflicting: int
     """Number of these images whose depth contradicts an image of the larger reconstruction."""
 
@@ -127,14 +134,13 @@ def collect_evidence(
         alignment: Agreement of the common images.
         options: Options of the mapper.
     """
-    only_a, only_b = _select_unshared(a, b), _select_unshared(b, a)
+    near_a, near_b = _select_near(a, b), _select_near(b, a)
     num_overlapping = num_conflicting = 0
-    near_a = _select_near(only_a, b) if only_a else set()
-    if options.consistency.enabled and near_a:
-        indices = near_a | {image.index for image in b.images}
-        scene, row_of = _create_scene(problem, merge_reconstructions(a, b), indices, options)
+    if options.consistency.enabled and near_a and near_b:
+        joined = merge_reconstructions(a, b)
+        scene, row_of = _create_scene(problem, joined, near_a | near_b, options)
         in_a = np.array([row_of[index] for index in sorted(near_a)], dtype=np.int64)
-        in_b = [row_of[image.index] for image in only_b]
+        in_b = [row_of[index] for index in sorted(near_b)]
         num_overlapping, num_conflicting = _count_depth_conflicts(scene, in_a, in_b, options)
     return JoinEvidence(
         alignment.num_images, alignment.num_common_images, num_overlapping, num_conflicting
@@ -203,26 +209,23 @@ def _rank_joins(models: Sequence[Reconstruction]) -> list[tuple[int, int]]:
     return [(row_a, row_b) for _, row_a, row_b in sorted(ranked)]
 
 
-def _select_unshared(model: Reconstruction, other: Reconstruction) -> list[RegisteredImage]:
-    """Return the images of a reconstruction that the other reconstruction does not have."""
-    shared = {image.index for image in other.images}
-    return [image for image in model.images if image.index not in shared]
+def _select_near(model: Reconstruction, other: Reconstruction) -> set[int]:
+    """Select the images of a reconstruction that see most points of another reconstruction.
 
-
-def _select_near(only_a: Sequence[RegisteredImage], b: Reconstruction) -> set[int]:
-    """Select the images of ``a`` that see most points of ``b``, at most as many as ``b`` has.
-
-    The selection limits the time of a join to that of the smaller reconstruction.
+    Images of both reconstructions are not selected.
     """
+    shared = {image.index for image in other.images}
+    images = [image for image in model.images if image.index not in shared]
+    step = max(1, len(other.points) // MAX_SAMPLED_POINTS)
     counts = count_visible_points(
-        b.points,
-        np.array([image.rotation for image in only_a]),
-        np.array([image.translation for image in only_a]),
-        np.array([image.camera.params for image in only_a]),
-        np.array([image.camera.size for image in only_a], dtype=np.float64),
+        np.ascontiguousarray(other.points[::step]),
+        np.array([image.rotation for image in images]).reshape(-1, 3, 3),
+        np.array([image.translation for image in images]).reshape(-1, 3),
+        np.array([image.camera.params for image in images]).reshape(-1, 4),
+        np.array([image.camera.size for image in images], dtype=np.float64).reshape(-1, 2),
     )
-    best = np.argsort(-counts, kind="stable")[: len(b.images)]
-    return {only_a[row].index for row in best if counts[row]}
+    best = np.argsort(-counts, kind="stable")[:MAX_COMPARED_IMAGES]
+    return {images[row].index for row in best if counts[row]}
 
 
 def _create_scene(

@@ -5,13 +5,15 @@ The steps of mapping in parts are::
     parts = partition_match_graph()     # overlapping clusters of well connected images
     map each part                       # mapper.reconstruct, on any worker
     join_reconstructions()              # similarity transforms from common images
-    mapper.reconstruct(initial_models)  # tracks across parts, refinement and checks of all images
+    mapper.reconstruct(parts)           # tracks across parts, refinement and checks of all images
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+
+import numpy as np
 
 from mpsfm_core.data import Int64, MappingProblem
 from mpsfm_core.mapping import mapper
@@ -51,7 +53,9 @@ def reconstruct(
     if len(parts) < 2:
         return mapper.reconstruct(problem, options, events, checkpoints)
     problems = [problem.subset([problem.images[i].name for i in part]) for part in parts]
-    part_options = options.model_copy(update={"register_tentatively": False})
+    part_options = options.model_copy(
+        update={"register_tentatively": False, "predict_errors": False}
+    )
     if map_parts is None:
         results = [mapper.reconstruct(part, part_options, events) for part in problems]
     else:
@@ -61,7 +65,10 @@ def reconstruct(
         for part, result in zip(parts, results, strict=True)
         for model in result.reconstructions
     ]
-    joined = join_reconstructions(problem, models, options)
+    joined = mapper.JoinedParts(
+        join_reconstructions(problem, models, options),
+        [np.array([image.index for image in model.images], dtype=np.int64) for model in models],
+    )
     result = mapper.reconstruct(problem, options, events, checkpoints, joined)
     reports = [part.report for part in results]
     report = sum_step_times(result.report, [*reports, result.report])

@@ -108,13 +108,23 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
     return DepthNoise(multiplier, correlation, effect)
 
 
-def find_well_constrained_keypoints(scene: Scene, image: int) -> Bool:
-    """Return a mask (k,) of the keypoints whose 3D points rays constrain well without depth."""
+def find_well_constrained_keypoints(
+    scene: Scene, image: int, angles_deg: Float64 | None = None
+) -> Bool:
+    """Return a mask (k,) of the keypoints whose 3D points rays constrain well without depth.
+
+    Args:
+        scene: The scene.
+        image: A registered image.
+        angles_deg: Triangulation angles (p,) of all points in degrees, or None to compute those of
+            the image.
+    """
     points = scene.tracks.point_of[scene.graph.keypoints_of(image)]
     is_observed = points >= 0
     is_constrained = np.zeros(len(points), dtype=np.bool_)
-    angles_deg, _ = scene.angles_deg_of(points[is_observed])
-    is_constrained[is_observed] = angles_deg >= MIN_CONSTRAINED_ANGLE_DEG
+    observed = points[is_observed]
+    angles = scene.angles_deg_of(observed)[0] if angles_deg is None else angles_deg[observed]
+    is_constrained[is_observed] = angles >= MIN_CONSTRAINED_ANGLE_DEG
     return is_constrained
 
 

@@ -12,6 +12,7 @@ from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingIm
 from mpsfm_core.geometry import sample_bilinear, scale_pixels
 from mpsfm_core.optimize.depth_integration import NO_ANCHORS, Anchors, RefinedDepth
 from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, upsample
+from mpsfm_core.support.disk_arrays import ArrayStore, store_fields, store_in_memory
 
 
 class RefinesDepth(Protocol):
@@ -136,13 +137,17 @@ class LazyDepth(DepthPrior):
         """Compute depth, variance and mask at the first access."""
         if name not in ("depth", "variance", "valid"):
             raise AttributeError(name)
+        self.compute()
+        return vars(self)[name]
+
+    def compute(self, store: ArrayStore = store_in_memory) -> None:
+        """Compute and store depth, variance and mask, unless they are computed."""
         lock = vars(self).get("_lock")
         if lock is not None:
             with lock:
-                self._compute()
-        return vars(self)[name]
+                self._compute(store)
 
-    def _compute(self) -> None:
+    def _compute(self, store: ArrayStore) -> None:
         """Scale depth to world units, with the relative variance of the prior."""
         if "_inputs" not in vars(self):
             return
@@ -154,7 +159,7 @@ class LazyDepth(DepthPrior):
         ratio = depth / np.where(prior.valid, prior.depth, np.float32(1))
         variance = None if prior.variance is None else prior.variance * ratio**2
         result = DepthPrior.from_arrays(depth, variance, prior.valid, metric=self.metric)
-        vars(self).update(vars(result))
+        vars(self).update(vars(store_fields(result, store)))
         del vars(self)["_inputs"], vars(self)["_lock"]
         object.__setattr__(self, "__class__", DepthPrior)
 

@@ -273,6 +273,9 @@ def compute_depth_maps(
     """
 
     def compute(image: RegisteredImage) -> RegisteredImage:
+        if isinstance(image.depth, LazyDepth):
+            image.depth.compute(store)
+            return image
         return replace(image, depth=store_fields(image.depth, store))
 
     return tuple(

@@ -296,10 +296,12 @@ class Scene:
         Returns:
             World points (m, 3), and a mask (m,) of the points with known depth.
         """
-        images = self.graph.image_of[keypoints]
-        is_active = np.array([depth_map.active for depth_map in self.maps], dtype=np.bool_)
-        depth = self.keypoint_prior[keypoints] * self.scales()[images]
-        valid = self.keypoint_valid[keypoints] & is_active[images] & (depth > 0)
+        images, rows = np.unique(self.graph.image_of[keypoints], return_inverse=True)
+        maps = [self.maps[image] for image in images.tolist()]
+        is_active = np.array([depth_map.active for depth_map in maps], dtype=np.bool_)[rows]
+        scales = np.array([depth_map.scale for depth_map in maps])[rows]
+        depth = self.keypoint_prior[keypoints] * scales
+        valid = self.keypoint_valid[keypoints] & is_active & (depth > 0)
         return self.at_depth(keypoints, np.where(valid, depth, 0.0)), valid
 
     def project(self, keypoints: Int64, points: Float64) -> tuple[Float64, Float64]:

@@ -24,8 +24,18 @@ class Tracks:
     """
 
     def __init__(self, num_keypoints: int) -> None:
-        self.xyz: Float64 = np.zeros((0, 3))
+        self._buffer: Float64 = np.zeros((0, 3))  # larger than xyz, so that few additions copy it
+        self._num_points = 0
         self.point_of: Int64 = np.full(num_keypoints, NO_POINT, dtype=np.int64)
+
+    @property
+    def xyz(self) -> Float64:
+        """(p, 3) float64 points in the world frame."""
+        return self._buffer[: self._num_points]
+
+    @xyz.setter
+    def xyz(self, points: Float64) -> None:
+        self._buffer, self._num_points = points, len(points)
 
     def __len__(self) -> int:
         """Return the number of points with observations."""
@@ -65,10 +75,12 @@ class Tracks:
         Returns:
             Rows (m,) of the added points in :attr:`xyz`.
         """
-        first = len(self.xyz)
-        self.xyz = np.concatenate([self.xyz, xyz])
+        first, end = self._num_points, self._num_points + len(xyz)
+        if end > len(self._buffer):
+            self._buffer = np.concatenate([self.xyz, np.empty((end, 3))])
+        self._buffer[first:end], self._num_points = xyz, end
         self.point_of[keypoints] = first + track
-        return np.arange(first, first + len(xyz))
+        return np.arange(first, end)
 
     def delete(self, points: Bool) -> None:
         """Delete the points that the bool mask ``points`` (p,) selects."""
