@@ -74,6 +74,7 @@ class ExtractionContext:
         work: Callable[[Item], Result],
         *providers: ActiveProvider,
         local: bool = False,
+        remote_items: Sequence[Any] | None = None,
     ) -> list[Result]:
         """Run an extraction stage on all items in parallel; return the results in order.
 
@@ -83,13 +84,14 @@ class ExtractionContext:
             work: Function that processes one item and returns the result.
             providers: Providers that the stage uses; each provider limits the number of threads.
             local: If true, the stage runs on this machine even if a remote executor is configured.
+            remote_items: Small descriptions of the items, which are sent to remote workers instead.
         """
         workers = min((p.workers for p in providers), default=worker_count(self.config.runtime))
-        is_cached = providers and all(
+        is_cached = (providers or remote_items is not None) and all(
             provider.is_reusable and not provider.can("uncached") for provider in providers
         )
         ahead = (
-            self.run_remotely(stage, items)
+            self.run_remotely(stage, items if remote_items is None else remote_items)
             if self.run_remotely and is_cached and not local
             else None
         )

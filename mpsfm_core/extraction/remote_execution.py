@@ -22,8 +22,13 @@ from mpsfm_core.extraction.active_provider import thread_count
 from mpsfm_core.extraction.cache import content_key
 from mpsfm_core.extraction.context import RUNS, ExtractionContext
 from mpsfm_core.extraction.events import NullExtractionEvents
-from mpsfm_core.extraction.features import FeatureTable
-from mpsfm_core.extraction.matching.pair_matching import PairMatcher
+from mpsfm_core.extraction.features import NO_FEATURES, FeatureTable
+from mpsfm_core.extraction.matching.keypoint_adjustment import KeypointAdjuster
+from mpsfm_core.extraction.matching.pair_matching import (
+    LocatedFeatures,
+    PairMatcher,
+    PairVerifier,
+)
 from mpsfm_core.extraction.pairs.selection import PairSelection
 from mpsfm_core.extraction.priors.multiview import GroupPriors
 from mpsfm_core.extraction.priors.prior_predictor import PriorPredictor
@@ -123,11 +128,14 @@ class _WorkerState:
         context.load_masks()
         table = None if config.features is None else FeatureTable(context, config.features)
         matcher = PairMatcher(context, table)
+        located: LocatedFeatures = [NO_FEATURES] * len(step.images) if table is None else table
         priors = PriorPredictor(context, matcher, [])
         self.work: dict[str, Callable[[Any], object]] = {
             "masks": context.mask,
             "retrieval": PairSelection(context, table).describe,
             "matching": matcher.results,
+            "verification": PairVerifier(context, located, matcher).verify_pair,
+            "adjustment": KeypointAdjuster(context).align_stored,
             "depth": priors.predicted,
             "normals": priors.full_size,
         }

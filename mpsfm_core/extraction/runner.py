@@ -253,7 +253,8 @@ def match_images(
     located = [NO_FEATURES] * len(context.images) if source is None else source.extract()
     duplicates = find_duplicates(located, [image.pinhole.size for image in context.images])
     selection = PairSelection(context, source, unconstrained, duplicates)
-    matcher, verifier = PairMatcher(context, source), PairVerifier(context, located)
+    matcher = PairMatcher(context, source)
+    verifier = PairVerifier(context, located, matcher)
     candidates = matcher.match(selection.choose() if pairs is None else pairs, located)
     geometries = verifier.verify(candidates)
     pairs_with_geometry = zip(candidates, geometries, strict=True)
@@ -294,8 +295,9 @@ def match_queries(
     source = feature_table(context)
     located = [NO_FEATURES] * len(context.images) if source is None else source.extract()
     pairs = PairSelection(context, source).choose_references(num_references)
-    candidates = PairMatcher(context, source).match(sorted([*pairs, *between]), located)
-    geometries = PairVerifier(context, located).verify(candidates)
+    matcher = PairMatcher(context, source)
+    candidates = matcher.match(sorted([*pairs, *between]), located)
+    geometries = PairVerifier(context, located, matcher).verify(candidates)
     return assemble_matches(candidates, geometries, located)
 
 

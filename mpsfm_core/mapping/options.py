@@ -8,7 +8,7 @@ angles, while the published code overestimates them.
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -199,10 +199,11 @@ class MappingOptions(Options):
     images. ``fixed`` keeps known poses and their unit of length, and leaves out images without a
     known pose. ``guess`` also re-registers misregistered images, and scales the world to meters if
     depth is metric."""
-    parts: int | None = Field(None, ge=20)
+    parts: Annotated[int, Field(ge=20)] | Literal["auto"] | None = "auto"
     """Number of images per part, to map more images in overlapping parts that are joined. Parts run
-    on the workers of ``runtime.executor``. null maps all images in one piece, as images with known
-    poses that are no guesses. [tuned: benchmarks.scale]"""
+    on the workers of ``runtime.executor``. ``auto`` maps more than 2000 images in parts of 500, if
+    an executor with workers is set. null maps all images in one piece, as images with known poses
+    that are no guesses. [tuned: benchmarks.scale]"""
     min_model_size: int = Field(2, ge=2)
     """Number of registered images below which a component is discarded. [COLMAP min_model_size]"""
     weigh_by_score: bool = expert(True)

@@ -7,10 +7,13 @@ all parts itself, and finds the checkpoints. An interrupted run loses at most th
 
 from __future__ import annotations
 
+import json
+import os
 import socket
-from collections.abc import Sequence
-from contextlib import closing, suppress
-from dataclasses import dataclass
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,23 +24,39 @@ from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.errors import InputError, OutputError
 from mpsfm_core.extraction.active_provider import thread_count
 from mpsfm_core.extraction.cache import cache_folder, digest
-from mpsfm_core.extraction.remote_execution import create_executor
+from mpsfm_core.extraction.remote_execution import THREADS, create_executor
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.problem_state import problem_from_state, problem_to_state
-from mpsfm_core.mapping.scene.reconstruction import MappingResult
+from mpsfm_core.mapping.scene.reconstruction import MappingResult, compute_depth_maps
 from mpsfm_core.mapping.state import flatten_state, unflatten_state
 from mpsfm_core.pipeline.checkpoints import MappingCheckpoints
-from mpsfm_core.pipeline.stages import Stages
+from mpsfm_core.pipeline.stages import Stages, peak_memory_mb, reset_peak_memory
 from mpsfm_core.providers import Executor
 from mpsfm_core.providers.registry import Registry
+from mpsfm_core.support.disk_arrays import DiskArrays
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.npz import read_npz
 from mpsfm_core.support.threads import limit_threads
 
+MAX_WHOLE_IMAGES = 2000
+"""Number of images above which workers map parts, if the size of parts is ``auto``. Four workers
+then save more time than they need to start. [tuned: benchmarks.scale]"""
+AUTO_PART_IMAGES = 500
+"""Number of images per part if the size of parts is ``auto``. [tuned: benchmarks.scale]"""
 _STEP = "parts"
 _NEVER_S = 1e9
 """Seconds between checkpoints if only completed parts are stored."""
+
+
+def choose_part_size(
+    options: MapperOptions, runtime: RuntimeOptions, num_images: int
+) -> MapperOptions:
+    """Replace the size of parts ``auto`` by a number of images, or by None for one piece."""
+    if options.parts != "auto":
+        return options
+    in_parts = runtime.executor != THREADS and num_images > MAX_WHOLE_IMAGES
+    return options.model_copy(update={"parts": AUTO_PART_IMAGES if in_parts else None})
 
 
 class PartMapper:
@@ -58,12 +77,18 @@ class PartMapper:
         self._runtime, self._registry, self._stages = runtime, registry, stages
         self._fresh = fresh
         self._stored: list[_StoredPart] = []
+        self.records: list[PartRecord] = []
+        """Time and memory of each part of the last reconstruction."""
 
     def __call__(
         self, problems: Sequence[MappingProblem], options: MapperOptions
     ) -> list[MappingResult]:
-        """Map all parts, and return their results in order."""
+        """Map all parts, and return their results in order.
+
+        Depth maps of many images are in temporary files of the cache folder.
+        """
         runtime = self._runtime
+        disk = DiskArrays(cache_folder(runtime.cache_dir))
         step = MapPart(
             cache_folder(runtime.cache_dir),
             options,
@@ -79,9 +104,13 @@ class PartMapper:
             if executor is not None:
                 self._map_remotely(executor, step, parts)
             stores = executor is not None or runtime.checkpoint_s is not None
-            results = []
+            results, self.records = [], []
             for done, part in enumerate(parts, start=1):
-                results.append(step.map(part.problem, stores=stores))
+                with measure_part(part.problem) as measured:
+                    result = step.map(part.problem, stores=stores)
+                models = compute_depth_maps(result.reconstructions, disk.store)
+                results.append(replace(result, reconstructions=models))
+                self.records.append(step.read_record(part.key) or measured[0])
                 if executor is None:
                     self._stages.stage_progress(_STEP, done, len(parts))
         return results
@@ -106,6 +135,36 @@ class PartMapper:
 
 
 @dataclass(frozen=True)
+class PartRecord:
+    """Time and memory of the mapping of a part, for ``summary.json``."""
+
+    images: int
+    seconds: float
+    cpu_seconds: float
+    peak_memory_mb: float | None
+    """Peak resident memory of the process, or None if the operating system reports none."""
+    worker: str
+    """Host and process identifier of the worker."""
+
+
+@contextmanager
+def measure_part(problem: MappingProblem) -> Iterator[list[PartRecord]]:
+    """Measure the mapping of a part in a ``with`` block, and append the record to the list."""
+    records: list[PartRecord] = []
+    started, cpu_started = time.perf_counter(), time.process_time()
+    yield records
+    records.append(
+        PartRecord(
+            len(problem.images),
+            time.perf_counter() - started,
+            time.process_time() - cpu_started,
+            peak_memory_mb(),
+            f"{socket.gethostname()}:{os.getpid()}",
+        )
+    )
+
+
+@dataclass(frozen=True)
 class MapPart:
     """Pickled function that maps a part on any machine, and stores the result as a checkpoint."""
 
@@ -125,8 +184,17 @@ class MapPart:
                 f"the worker on {socket.gethostname()} does not see the cache {self.cache} of this "
                 "run: set runtime.cache_dir to a folder that all machines share"
             ) from error
-        with limit_threads(self.threads):
-            self.map(problem_from_state(unflatten_state(arrays)))
+        reset_peak_memory()
+        problem = problem_from_state(unflatten_state(arrays))
+        with limit_threads(self.threads), measure_part(problem) as records:
+            self.map(problem)
+        write_file(self.record_file(key), json.dumps(asdict(records[0])))
+
+    def read_record(self, key: str) -> PartRecord | None:
+        """Return the record of a part that a worker mapped, or None without a worker."""
+        with suppress(OSError, ValueError, TypeError):
+            return PartRecord(**json.loads(self.record_file(key).read_text(encoding="utf-8")))
+        return None
 
     def map(self, problem: MappingProblem, *, stores: bool = True) -> MappingResult:
         """Map a part, or load its result if the part is complete.
@@ -147,13 +215,17 @@ class MapPart:
         """Return the file of the mapping problem with a key."""
         return self.cache / "mapping" / "parts" / f"{key}.npz"
 
+    def record_file(self, key: str) -> Path:
+        """Return the file of time and memory of the mapping problem with a key."""
+        return self.file(key).with_suffix(".json")
+
 
 class _StoredPart:
     """Mapping problem of a part, with its files in the cache folder."""
 
     def __init__(self, step: MapPart, problem: MappingProblem) -> None:
         self.problem, self.key = problem, digest(problem)
-        self._file = step.file(self.key)
+        self._file, self._record_file = step.file(self.key), step.record_file(self.key)
         self._checkpoints = step.checkpoints(problem)
 
     def store(self) -> None:
@@ -171,7 +243,7 @@ class _StoredPart:
             ) from error
 
     def forget(self) -> None:
-        """Delete mapping problem and checkpoint."""
+        """Delete mapping problem, checkpoint and record."""
         self._checkpoints.forget()
-        with suppress(OSError):
-            self._file.unlink()
+        for path in (self._file, self._record_file):
+            path.unlink(missing_ok=True)

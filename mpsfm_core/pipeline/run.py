@@ -48,7 +48,7 @@ from mpsfm_core.mapping.scene.reconstruction import (
 from mpsfm_core.pipeline import precompile, resources
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, MappingCheckpoints
 from mpsfm_core.pipeline.input_reader import InputReader, Source
-from mpsfm_core.pipeline.parts import PartMapper
+from mpsfm_core.pipeline.parts import PartMapper, PartRecord, choose_part_size
 from mpsfm_core.pipeline.provider_resolution import ProviderResolution, resolve_providers
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.pipeline.trajectory import localize_frames
@@ -256,6 +256,7 @@ class _Run:
         self._children = ChildMemoryMonitor()
         self._checkpoints: list[MappingCheckpoints | DenseCheckpoints | PartMapper] = []
         self._compilation: precompile.Compilation | None = None
+        self._part_records: list[PartRecord] = []
 
     @property
     def _config(self) -> Config:
@@ -367,11 +368,15 @@ class _Run:
     def _map(self, problem: MappingProblem, options: MapperOptions | None = None) -> MappingResult:
         """Run the mapper, by default with the mapper options of the configuration."""
         options = options or self._config.mapper_options()
+        options = choose_part_size(options, self._config.runtime, len(problem.images))
         with self._stages.stage("mapping"):
             checkpoints = self._mapping_checkpoints(problem, options)
-            return part_mapping.reconstruct(
-                problem, options, self._stages, checkpoints, self._part_mapper()
+            part_mapper = self._part_mapper()
+            result = part_mapping.reconstruct(
+                problem, options, self._stages, checkpoints, part_mapper
             )
+            self._part_records = part_mapper.records
+            return result
 
     def _map_undistorted(
         self, images: ImageSet, extraction: Extraction, mapping: MappingResult
@@ -661,6 +666,7 @@ class _Run:
             "reconstructions": describe_reconstructions(mapping, models, extraction.problem),
             "mapping_runs": mapping.report.runs,
             "mapping_steps": describe_mapping_steps(mapping),
+            "mapping_parts": [asdict(record) for record in self._part_records],
             "georeference": self._georeference_report,
             "dense": self._dense_reports,
             "resources": self._describe_resources(),

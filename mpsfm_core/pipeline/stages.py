@@ -82,7 +82,7 @@ class Stages:
     def stage(self, name: str) -> Iterator[None]:
         """Record a pipeline stage that runs in the ``with`` block."""
         self.stage_started(name, None)
-        _reset_peak_memory()
+        reset_peak_memory()
         self._running[name] = time.perf_counter()
         try:
             yield
@@ -160,7 +160,7 @@ def _ignore(event: Event) -> None:
     """Ignore a progress event, as default of the callback ``on_event``."""
 
 
-def _reset_peak_memory() -> None:
+def reset_peak_memory() -> None:
     """Reset the peak memory of this process; only Linux can do so."""
     with suppress(OSError):
         (_PROC / "clear_refs").write_text("5")

@@ -6,11 +6,12 @@ import base64
 import html
 import json
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pycolmap
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from mpsfm_core.data import Float64
 from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel, IntrinsicParameter
 from mpsfm_core.data.errors import InputError, MpsfmError
-from mpsfm_core.data.result_layout import REPORT
+from mpsfm_core.data.result_layout import REPORT, VIEWS
 from mpsfm_core.report import pictures
 from mpsfm_core.report.findings import describe_scale, findings, partner_counts
 from mpsfm_core.report.points import PointSet, dense_points, sparse_points
@@ -35,12 +36,19 @@ MAX_SPARSE_POINTS = 40_000
 """Maximum numbers of dense and sparse points in the page, 16 bytes each in base64."""
 MAX_PICTURE_BYTES = 9_000_000
 """Maximum size in bytes of all pictures in the page; with many images each picture is smaller."""
+MAX_EMBEDDED = 700
+"""Maximum number of images with pictures in the page, so that the smallest pictures fit in
+``MAX_PICTURE_BYTES``. Other images are loaded from the result folder when they are shown."""
+MAX_LINE_BYTES = 9_000_000
+"""Maximum size in bytes of all match lines in the page; with many pairs each pair has fewer."""
 _PHOTO_SIDE = (192, 800)
 """Minimum and maximum of the longer side in pixels of an embedded image."""
 _MAP_SIDE = (128, 360)
 """Minimum and maximum of the longer side in pixels of an embedded depth or normal map."""
 _BYTES_PER_PIXEL = 0.16
 """Mean size in bytes per pixel of a WebP picture in base64, measured on indoor images."""
+_LINE_BYTES = 11
+"""Size in bytes of a match line in base64."""
 _NUM_MAPS = 4
 """Number of embedded depth, std and normal maps per image."""
 _MAX_COORDINATE = 0xFFFF
@@ -71,14 +79,21 @@ def write_report(folder: Path) -> Path:
     return folder / REPORT
 
 
-def render(result: ResultFolder) -> str:
-    """Return the report page of a result folder as HTML text."""
+def render(result: ResultFolder, max_embedded: int = MAX_EMBEDDED) -> str:
+    """Return the report page of a result folder as HTML text.
+
+    Args:
+        result: The result folder.
+        max_embedded: Maximum number of images with pictures in the page.
+    """
+    payload = _payload(result, max_embedded)
+    data = json.dumps(payload, separators=(",", ":"), allow_nan=False)
     parts = {
         "TITLE": html.escape(result.path.resolve().name),
         "STYLE": _asset("page.css"),
         "THREE": _asset("three.min.js"),
         "SCRIPT": _asset("page.js"),
-        "DATA": _script_safe(json.dumps(_payload(result), separators=(",", ":"), allow_nan=False)),
+        "DATA": _script_safe(data),
     }
     page = _asset("page.html")
     head, *rest = page.split("{{")
@@ -98,24 +113,22 @@ def _script_safe(data: str) -> str:
     return data.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
-def _payload(result: ResultFolder) -> dict[str, Any]:
+def _payload(result: ResultFolder, max_embedded: int) -> dict[str, Any]:
     summary = result.summary
-    maps = dict(zip(result.names, parallel_map(result.refined, result.names), strict=True))
+    names = result.names
+    embedded = [names[row] for row in _space_evenly(len(names), max_embedded)]
+    maps = dict(zip(embedded, parallel_map(result.refined, embedded), strict=True))
     refined_maps = [refined for refined in maps.values() if refined is not None]
     photos = _ImageEntries(result, maps)
-    ids = {name: row for row, name in enumerate(result.names)}
+    ids = {name: row for row, name in enumerate(names)}
     verdict = judge(summary)
     return {
         "folder": result.path.resolve().name,
         "verdict": {"level": verdict.level, "text": verdict.text},
         "findings": [asdict(finding) for finding in findings(summary)],
-        "photos": parallel_map(photos.describe, result.names),
+        "photos": parallel_map(photos.describe, names),
         "pairs": _pairs(summary, ids),
-        "lines": {
-            f"{ids[pair.image_a]} {ids[pair.image_b]}": photos.lines(pair)
-            for pair in result.matches()
-            if pair.image_a in ids and pair.image_b in ids
-        },
+        "lines": _lines(result.matches(), photos, ids),
         "points": {
             "sparse": _points(sparse_points(result.model, refined_maps, MAX_SPARSE_POINTS)),
             "dense": _points(dense_points(result.dense_cloud(), refined_maps, MAX_DENSE_POINTS)),
@@ -153,7 +166,12 @@ def _describe_frames(
 
 
 class _ImageEntries:
-    """Collector of the statistics and pictures of each image for the report page."""
+    """Collector of the statistics and pictures of each image for the report page.
+
+    Args:
+        result: The result folder.
+        maps: Refined depth map or None of each image with pictures in the page.
+    """
 
     def __init__(self, result: ResultFolder, maps: Mapping[str, RefinedMap | None]) -> None:
         self._result = result
@@ -166,7 +184,7 @@ class _ImageEntries:
             if "inliers" in pair
             for name in pair["images"]
         )
-        self._sizes = _PictureSizes.of(len(result.names))
+        self._sizes = _PictureSizes.of(len(maps))
         stds = [
             float(np.percentile(refined.relative_std[refined.valid], 95))
             for refined in maps.values()
@@ -185,7 +203,7 @@ class _ImageEntries:
             status = "unconfirmed"
         elif explained is not None:
             status = "missing"
-        prior, refined = self._result.prior(name), self._maps[name]
+        prior = self._result.prior(name)
         if prior is not None:
             self._views[name] = prior.camera.size
         details = images["details"][name]
@@ -204,15 +222,17 @@ class _ImageEntries:
             "lens": _list_lens_parameters(details),
             **self._in_model(name),
             **self._camera(name, prior),
-            "pictures": self._pictures(name, prior, refined),
+            "pictures": self._pictures(name, prior)
+            if name in self._maps
+            else self._link_picture(name),
         }
 
-    def lines(self, pair: MatchLines) -> str:
+    def lines(self, pair: MatchLines, max_lines: int) -> str:
         """Encode matches as uint16 (ax, ay, bx, by), relative to the sizes of both images."""
         sides = []
         for name, points in ((pair.image_a, pair.points_a), (pair.image_b, pair.points_b)):
             size = np.array(self._views.get(name, (1, 1)))
-            sides.append(np.clip(points / size, 0, 1) * _MAX_COORDINATE)
+            sides.append(np.clip(points[:max_lines] / size, 0, 1) * _MAX_COORDINATE)
         return _base64(np.concatenate(sides, axis=1).astype("<u2"))
 
     def _in_model(self, name: str) -> dict[str, Any]:
@@ -245,10 +265,14 @@ class _ImageEntries:
         edges = [-cx / fx, -cy / fy, (width - cx) / fx, (height - cy) / fy]
         return {"pose": _rounded(pose.ravel()), "edges": _rounded(np.array(edges))}
 
-    def _pictures(
-        self, name: str, prior: PriorMaps | None, refined: RefinedMap | None
-    ) -> dict[str, Any]:
-        sizes, made = self._sizes, {}
+    def _link_picture(self, name: str) -> dict[str, Any]:
+        """Return the address of the image, which the browser loads when the image is shown."""
+        if not (self._result.path / VIEWS / f"{name}.webp").is_file():
+            return {}
+        return {"photo": {"src": quote(f"{VIEWS}/{name}.webp"), "linked": True}}
+
+    def _pictures(self, name: str, prior: PriorMaps | None) -> dict[str, Any]:
+        sizes, made, refined = self._sizes, {}, self._maps[name]
         picture = self._result.picture(name)
         if picture is not None:
             made["photo"] = {"src": pictures.photo(picture, sizes.photo)}
@@ -283,6 +307,24 @@ class _ImageEntries:
                 "legend": "red faces right, green up, blue the camera",
             }
         return made
+
+
+def _lines(
+    pairs: Sequence[MatchLines], photos: _ImageEntries, ids: Mapping[str, int]
+) -> dict[str, str]:
+    """Encode the match lines of all pairs, by the indices of both images."""
+    shown = [pair for pair in pairs if pair.image_a in ids and pair.image_b in ids]
+    max_lines = MAX_LINE_BYTES // (_LINE_BYTES * max(len(shown), 1))
+    return {
+        f"{ids[pair.image_a]} {ids[pair.image_b]}": photos.lines(pair, max(max_lines, 1))
+        for pair in shown
+    }
+
+
+def _space_evenly(count: int, max_rows: int) -> list[int]:
+    """Return at most ``max_rows`` of ``count`` row indices at even distances."""
+    number = min(count, max_rows)
+    return [row * count // number for row in range(number)]
 
 
 @dataclass(frozen=True)

@@ -141,6 +141,9 @@ class RunSummary(TypedDict):
     """Number of mapper runs with different seeds."""
     mapping_steps: dict[str, dict[str, Any]]
     """Run time in seconds and number of calls of each step of the mapper."""
+    mapping_parts: list[dict[str, Any]]
+    """Number of images, seconds, CPU seconds, peak memory in MB, and worker of each part; empty for
+    mapping in one piece."""
     georeference: dict[str, Any] | None
     """Alignment of the first reconstruction with GPS positions, or the reason why it is not
     aligned."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import signal
+import socket
 import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -62,6 +64,21 @@ class _KillFirstWorker(_WriteMarker):
         super().__call__(item)
 
 
+class _KillFirstPartWorker(Stages):
+    """Receiver of progress that kills the worker of the first completed part."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(Registry())
+        self._folder = folder
+        self.killed = ""
+
+    def stage_progress(self, stage: str, done: int, total: int) -> None:
+        if done == 1:
+            (record, *_) = self._folder.glob("mapping/parts/*.json")
+            self.killed = json.loads(record.read_text(encoding="utf-8"))["worker"]
+            os.kill(int(self.killed.rpartition(":")[2]), signal.SIGKILL)
+
+
 def _fail_on_two(item: int) -> None:
     """Test step that raises an exception for the work item with index 2."""
     if item == 2:
@@ -109,21 +126,30 @@ def check_errors(executor: Executor) -> None:
     assert sum(1 for _ in executor.run(_fail_on_two, [0, 1])) == 2
 
 
-def check_mapping_in_parts(name: str, options: dict[str, Any], folder: Path) -> None:
+def check_mapping_in_parts(
+    name: str, options: dict[str, Any], folder: Path, *, kills_worker: bool = False
+) -> None:
     """Require that mapping in parts is bitwise equal on the executor and in this process.
 
     Args:
         name: Value of ``runtime.executor``.
         options: Value of ``runtime.executor_options``.
         folder: Folder that the check creates and that the workers can access.
+        kills_worker: If true, kill the worker that has completed the first part.
     """
-    problem = make_hall_problem(36, map_width=48, points_per_view=40).problem
+    problem = make_hall_problem(64, map_width=48, points_per_view=40).problem
     settings = MapperOptions(parts=20)
     runtime = RuntimeOptions(cache_dir=folder, workers=1, executor=name, executor_options=options)
-    part_mapper = PartMapper(runtime, Registry.discover(), Stages(Registry()))
+    stages = _KillFirstPartWorker(folder) if kills_worker else Stages(Registry())
+    part_mapper = PartMapper(runtime, Registry.discover(), stages)
     local = part_mapping.reconstruct(problem, settings)
     remote = part_mapping.reconstruct(problem, settings, map_parts=part_mapper)
     part_mapper.forget()
+    assert len(part_mapper.records) >= 4
+    workers = {record.worker for record in part_mapper.records}
+    assert f"{socket.gethostname()}:{os.getpid()}" not in workers, "the main process mapped a part"
+    if isinstance(stages, _KillFirstPartWorker):
+        assert stages.killed in workers and len(workers) > 1
     expected, actual = ([digest(m) for m in r.reconstructions] for r in (local, remote))
     assert actual == expected, "mapping on the executor gives another result"
     remaining = [path for path in folder.rglob("*") if path.is_file()]
@@ -310,7 +336,7 @@ def _extract(
 def _read_cache(cache: Path) -> dict[str, bytes]:
     """Read the arrays that an extraction wrote to its cache, without the records of runs."""
     root = cache / "extraction"
-    kinds = ("features", "matcher", "normals", "depth")
+    kinds = ("features", "matcher", "normals", "depth", "two-view")
     return {
         str(path.relative_to(root)): path.read_bytes()
         for kind in kinds

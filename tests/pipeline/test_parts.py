@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import pickle
+import signal
+import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +23,7 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts.part_mapping import reconstruct
 from mpsfm_core.mapping.problem_state import problem_from_state, problem_to_state
 from mpsfm_core.mapping.state import flatten_state, unflatten_state
-from mpsfm_core.pipeline.parts import MapPart, PartMapper
+from mpsfm_core.pipeline.parts import MapPart, PartMapper, choose_part_size
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.support.npz import read_npz
@@ -99,7 +103,10 @@ def test_executor_gives_the_same_bits_and_no_file_remains(
     runtime = RuntimeOptions(cache_dir=tmp_path, executor="backwards", checkpoint_s=None)
     result, mapper = map_in_parts(problem, runtime, stages, registry)
     assert result == expected and executor.closed
-    assert len(stages.done) == stages.done[0][1] > 1
+    assert len(stages.done) == stages.done[0][1] == len(mapper.records) > 1
+    for record in mapper.records:
+        assert 20 <= record.images < 36 and record.cpu_seconds > 0
+        assert record.worker.endswith(f":{os.getpid()}")
     assert list_files(tmp_path)
     mapper.forget()
     assert not list_files(tmp_path)
@@ -122,6 +129,32 @@ def test_interrupted_run_does_not_map_finished_parts_again(
     assert map_in_parts(problem, runtime, Progress(registry), registry)[0] != expected
 
 
+def map_in_process(folder: Path) -> None:
+    """Map the problem of the tests in parts, in a process that is killed."""
+    problem = make_hall_problem(36, map_width=48, points_per_view=40).problem
+    map_in_parts(problem, RuntimeOptions(cache_dir=folder), Stages(Registry()), Registry())
+
+
+@pytest.mark.slow  # starts a process
+def test_killed_main_process_resumes_with_the_same_bits(
+    problem: MappingProblem, expected: str, tmp_path: Path
+) -> None:
+    process = multiprocessing.get_context("spawn").Process(target=map_in_process, args=(tmp_path,))
+    process.start()
+    while process.is_alive() and not list(tmp_path.glob("mapping/*.npz")):
+        time.sleep(0.02)
+    process.kill()
+    process.join()
+    assert process.exitcode == -signal.SIGKILL
+    modified = {path: path.stat().st_mtime_ns for path in tmp_path.glob("mapping/*.npz")}
+    assert modified
+    registry = Registry()
+    runtime = RuntimeOptions(cache_dir=tmp_path)
+    result, _ = map_in_parts(problem, runtime, Progress(registry), registry)
+    assert result == expected
+    assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in modified.items())
+
+
 def test_run_without_checkpoints_writes_no_file(
     problem: MappingProblem, expected: str, tmp_path: Path
 ) -> None:
@@ -129,6 +162,23 @@ def test_run_without_checkpoints_writes_no_file(
     runtime = RuntimeOptions(cache_dir=tmp_path, checkpoint_s=None)
     assert map_in_parts(problem, runtime, Stages(registry), registry)[0] == expected
     assert not list_files(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("parts", "executor", "num_images", "expected"),
+    [
+        ("auto", "dask", 2001, 500),
+        ("auto", "dask", 2000, None),
+        ("auto", "threads", 5000, None),
+        (None, "dask", 5000, None),
+        (100, "threads", 200, 100),
+    ],
+)
+def test_part_size_is_automatic_for_many_images_on_workers(
+    parts: Any, executor: str, num_images: int, expected: int | None
+) -> None:
+    options, runtime = MapperOptions(parts=parts), RuntimeOptions(executor=executor)
+    assert choose_part_size(options, runtime, num_images).parts == expected
 
 
 def test_worker_without_the_cache_folder_raises(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import re
 import shutil
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -44,6 +45,17 @@ def test_report_loads_nothing_from_servers(finished: Path) -> None:
     assert "default-src 'none'" in page
     assert not re.search(r"""(src|href)=["']?(https?:)?//""", page)
     assert "url(http" not in page
+
+
+def test_report_of_many_images_loads_further_pictures_from_the_folder(finished: Path) -> None:
+    result = ResultFolder.open(finished)
+    photos = data_of(render(result, max_embedded=2))["photos"]
+    sources = [photo["pictures"]["photo"]["src"] for photo in photos]
+    embedded = [source.startswith("data:") for source in sources]
+    assert len(photos) > 2 and sum(embedded) == 2 and embedded[0]
+    for photo, source, is_embedded in zip(photos, sources, embedded, strict=True):
+        assert is_embedded == ("prior" in photo["pictures"])
+        assert is_embedded or (finished / unquote(source)).is_file()
 
 
 def test_points_of_report_are_those_of_the_model(finished: Path) -> None:

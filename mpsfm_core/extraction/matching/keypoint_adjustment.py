@@ -21,6 +21,7 @@ from scipy.sparse import csc_matrix
 from scipy.sparse.linalg import splu
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8, VerifiedPair
+from mpsfm_core.extraction.cache import content_key, digest
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.geometry import rays
 from mpsfm_core.geometry.patch_alignment import align_patches
@@ -41,6 +42,8 @@ MAX_SHIFT_STD = 3.0
 """Maximum shift of a keypoint, in keypoint standard deviations."""
 ADJUSTED_STD_RATIO = 0.25
 """Ratio of keypoint standard deviations after and before adjustment."""
+_INPUTS, _ALIGNED = "alignment-input", "alignment"
+"""Subfolders of the cache with the inputs and results of remote workers."""
 _NOISE_CORRELATION_PX = float(2 * np.sqrt(np.pi) * BLUR_PX)
 """Correlation length of image noise after the Gaussian blur, pixels."""
 _MIN_ALIGNMENT_STD = 0.05
@@ -66,6 +69,24 @@ class AlignedPair:
     """(m, 2) offset of the linear equations, in pixels of view b."""
     information: Float64
     """(m, 2, 2) inverse covariance of the offset, in pixels^-2 of view b."""
+
+
+@dataclass(frozen=True, eq=False)
+class AlignmentInput:
+    """Matched keypoints of an image pair, in the cache for a remote worker."""
+
+    images: Int64
+    """(2,) indices of both images."""
+    xy_a: Float64
+    """(m, 2) matched keypoints of the first view, pixels."""
+    xy_b: Float64
+    """(m, 2) matched keypoints of the second view, pixels."""
+    std_px: Float64
+    """(2,) standard deviation of the keypoints of both views, pixels."""
+    rotation: Float64
+    """(3, 3) rotation ``b_from_a``."""
+    translation: Float64
+    """(3,) translation ``b_from_a``."""
 
 
 _EQUATION = ("warp", "offset", "information")
@@ -100,43 +121,89 @@ class PairSide(NamedTuple):
 class KeypointAdjuster:
     """Adjusts the keypoints of all images of a run.
 
+    Remote workers read the matched keypoints from the cache, and write the alignment of patches to
+    the cache.
+
     Args:
         context: Context of the extraction with images, options and progress.
-        keypoints: (n, 2) keypoints of each image, pixels.
+        keypoints: (n, 2) keypoints of each image, pixels; empty in a remote worker.
         std_px: Standard deviation of the keypoints of each image.
     """
 
     def __init__(
-        self, context: ExtractionContext, keypoints: Sequence[Float64], std_px: Sequence[float]
+        self,
+        context: ExtractionContext,
+        keypoints: Sequence[Float64] = (),
+        std_px: Sequence[float] = (),
     ) -> None:
         self._context = context
         self._keypoints = keypoints
         self._std_px = std_px
-        self._gray: LruCache[int, Float32] = LruCache(CACHED_BYTES, lambda image: image.nbytes)
+        self._gray: LruCache[tuple[int, float], Float32] = LruCache(
+            CACHED_BYTES, lambda image: image.nbytes
+        )
 
     def run(self, pairs: Sequence[VerifiedPair]) -> list[AdjustedKeypoints]:
         """Align the patches of the best matches of all pairs, and adjust all keypoints."""
         counts = [len(xy) for xy in self._keypoints]
         pairs = select_best_matches(pairs, counts, MAX_ALIGNMENTS)
-        aligned = self._context.each("adjustment", pairs, self._align)
+        context = self._context
+        keys = [self._store(pair) for pair in pairs] if context.run_remotely else None
+        aligned = context.each("adjustment", pairs, self._align, remote_items=keys)
+        for key in keys or ():
+            context.cache.forget(_INPUTS, key)
+            context.cache.forget(_ALIGNED, key)
         return adjust_keypoints(self._keypoints, self._std_px, pairs, aligned)
 
-    def _align(self, pair: VerifiedPair) -> AlignedPair:
-        a, b = (
-            PairSide(
-                self._context.images[index].pinhole,
-                self._image(index),
-                self._keypoints[index][pair.matches[:, column]],
-                self._std_px[index],
-            )
-            for column, index in enumerate((pair.image_a, pair.image_b))
-        )
-        return align_pair(a, b, pair.rotation, pair.translation)
+    def align_stored(self, key: str) -> None:
+        """Align the patches of a pair in the cache, and store the result for the main process."""
+        cache = self._context.cache
+        given = cache.load(_INPUTS, key, AlignmentInput)
+        if given is not None and cache.load(_ALIGNED, key, AlignedPair) is None:
+            cache.store(_ALIGNED, key, self._align_input(given))
 
-    def _image(self, index: int) -> Float32:
-        std_px = self._std_px[index]
+    def _store(self, pair: VerifiedPair) -> str:
+        """Store the matched keypoints of a pair for remote workers, and return their key."""
+        given = self._input(pair)
+        key = self._key(given)
+        self._context.cache.store(_INPUTS, key, given)
+        return key
+
+    def _key(self, given: AlignmentInput) -> str:
+        """Return the key in the cache of an input and its result, which belong to one run."""
+        return content_key(self._context.shared_run, digest(given))
+
+    def _input(self, pair: VerifiedPair) -> AlignmentInput:
+        images = [pair.image_a, pair.image_b]
+        xy_a, xy_b = (
+            self._keypoints[index][pair.matches[:, side]] for side, index in enumerate(images)
+        )
+        std_px = np.array([self._std_px[index] for index in images], dtype=np.float64)
+        return AlignmentInput(np.array(images), xy_a, xy_b, std_px, pair.rotation, pair.translation)
+
+    def _align(self, pair: VerifiedPair) -> AlignedPair:
+        given = self._input(pair)
+        if self._context.run_remotely:
+            stored = self._context.cache.load(_ALIGNED, self._key(given), AlignedPair)
+            if stored is not None:
+                return stored
+        return self._align_input(given)
+
+    def _align_input(self, given: AlignmentInput) -> AlignedPair:
+        a, b = (
+            PairSide(self._context.images[index].pinhole, self._image(index, std_px), xy, std_px)
+            for index, std_px, xy in zip(
+                given.images.tolist(),
+                given.std_px.tolist(),
+                (given.xy_a, given.xy_b),
+                strict=True,
+            )
+        )
+        return align_pair(a, b, given.rotation, given.translation)
+
+    def _image(self, index: int, std_px: float) -> Float32:
         return self._gray.get(
-            index, lambda: smooth_gray_image(self._context.view(index).image, std_px)
+            (index, std_px), lambda: smooth_gray_image(self._context.view(index).image, std_px)
         )
 
 

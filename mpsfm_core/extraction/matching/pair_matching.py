@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, cast
 
@@ -60,6 +61,10 @@ class CandidateMatches:
         return len(self.sparse) + len(self.points.scores)
 
 
+LocatedFeatures = Sequence[Features] | FeatureSource
+"""Features of each image by image index, whose descriptors may be empty."""
+
+
 class PairMatcher:
     """Runs the configured matchers on pairs of images."""
 
@@ -79,7 +84,7 @@ class PairMatcher:
         """
 
         def work(pair: Pair) -> CandidateMatches:
-            return self._match_pair(pair, located[pair[0]], located[pair[1]])
+            return self.match_pair(pair, located)
 
         matches = self._context.each("matching", pairs, work, *self._providers)
         failures = [text for p in pairs if (text := self._context.pair_failures.get(p))]
@@ -102,7 +107,14 @@ class PairMatcher:
                 return (depth.depth_a, depth.depth_b)[side]
         raise LookupError(f"no matcher predicts depth for pair {pair}")
 
-    def _match_pair(self, pair: Pair, a: Features, b: Features) -> CandidateMatches:
+    @property
+    def is_cached(self) -> bool:
+        """True if all results of the matchers are in the cache."""
+        return all(p.is_reusable and not p.can("uncached") for p in self._providers)
+
+    def match_pair(self, pair: Pair, located: LocatedFeatures) -> CandidateMatches:
+        """Match an image pair with the features of all images, whose descriptors may be empty."""
+        a, b = located[pair[0]], located[pair[1]]
         options = self._context.config.extraction
         results = self.results(pair)
         no_scores = np.empty(0, dtype=np.float32)
@@ -148,15 +160,33 @@ class PairMatcher:
 
 
 class PairVerifier:
-    """Estimates the two-view geometry of candidate matches and caches the results."""
+    """Estimates the two-view geometry of candidate matches and caches the results.
 
-    def __init__(self, context: ExtractionContext, located: list[Features]) -> None:
-        self._context = context
-        self._located = located
+    Args:
+        context: Context of the extraction with images, options and cache.
+        located: Features of each image, whose descriptors may be empty.
+        matcher: Matcher of the candidate matches, whose results remote workers read from the cache,
+            or None for imported matches.
+    """
+
+    def __init__(
+        self,
+        context: ExtractionContext,
+        located: LocatedFeatures,
+        matcher: PairMatcher | None = None,
+    ) -> None:
+        self._context, self._located, self._matcher = context, located, matcher
 
     def verify(self, candidates: list[CandidateMatches]) -> list[TwoViewGeometry]:
         """Verify the candidate matches of all pairs; return their two-view geometries in order."""
-        return self._context.each("verification", candidates, self._verify)
+        is_cached = self._matcher is not None and self._matcher.is_cached
+        pairs = [matches.pair for matches in candidates] if is_cached else None
+        return self._context.each("verification", candidates, self._verify, remote_items=pairs)
+
+    def verify_pair(self, pair: Pair) -> TwoViewGeometry:
+        """Verify the matches of an image pair that the matcher has cached."""
+        assert self._matcher is not None
+        return self._verify(self._matcher.match_pair(pair, self._located))
 
     def _verify(self, matches: CandidateMatches) -> TwoViewGeometry:
         options, seed = self._context.config.verification, self._context.config.runtime.seed

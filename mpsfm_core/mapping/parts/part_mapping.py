@@ -78,9 +78,10 @@ def reconstruct(
 def select_parts(problem: MappingProblem, options: MapperOptions) -> list[Int64]:
     """Return the image indices of each part, or no parts if the problem is mapped in one piece.
 
+    Only the pipeline knows whether workers map the parts, so ``auto`` selects one piece.
     Known poses that are no guesses define the world, so these images are mapped in one piece.
     """
-    size = options.parts
+    size = None if options.parts == "auto" else options.parts
     has_poses = any(image.known_pose is not None for image in problem.images)
     if not size or len(problem.images) <= size or (has_poses and options.known_poses != "guess"):
         return []

@@ -518,7 +518,7 @@
       face.setAttribute("position", new THREE.BufferAttribute(new Float32Array([0, 1, 2, 0, 2, 3].map((i) => corners[i]).flat()), 3));
       face.setAttribute("uv", new THREE.BufferAttribute(new Float32Array([0, 1, 1, 1, 1, 0, 0, 1, 1, 0, 0, 0]), 2));
       const material = new THREE.MeshBasicMaterial({ side: THREE.DoubleSide, transparent: true, opacity: 0.85 });
-      if (photo.pictures.photo) {
+      if (photo.pictures.photo && !photo.pictures.photo.linked) {
         material.map = loader.load(photo.pictures.photo.src, draw);
         material.map.colorSpace = THREE.SRGBColorSpace;
       } else material.color.set("#8899aa");

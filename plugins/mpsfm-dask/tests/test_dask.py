@@ -44,6 +44,12 @@ def test_mapping_in_parts(tmp_path: Path, workers: int) -> None:
     executor_contract.check_mapping_in_parts("dask", {"workers": workers}, tmp_path)
 
 
+@pytest.mark.slow  # starts clusters
+def test_mapping_in_parts_with_a_killed_worker(tmp_path: Path) -> None:
+    options = {"workers": 2}
+    executor_contract.check_mapping_in_parts("dask", options, tmp_path, kills_worker=True)
+
+
 @pytest.mark.slow
 def test_a_failing_provider(tmp_path: Path) -> None:
     executor_contract.check_failing_provider("dask", {"workers": 2}, tmp_path)

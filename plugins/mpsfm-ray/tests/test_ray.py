@@ -40,8 +40,15 @@ def test_extraction(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow  # starts clusters
-def test_mapping_in_parts(tmp_path: Path) -> None:
-    executor_contract.check_mapping_in_parts("ray", {"workers": 2}, tmp_path)
+@pytest.mark.parametrize("workers", [1, 3])
+def test_mapping_in_parts(tmp_path: Path, workers: int) -> None:
+    executor_contract.check_mapping_in_parts("ray", {"workers": workers}, tmp_path)
+
+
+@pytest.mark.slow  # starts clusters
+def test_mapping_in_parts_with_a_killed_worker(tmp_path: Path) -> None:
+    options = {"workers": 2}
+    executor_contract.check_mapping_in_parts("ray", options, tmp_path, kills_worker=True)
 
 
 @pytest.mark.slow  # starts clusters
