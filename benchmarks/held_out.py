@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import time
-import zlib  # noqa: F401, because zlib fails if pycolmap, which has its own, is imported first
 from pathlib import Path
 from typing import Any
 
