@@ -349,8 +349,9 @@ class Component:
         reason = ImageReason.LOST_POINTS.because(step="re-registration")
         maintenance.deregister(find_lost_images(self.scene), reason)
         maintenance.history.clear()
+        rigs = self.scene.rigs
         for image, reference in detection.supporting_pairs.tolist():
-            maintenance.history.excluded_references[image].add(reference)
+            maintenance.history.exclude(rigs.images_of(image), rigs.images_of(reference))
 
     def _detect_misregistrations(self) -> list[Misregistration]:
         """Detect misregistered images, except those whose known pose must not change.

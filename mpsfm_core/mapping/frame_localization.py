@@ -25,6 +25,7 @@ from mpsfm_core.data.decisions import FrameReason, Reason
 from mpsfm_core.geometry import inside, project, rays, sample_nearest, scale_pixels, transform
 from mpsfm_core.geometry.optical_flow import track_points
 from mpsfm_core.optimize.resection import (
+    FrameImage,
     RaySegments,
     linearize_pose,
     measure_segments,
@@ -163,7 +164,8 @@ def localize_frame(
         np.full(len(xy), MAX_ERROR_PX),
         np.full(len(xy), MAX_ERROR_PX**2),
     )
-    pose = refine_pose(predicted, camera.pinhole.params, segments, scales=_SCALES)
+    image = FrameImage((np.eye(3), np.zeros(3)), camera.pinhole.params, segments)
+    pose = refine_pose(predicted, [image], scales=_SCALES)
     distances, _ = measure_segments(pose, camera.pinhole.params, segments)
     inlier = distances < MAX_ERROR_PX
     if inlier.sum() < MIN_INLIERS:

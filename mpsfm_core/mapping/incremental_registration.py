@@ -9,6 +9,7 @@ import numpy as np
 from mpsfm_core.data import Bool
 from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.model_maintenance import ModelMaintenance
+from mpsfm_core.mapping.refinement.depth_noise import DepthNoise
 from mpsfm_core.mapping.refinement.filtering import filter_points, find_lost_images
 from mpsfm_core.mapping.registration.correspondences import (
     PoseCorrespondences,
@@ -19,8 +20,9 @@ from mpsfm_core.mapping.registration.pose_estimation import (
     AbsolutePoseEstimator,
     select_distinct_poses,
 )
-from mpsfm_core.mapping.registration.pose_support import ScoredPose, score_pose
+from mpsfm_core.mapping.registration.pose_support import ScoredPose
 from mpsfm_core.mapping.scene.local_bundle import find_local_bundle
+from mpsfm_core.mapping.scene.scene import Snapshot
 from mpsfm_core.mapping.triangulation import triangulate_image
 
 NUM_WIDE_REFERENCES = 10
@@ -109,7 +111,8 @@ class IncrementalRegistration:
         scores = self._history.select_scores(self._scores, excluded=True)
         options = self._options.registration
         for image, best_match in rank_next_images(self._scene, scores, candidates, options):
-            del self._history.excluded_references[image]
+            for member in self._scene.rigs.images_of(image):
+                self._history.excluded_references.pop(member, None)
             references = self._select_references(image, best_match)
             if self._register_image(image, references, refine_globally=True) is None:
                 self._maintenance.confirm(image)
@@ -142,21 +145,21 @@ class IncrementalRegistration:
         return best is None or self._thresholds.check_support(best) is not None
 
     def _estimate_poses(
-        self, image: int, references: list[int], correspondences: PoseCorrespondences
+        self, references: list[int], correspondences: PoseCorrespondences
     ) -> list[ScoredPose]:
         """Estimate poses of an image, best first, and add the best pose of the last attempt."""
-        options, history = self._options.registration, self._history
-        poses = []
+        history = self._history
+        image, poses = correspondences.image, []
         last_pose = history.get_last_pose(image)
         if last_pose:
             hypothesis = last_pose.hypothesis
             if not self._scene.has_free_focal(image):
                 hypothesis = hypothesis._replace(focal_px=None)
-            poses.append(score_pose(self._scene, correspondences, hypothesis, options))
+            poses.append(self._pose_estimator.score_pose(correspondences, hypothesis))
         search = not history.is_exhausted(image, references)
         if search:
             attempt = history.count_searches(image)
-            poses += self._pose_estimator.estimate_poses(image, correspondences, attempt=attempt)
+            poses += self._pose_estimator.estimate_poses(correspondences, attempt=attempt)
         poses = select_distinct_poses(poses)
         history.record_attempt(image, references, poses[0] if poses else None, searched=search)
         return poses
@@ -181,17 +184,15 @@ class IncrementalRegistration:
             correspondences = find_correspondences(
                 scene, image, references, self._options.registration
             )
-            counts = np.bincount(
-                correspondences.references, correspondences.depth_weights, minlength=1
-            )
-            num_matches = int(counts.max())
+            num_matches = int(correspondences.max_frame_weight(scene))
             if num_matches < self._thresholds.min_inliers:
                 return ImageReason.TOO_FEW_POINTS.because(
                     num_matches=num_matches, min_matches=self._thresholds.min_inliers
                 )
-            poses = self._estimate_poses(image, references, correspondences)
-        snapshot, noise = scene.snapshot(), self._refiner.noise
+            poses = self._estimate_poses(references, correspondences)
+        before = scene.snapshot(), self._refiner.noise
         reason: Reason | None = ImageReason.NO_POSE.because()
+        verified: list[tuple[int, tuple[Snapshot, DepthNoise]]] = []
         for pose in poses:
             reason = self._thresholds.check_support(pose, confident=refine_globally)
             if not refine_globally:
@@ -201,11 +202,23 @@ class IncrementalRegistration:
                     image, pose, correspondences, refine_globally=refine_globally
                 )
                 if reason is None:
-                    return None
-                self._history.reject_pose(image, pose, reason)
-                scene.restore(snapshot)
-                self._refiner.noise = noise
+                    if len(scene.rigs.images_of(image)) == 1:
+                        return None
+                    num_explained = int(np.count_nonzero(scene.explained_edges()))
+                    verified.append((num_explained, (scene.snapshot(), self._refiner.noise)))
+                else:
+                    self._history.reject_pose(image, pose, reason)
+                self._restore(before)
+        if verified:
+            _, state = max(verified, key=lambda candidate: candidate[0])
+            self._restore(state)
+            return None
         return reason
+
+    def _restore(self, state: tuple[Snapshot, DepthNoise]) -> None:
+        """Restore the scene and the noise of depth before or after the registration of an image."""
+        snapshot, self._refiner.noise = state
+        self._scene.restore(snapshot)
 
     def _extend_model(
         self,
@@ -246,7 +259,7 @@ class IncrementalRegistration:
                 self._refiner.refine_globally()
         reason = self._maintenance.check_depth(image, self._options.consistency.max_violations)
         if reason:
-            self._exclude_references(image, pose, correspondences)
+            self._exclude_references(pose, correspondences)
             return reason
         with self._event_log.timed("local refinement"):
             self._refiner.refine_locally(image)
@@ -256,13 +269,13 @@ class IncrementalRegistration:
         self._maintenance.deregister(lost, ImageReason.LOST_POINTS.because(step="local-refinement"))
         return None
 
-    def _exclude_references(
-        self, image: int, pose: ScoredPose, correspondences: PoseCorrespondences
-    ) -> None:
-        """Exclude reference images whose matches support a pose that depth contradicts."""
-        options = self._options.registration
-        for reference in map(int, np.unique(correspondences.references)):
-            rows = correspondences.references == reference
-            scored = score_pose(self._scene, correspondences.select(rows), pose.hypothesis, options)
+    def _exclude_references(self, pose: ScoredPose, correspondences: PoseCorrespondences) -> None:
+        """Exclude reference frames whose matches support a pose that depth contradicts."""
+        scene, options = self._scene, self._options.registration
+        new_images = scene.rigs.images_of(correspondences.image)
+        frames = correspondences.frames(scene)
+        for frame in map(int, np.unique(frames)):
+            of_frame = correspondences.select(frames == frame)
+            scored = self._pose_estimator.score_pose(of_frame, pose.hypothesis)
             if scored.inlier_ratio >= options.min_pose_inlier_ratio:
-                self._history.excluded_references[image].add(reference)
+                self._history.exclude(new_images, scene.rigs.images_of(frame))

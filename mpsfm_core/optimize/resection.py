@@ -8,6 +8,7 @@ dt`` minimizes Tukey's biweight loss of the distances between keypoints and proj
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,18 @@ class RaySegments(NamedTuple):
     influence."""
     weight: Float64
     """(m,) weight of each match in the objective."""
+
+
+class FrameImage(NamedTuple):
+    """Image of a frame of a rig, whose relative pose to the refined camera is constant."""
+
+    relative_pose: Pose
+    """Pose ``image_from_camera`` of the image relative to the refined camera, which is the identity
+    for the refined camera."""
+    intrinsics: Float64
+    """(4,) camera parameters fx, fy, cx, cy in pixels."""
+    segments: RaySegments
+    """Keypoints of the image, and their segments."""
 
 
 class _NearestPoint(NamedTuple):
@@ -89,23 +102,27 @@ def measure_segments(
 
 
 def refine_pose(
-    pose: Pose, intrinsics: Float64, segments: RaySegments, *, scales: Float64
+    pose: Pose, images: Sequence[FrameImage], *, scales: Float64
 ) -> tuple[Float64, Float64]:
     """Refine a camera pose by one Gauss-Newton step per scale of the distance limits.
 
+    A rotation ``exp(w)`` of the camera is a rotation ``exp(R w)`` of an image with the relative
+    pose ``(R, t)``, and a shift ``dt`` of the camera is a shift ``R dt`` of the image.
+
     Args:
         pose: Initial ``cam_from_world``.
-        intrinsics: (4,) camera parameters fx, fy, cx, cy in pixels.
-        segments: Keypoints and segments.
+        images: Images of the camera's frame, whose keypoints determine the pose.
         scales: Factors on the distance limits, the largest first (graduated non-convexity).
 
     Returns:
         The refined pose, or the last valid pose if the matches do not constrain the pose.
     """
     rotation, translation = map(np.ascontiguousarray, pose)
-    matrix, vector = np.empty((POSE, POSE)), np.empty(POSE)
+    derivatives = [
+        np.kron(np.eye(2), image.relative_pose[0]).astype(np.float64) for image in images
+    ]
     for scale in scales:
-        linearize_pose(rotation, translation, intrinsics, segments, scale, matrix, vector)
+        matrix, vector = _linearize_frame(rotation, translation, images, derivatives, scale)
         diagonal = matrix.diagonal()
         if not (diagonal > 0).all():
             break
@@ -115,6 +132,39 @@ def refine_pose(
         rotation = np.array(rotation_from_vector(step[0], step[1], step[2])) @ rotation
         translation = translation + step[3:]
     return rotation, translation
+
+
+def _linearize_frame(
+    rotation: Float64,
+    translation: Float64,
+    images: Sequence[FrameImage],
+    derivatives: Sequence[Float64],
+    scale: float,
+) -> tuple[Float64, Float64]:
+    """Sum the Gauss-Newton matrices (6, 6) and gradients (6,) of the images of a frame.
+
+    Args:
+        rotation: (3, 3) ``cam_from_world``.
+        translation: (3,) ``cam_from_world``.
+        images: Images of the frame.
+        derivatives: Derivative (6, 6) of the pose of each image by the pose of the camera.
+        scale: Factor on the distance limits.
+    """
+    matrix, gradient = np.zeros((POSE, POSE)), np.zeros(POSE)
+    of_image, vector = np.empty((POSE, POSE)), np.empty(POSE)
+    for ((turn, shift), intrinsics, segments), derivative in zip(images, derivatives, strict=True):
+        linearize_pose(
+            turn @ rotation,
+            turn @ translation + shift,
+            intrinsics,
+            segments,
+            scale,
+            of_image,
+            vector,
+        )
+        matrix += derivative.T @ of_image @ derivative
+        gradient += derivative.T @ vector
+    return matrix, gradient
 
 
 @_kernel

@@ -82,7 +82,7 @@ def proposals(problem: MappingProblem, reference: int = 0, image: int = 1) -> li
     made = [
         estimate()
         for estimate in PoseHypothesisGenerator(
-            scene, image, correspondences, options, 0
+            scene, correspondences, options, 0
         ).generate_from_all()
     ]
     return [h for h in made if h is not None and h.source == "multi-view network"]
@@ -110,5 +110,5 @@ def test_wrong_network_pose_is_outvoted_by_matches() -> None:
     scene.maps[0].set_scale(1.0)
     options = RegistrationOptions()
     correspondences = find_correspondences(scene, 1, [0], options)
-    best = estimate_candidate_poses(scene, 1, correspondences, options, seed=0, attempt=0)[0]
+    best = estimate_candidate_poses(scene, correspondences, options, seed=0, attempt=0)[0]
     assert rotation_angle_deg(best.rotation @ POSES[1][:, :3].T) < 1.0

@@ -136,7 +136,7 @@ def test_support_and_inlier_ratio_are_weighted_and_num_inliers_is_not() -> None:
     scores = np.where(np.arange(count) < 6, 0.9, 0.1)
     references, known = np.zeros(count, dtype=np.int64), np.ones(count, dtype=np.bool_)
     correspondences = PoseCorrespondences(
-        keypoints, keypoints, points, points, points, references, known, scores
+        1, keypoints, keypoints, points, points, points, references, known, scores
     )
     options = RegistrationOptions(max_depth_deviation=1e6)
     pose = score_pose(

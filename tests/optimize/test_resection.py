@@ -12,6 +12,7 @@ from mpsfm_core.data import Float64, Pose
 from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.optimize.resection import (
     POSE,
+    FrameImage,
     RaySegments,
     linearize_pose,
     measure_segments,
@@ -52,6 +53,11 @@ def errors(pose: Pose) -> tuple[float, float]:
     """Return the rotation error in degrees and the translation error of a pose."""
     turn = float(rotation_angle_deg(pose[0] @ TRUTH[0].T))
     return turn, float(np.linalg.norm(pose[1] - TRUTH[1]))
+
+
+def alone(seen: RaySegments) -> list[FrameImage]:
+    """Return the only image of a frame."""
+    return [FrameImage((np.eye(3), np.zeros(3)), INTRINSICS, seen)]
 
 
 def objective(pose: Pose, seen: RaySegments, scale: float = 1.0) -> tuple[float, Float64, Float64]:
@@ -131,7 +137,7 @@ def test_pose_with_wrong_matches_is_found_from_distant_start() -> None:
     start = moved(TRUTH, np.array([0.02, -0.02, 0.02, 0.1, 0.1, -0.1]))
     off = measure_segments(start, INTRINSICS, seen)[0][~wrong]
     assert np.median(off) > 4.0
-    found = refine_pose(start, INTRINSICS, seen, scales=NARROWING)
+    found = refine_pose(start, alone(seen), scales=NARROWING)
     turn, shift = errors(found)
     assert turn < 0.05
     assert shift < 0.01
@@ -148,7 +154,7 @@ def test_optimum_of_noisy_points_equals_scipy() -> None:
         return values
 
     expected = moved(TRUTH, least_squares(residuals, np.zeros(POSE), xtol=1e-12, ftol=1e-12).x)
-    found = refine_pose(TRUTH, INTRINSICS, seen, scales=np.ones(50))
+    found = refine_pose(TRUTH, alone(seen), scales=np.ones(50))
     np.testing.assert_allclose(found[0], expected[0], atol=1e-6)
     np.testing.assert_allclose(found[1], expected[1], atol=1e-5)
 
@@ -157,7 +163,7 @@ def test_pose_from_points_is_as_accurate_as_colmap() -> None:
     """COLMAP minimizes another robust loss of the same errors."""
     seen = segments(200, slack=0.0, noise_px=0.5, seed=3)
     start = moved(TRUTH, np.array([0.01, -0.01, 0.01, 0.05, 0.05, -0.05]))
-    found = refine_pose(start, INTRINSICS, seen, scales=NARROWING)
+    found = refine_pose(start, alone(seen), scales=NARROWING)
     camera = pycolmap.Camera(model="PINHOLE", width=640, height=480, params=INTRINSICS)
     colmap = pycolmap.refine_absolute_pose(
         pycolmap.Rigid3d(pycolmap.Rotation3d(start[0]), start[1]),
@@ -173,8 +179,31 @@ def test_pose_from_points_is_as_accurate_as_colmap() -> None:
 def test_undetermined_pose_is_unchanged() -> None:
     seen = segments(5)
     far_off = seen._replace(xy=seen.xy + 1e4)
-    found = refine_pose(TRUTH, INTRINSICS, far_off, scales=np.ones(3))
+    found = refine_pose(TRUTH, alone(far_off), scales=np.ones(3))
     np.testing.assert_array_equal(found[0], TRUTH[0])
     np.testing.assert_array_equal(found[1], TRUTH[1])
     one = RaySegments(*(values[:1] for values in seen))
-    assert np.isfinite(refine_pose(TRUTH, INTRINSICS, one, scales=np.ones(3))[1]).all()
+    assert np.isfinite(refine_pose(TRUTH, alone(one), scales=np.ones(3))[1]).all()
+
+
+def test_pose_of_frame_is_determined_by_all_images() -> None:
+    """Two points in each of three images determine the pose, and no image determines it alone."""
+    images = []
+    for number, angle in enumerate((0.0, 1.5, 3.0)):
+        relative = (
+            Rotation.from_rotvec([0.1, angle, 0.0]).as_matrix(),
+            np.array([0.1 * number, 0.2, 0.0]),
+        )
+        of_image = relative[0] @ TRUTH[0], relative[0] @ TRUTH[1] + relative[1]
+        rays = np.random.default_rng(number).uniform(-0.5, 0.5, (2, 2))
+        depth = np.array([2.0, 3.0])[:, None]
+        points = (depth * np.column_stack([rays, np.ones(2)]) - of_image[1]) @ of_image[0]
+        xy = rays * INTRINSICS[:2] + INTRINSICS[2:]
+        seen = RaySegments(points, points, xy, np.full(2, 4.0), np.ones(2))
+        images.append(FrameImage(relative, INTRINSICS, seen))
+    start = moved(TRUTH, np.array([0.01, -0.02, 0.01, 0.02, 0.03, -0.03]))
+    turn, shift = errors(refine_pose(start, images, scales=NARROWING))
+    assert turn < 1e-4
+    assert shift < 1e-4
+    turn, shift = errors(refine_pose(start, images[:1], scales=NARROWING))
+    assert shift > 1e-3

@@ -109,6 +109,9 @@ class PairCounts(NamedTuple):
 def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistration]:
     """Detect groups of registered images whose matches mostly contradict their poses.
 
+    The matches of all images of a frame are counted together, and the first image represents the
+    frame.
+
     Args:
         scene: The scene with the registered images.
         min_matches: Smallest number of matches of a pair that can contradict poses.
@@ -117,7 +120,8 @@ def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistrat
         Sets of images that may be misregistered together, the largest excess of contradicting
         matches first.
     """
-    return find_misregistrations(count_pair_matches(scene, min_matches), scene.registered)
+    registered = scene.registered & scene.rigs.is_first
+    return find_misregistrations(count_pair_matches(scene, min_matches), registered)
 
 
 def find_misregistrations(counts: PairCounts, registered: Bool) -> list[Misregistration]:
@@ -178,14 +182,18 @@ def find_misregistrations(counts: PairCounts, registered: Bool) -> list[Misregis
 
 
 def count_pair_matches(scene: Scene, min_matches: int = 0) -> PairCounts:
-    """Count the explained and the contradicting matches of each pair of images.
+    """Count the explained and the contradicting matches of each pair of frames.
+
+    The first image of a frame represents the frame, and is the frame of an image without a rig.
+    Matches within a frame are not counted.
 
     Args:
         scene: The scene with the registered images.
         min_matches: Smallest number of matches of a pair that can contradict poses.
     """
     graph, n = scene.graph, scene.num_images
-    a, b = graph.image_of[graph.source], graph.image_of[graph.target]
+    frame_of = scene.rigs.frame_of[graph.image_of]
+    a, b = frame_of[graph.source], frame_of[graph.target]
     once = a < b
     keys, pair_of, matches = np.unique(
         a[once] * n + b[once], return_inverse=True, return_counts=True

@@ -84,7 +84,7 @@ class PairConsistencyCheck:
         min_matches = self._options.registration.min_inliers
         results = {
             pair: self.check_pair(pair)
-            for pair in problem.pairs
+            for pair in problem.pairs_between_frames()
             if len(pair) >= min_matches and candidates[pair.image_a] and candidates[pair.image_b]
         }
         consistent = {
@@ -155,6 +155,8 @@ class PairConsistencyCheck:
             scene, initial.image, [initial.reference], self._options.registration
         )
         depth_map = scene.maps[initial.image]
+        of_image = scene.graph.image_of[correspondences.keypoints] == initial.image
+        correspondences = correspondences.select(of_image)
         rows = correspondences.keypoints - scene.graph.offsets[initial.image]
         z = correspondences.points @ pose.rotation[2] + pose.translation[2]
         usable = correspondences.depth_known & depth_map.keypoint_valid[rows] & (z > 0)

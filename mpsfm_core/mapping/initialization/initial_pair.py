@@ -22,7 +22,7 @@ from mpsfm_core.mapping.registration.correspondences import (
 )
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.registration.pose_support import ScoredPose
-from mpsfm_core.mapping.registration.rig_scale import estimate_rig_scale
+from mpsfm_core.mapping.registration.rig_scale import estimate_rig_scale, set_frame_scales
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.mapping.triangulation import triangulate_midpoints
@@ -127,6 +127,7 @@ def register_first_image(scene: Scene, image: int) -> None:
     scene.maps[image].set_scale(1.0)
     if scene.rigs.exist:
         scene.set_rig_scale(estimate_rig_scale(scene, image) or 1.0)
+        set_frame_scales(scene, image)
 
 
 def rank_initial_pairs(scene: Scene) -> list[VerifiedPair]:
@@ -153,11 +154,11 @@ def estimate_initial_pairs(
     """
     estimate = pose_estimator.estimate_poses if refine else pose_estimator.estimate_unrefined_poses
     return [
-        InitialPair(reference, image, pose)
-        for reference, image, correspondences in _register_each_reference(
+        InitialPair(reference, correspondences.image, pose)
+        for reference, correspondences in _register_each_reference(
             pose_estimator.scene, pair, options
         )
-        for pose in estimate(image, correspondences, attempt=0)
+        for pose in estimate(correspondences, attempt=0)
     ]
 
 
@@ -169,12 +170,11 @@ def refine_initial_pairs(
 ) -> list[InitialPair]:
     """Refine relative poses by bundle adjustment, except poses that lose support."""
     return [
-        InitialPair(reference, image, pose)
-        for reference, image, correspondences in _register_each_reference(
+        InitialPair(reference, correspondences.image, pose)
+        for reference, correspondences in _register_each_reference(
             pose_estimator.scene, pair, options
         )
         for pose in pose_estimator.refine_poses(
-            image,
             [initial.pose for initial in initial_pairs if initial.reference == reference],
             correspondences,
         )
@@ -183,12 +183,12 @@ def refine_initial_pairs(
 
 def _register_each_reference(
     scene: Scene, pair: VerifiedPair, options: RegistrationOptions
-) -> Iterator[tuple[int, int, PoseCorrespondences]]:
-    """Yield reference image, second image and 2D-3D matches, with either image as reference."""
+) -> Iterator[tuple[int, PoseCorrespondences]]:
+    """Yield the reference image and the 2D-3D matches, with either image as reference."""
     empty = scene.snapshot()
     for reference, image in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a)):
         register_first_image(scene, reference)
-        yield reference, image, find_correspondences(scene, image, [reference], options)
+        yield reference, find_correspondences(scene, image, [reference], options)
         scene.restore(empty)
 
 

@@ -11,8 +11,13 @@ steps.
 6. ``pose_estimation`` refines a few distinct poses by bundle adjustment.
 7. ``IncrementalRegistration`` registers the image, triangulates, refines locally and checks depth
    consistency (paper section 3.4). If the depth is inconsistent, the registration is rolled back.
+   A frame with several images takes the pose with which most matches are explained.
 8. ``registration_history`` records failed registration attempts, so that they are not repeated.
 9. ``threshold_schedule`` relaxes the acceptance thresholds if no image can be registered.
+
+The images of one frame of a rig are registered together by the matches of all of them. An image
+without a rig is the only image of its frame. For frames of rigs, ``reverse_correspondences``
+exchanges the roles of the new and a registered frame, so that the more accurate depth is used.
 
 ``tentative_registration`` adds images without verification after the reconstruction is complete.
 """

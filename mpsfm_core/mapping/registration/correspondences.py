@@ -1,4 +1,7 @@
-"""2D-3D correspondences of an image that is to be registered.
+"""2D-3D correspondences of an image that is to be registered, and of its frame.
+
+The images of one frame of a rig have constant relative poses, so the matches of all images of the
+frame determine one pose. An image without a rig is the only image of its frame.
 
 Each match to a registered image gives one correspondence between a keypoint of the new image and a
 3D point. The 3D point of a match is triangulated, or lifted from the depth of the registered image
@@ -26,10 +29,13 @@ keypoints]"""
 
 
 class PoseCorrespondences(NamedTuple):
-    """2D-3D correspondences of one image with registered images."""
+    """2D-3D correspondences of the images of one frame with registered images."""
 
+    image: int
+    """Image that is to be registered, whose pose the correspondences determine."""
     keypoints: Int64
-    """(m,) global keypoint numbers of the image that is to be registered."""
+    """(m,) global keypoint numbers of the image and of the other images of its frame, the keypoints
+    of one image after those of another."""
     matched_keypoints: Int64
     """(m,) global numbers of the matched keypoints in registered images."""
     points: Float64
@@ -57,16 +63,36 @@ class PoseCorrespondences(NamedTuple):
         is_point: Bool = (self.near_points == self.far_points).all(axis=1)
         return is_point
 
-    def select(self, rows: Int64 | Bool) -> PoseCorrespondences:
-        """Return the correspondences that row indices or a bool mask select."""
-        fields: list[Any] = [values[rows] for values in self]
-        return PoseCorrespondences(*fields)
+    def select(self, rows: Int64 | Bool | slice) -> PoseCorrespondences:
+        """Return the correspondences that row indices, a bool mask or a slice select."""
+        fields: list[Any] = [values[rows] for values in self[1:]]
+        return PoseCorrespondences(self.image, *fields)
+
+    def split_by_image(self, scene: Scene) -> list[tuple[int, slice]]:
+        """Return the images of the frame that have correspondences, each with its slice of rows."""
+        images = scene.graph.image_of[self.keypoints]
+        starts = [0, *(np.flatnonzero(np.diff(images)) + 1).tolist()]
+        ends = [*starts[1:], len(images)]
+        return [
+            (int(images[start]), slice(start, end))
+            for start, end in zip(starts, ends, strict=True)
+            if end > start
+        ]
+
+    def frames(self, scene: Scene) -> Int64:
+        """Return the frame (m,) of the registered image of each correspondence."""
+        frames: Int64 = scene.rigs.frame_of[self.references]
+        return frames
+
+    def max_frame_weight(self, scene: Scene) -> float:
+        """Return the largest sum of :attr:`depth_weights` over the images of one frame."""
+        return float(np.bincount(self.frames(scene), self.depth_weights, minlength=1).max())
 
 
 def find_correspondences(
     scene: Scene, image: int, references: list[int], options: RegistrationOptions
 ) -> PoseCorrespondences:
-    """Collect the 2D-3D correspondences of an image with the given registered images.
+    """Collect the 2D-3D correspondences of the frame of an image with registered images.
 
     A match uses the triangulated point of its keypoint if the triangulation angle suffices.
     If the triangulation angle is too small, the 3D point lies on the part of the matched keypoint's
@@ -75,14 +101,18 @@ def find_correspondences(
     Args:
         scene: The scene with the registered images.
         image: The image to register.
-        references: Registered images whose matches are used.
+        references: Registered images whose matches, and those of the other images of their frames,
+            are used.
         options: Registration options ``lifting``, ``min_point_angle_deg`` and
             ``max_depth_deviation``.
     """
     graph, tracks = scene.graph, scene.tracks
-    edges = graph.edges_of(image)
-    source, target, scores = graph.source[edges], graph.target[edges], graph.score[edges]
-    in_references = scene.mask(references)[graph.image_of[target]]
+    edges = [graph.edges_of(member) for member in scene.rigs.images_of(image)]
+    source, target, scores = (
+        np.concatenate([values[rows] for rows in edges])
+        for values in (graph.source, graph.target, graph.score)
+    )
+    in_references = scene.mask(scene.rigs.complete(references))[graph.image_of[target]]
     source, target, scores = source[in_references], target[in_references], scores[in_references]
     point = tracks.point_of[target]
     angle_deg = np.append(scene.track_angles_deg(), 0.0)[point]
@@ -100,6 +130,7 @@ def find_correspondences(
     near_points = centers + rays * np.maximum(np.exp(-log_range), MIN_DEPTH_RATIO)[:, None]
     far_points = centers + rays * np.exp(log_range)[:, None]
     return PoseCorrespondences(
+        image,
         source,
         target,
         points,

@@ -40,6 +40,9 @@ def rank_next_images(
 ) -> list[tuple[int, int]]:
     """Rank the unregistered candidate images, best first (COLMAP's ``FindNextImages``).
 
+    One image represents each frame of a rig, the image with the best matching registered image.
+    Frames are ranked by the match scores between all images of two frames.
+
     Args:
         scene: The scene with the registered images.
         scores: (n, n) matching scores from :func:`compute_pair_scores`.
@@ -50,15 +53,24 @@ def rank_next_images(
         Candidate images, best first, each with its best matching registered image.
     """
     visible = _count_visible_points(scene) if options.next_view == "visible-points" else None
+    frame_of, is_candidate = scene.rigs.frame_of, candidates & ~scene.registered
     ranked = []
-    for image in map(int, np.flatnonzero(candidates & ~scene.registered)):
-        row = slice(*scores.indptr[image : image + 2])
-        matching, values = scores.indices[row], scores.data[row]
+    for frame in map(int, np.unique(frame_of[is_candidate])):
+        images = [k for k in scene.rigs.images_of(frame) if is_candidate[k]]
+        rows = [slice(*scores.indptr[k : k + 2]) for k in images]
+        owners = np.repeat(images, [row.stop - row.start for row in rows])
+        matching, values = (
+            np.concatenate([array[row] for row in rows]) for array in (scores.indices, scores.data)
+        )
         usable = scene.registered[matching] & (values > 0)
         if usable.any():
-            best = int(np.where(usable, values, 0).argmax())
-            rank = float(values[best] if visible is None else visible[image])
-            ranked.append((-rank, image, int(matching[best])))
+            owners, matching, values = owners[usable], matching[usable], values[usable]
+            _, frame_rows = np.unique(frame_of[matching], return_inverse=True)
+            totals = np.bincount(frame_rows, values)
+            best_frame = int(totals.argmax())
+            best = int(np.where(frame_rows == best_frame, values, 0).argmax())
+            rank = float(totals[best_frame] if visible is None else visible[images].sum())
+            ranked.append((-rank, int(owners[best]), int(matching[best])))
     return [(image, best_match) for _, image, best_match in sorted(ranked)]
 
 

@@ -14,7 +14,7 @@ from functools import partial
 
 import numpy as np
 
-from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.geometry import compose, invert, rotation_angle_deg
 from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
 from mpsfm_core.mapping.refinement.refinement import Refiner
 from mpsfm_core.mapping.registration.correspondences import PoseCorrespondences
@@ -24,6 +24,10 @@ from mpsfm_core.mapping.registration.pose_hypotheses import (
     PoseHypothesisGenerator,
 )
 from mpsfm_core.mapping.registration.pose_support import ScoredPose, maximize_support, score_pose
+from mpsfm_core.mapping.registration.reverse_correspondences import (
+    find_reverse_reference,
+    reverse_registration,
+)
 from mpsfm_core.mapping.scene.scene import Scene, Snapshot
 from mpsfm_core.mapping.triangulation import triangulate_image
 from mpsfm_core.support.threads import thread_limit
@@ -45,7 +49,7 @@ class AbsolutePoseEstimator:
         self._options = options
 
     def estimate_poses(
-        self, image: int, correspondences: PoseCorrespondences, *, attempt: int
+        self, correspondences: PoseCorrespondences, *, attempt: int
     ) -> list[ScoredPose]:
         """Estimate a few distinct poses of an image and refine them by bundle adjustment.
 
@@ -53,54 +57,90 @@ class AbsolutePoseEstimator:
         registration runs bundle adjustment anyway.
 
         Args:
-            image: The image to register.
-            correspondences: Its 2D-3D correspondences.
+            correspondences: 2D-3D correspondences of the image to register and of its frame.
             attempt: Number of earlier registration attempts of the image (see
                 :func:`estimate_candidate_poses`).
         """
         options = self._options.registration
-        poses = self.estimate_unrefined_poses(image, correspondences, attempt=attempt)
+        poses = self.estimate_unrefined_poses(correspondences, attempt=attempt)
         if len(poses) == 1 and poses[0].inlier_ratio >= options.confident_inlier_ratio:
             return poses
-        return self.refine_poses(image, poses, correspondences)
+        return self.refine_poses(poses, correspondences)
 
     def estimate_unrefined_poses(
-        self, image: int, correspondences: PoseCorrespondences, *, attempt: int
+        self, correspondences: PoseCorrespondences, *, attempt: int
     ) -> list[ScoredPose]:
         """Estimate a few distinct poses of an image without bundle adjustment."""
         options, seed = self._options.registration, self._options.seed
         if not self._options.refinement.refine_focal:
             options = options.model_copy(update={"estimate_focal": False})
-        return estimate_candidate_poses(
-            self.scene, image, correspondences, options, seed=seed, attempt=attempt
+        estimate = partial(estimate_candidate_poses, options=options, seed=seed, attempt=attempt)
+        poses = estimate(self.scene, correspondences)
+        image, reference = (
+            correspondences.image,
+            find_reverse_reference(self.scene, correspondences),
         )
+        if reference is None:
+            return poses
+        with reverse_registration(self.scene, image, reference, options) as reverse:
+            reverse_poses = estimate(self.scene, reverse)
+        poses += [self._from_reverse(pose, reference) for pose in reverse_poses]
+        return select_distinct_poses(poses, options.num_bundle_adjusted)
+
+    def score_pose(
+        self, correspondences: PoseCorrespondences, hypothesis: PoseHypothesis
+    ) -> ScoredPose:
+        """Compute the support of a pose by the depth of the registered or of the new frame.
+
+        Args:
+            correspondences: 2D-3D correspondences of the image to register and of its frame.
+            hypothesis: The pose of the image.
+        """
+        scene, options = self.scene, self._options.registration
+        scored = score_pose(scene, correspondences, hypothesis, options)
+        image, reference = correspondences.image, find_reverse_reference(scene, correspondences)
+        if reference is None:
+            return scored
+        world = scene.rotations[reference].copy(), scene.translations[reference].copy()
+        pose = compose(world, invert(hypothesis.rotation, hypothesis.translation))
+        reverse_hypothesis = PoseHypothesis(*pose, hypothesis.source)
+        with reverse_registration(scene, image, reference, options) as reverse:
+            reverse_scored = score_pose(scene, reverse, reverse_hypothesis, options)
+        reverse_scored = self._from_reverse(reverse_scored, reference)
+        return max(scored, reverse_scored, key=lambda candidate: candidate.support)
+
+    def _from_reverse(self, scored: ScoredPose, reference: int) -> ScoredPose:
+        """Return the pose of a new image from the pose of a registered image relative to it."""
+        world = self.scene.rotations[reference], self.scene.translations[reference]
+        rotation, translation = compose(invert(scored.rotation, scored.translation), world)
+        return replace(scored, rotation=rotation, translation=translation)
 
     def refine_poses(
-        self, image: int, poses: Sequence[ScoredPose], correspondences: PoseCorrespondences
+        self, poses: Sequence[ScoredPose], correspondences: PoseCorrespondences
     ) -> list[ScoredPose]:
         """Refine poses by bundle adjustment, except poses that lose support."""
         snapshot = self.scene.snapshot()
-        return [self._refine_pose(image, pose, correspondences, snapshot) for pose in poses]
+        return [self._refine_pose(pose, correspondences, snapshot) for pose in poses]
 
     def _refine_pose(
-        self, image: int, pose: ScoredPose, correspondences: PoseCorrespondences, snapshot: Snapshot
+        self, pose: ScoredPose, correspondences: PoseCorrespondences, snapshot: Snapshot
     ) -> ScoredPose:
-        scene, options = self.scene, self._options
+        scene, options, image = self.scene, self._options, correspondences.image
         scene.register(image, pose.rotation, pose.translation, pose.focal_px)
-        triangulate_image(scene, image, options.triangulation)
+        for member in scene.rigs.images_of(image):
+            triangulate_image(scene, member, options.triangulation)
         self._refiner.adjust(
             [image], local=True, max_iterations=options.registration.max_bundle_iterations
         )
         rotation, translation = scene.rotations[image].copy(), scene.translations[image].copy()
         scene.restore(snapshot)
         adjusted = PoseHypothesis(rotation, translation, pose.source, pose.focal_px)
-        refined = score_pose(scene, correspondences, adjusted, options.registration)
+        refined = self.score_pose(correspondences, adjusted)
         return max(pose, refined, key=lambda candidate: candidate.support)
 
 
 def estimate_candidate_poses(
     scene: Scene,
-    image: int,
     correspondences: PoseCorrespondences,
     options: RegistrationOptions,
     *,
@@ -114,8 +154,7 @@ def estimate_candidate_poses(
 
     Args:
         scene: The scene with the registered images.
-        image: The image to register.
-        correspondences: Its 2D-3D correspondences.
+        correspondences: 2D-3D correspondences of the image to register and of its frame.
         options: Inlier thresholds and numbers of pose hypotheses.
         seed: Seed of RANSAC.
         attempt: Number of earlier registration attempts of the image. Each of the first
@@ -123,7 +162,7 @@ def estimate_candidate_poses(
             attempts draw no halves.
     """
     poses: list[ScoredPose] = []
-    generator = PoseHypothesisGenerator(scene, image, correspondences, options, seed)
+    generator = PoseHypothesisGenerator(scene, correspondences, options, seed)
     with ThreadPoolExecutor(thread_limit()) as pool:
 
         def add_poses(estimators: Iterator[HypothesisEstimator]) -> None:

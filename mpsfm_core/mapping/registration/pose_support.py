@@ -18,7 +18,12 @@ from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration.correspondences import PoseCorrespondences
 from mpsfm_core.mapping.registration.pose_hypotheses import PoseHypothesis
 from mpsfm_core.mapping.scene.scene import Scene
-from mpsfm_core.optimize.resection import RaySegments, measure_segments, refine_pose
+from mpsfm_core.optimize.resection import (
+    FrameImage,
+    RaySegments,
+    measure_segments,
+    refine_pose,
+)
 
 REFINEMENT_SCALES = np.maximum(5.0 * 0.8 ** np.arange(12), 1.0)
 """Factors of the inlier threshold in successive Gauss-Newton steps. The factors start large because
@@ -61,28 +66,29 @@ def score_pose(
 
     Args:
         scene: The scene with the registered images.
-        correspondences: 2D-3D correspondences of the image.
-        hypothesis: The pose.
+        correspondences: 2D-3D correspondences of the image and of the images of its frame.
+        hypothesis: The pose of the image.
         options: Options with the inlier thresholds ``max_support_error_px`` and
             ``max_depth_deviation``.
     """
     residuals = _compute_residuals(scene, correspondences, hypothesis, options)
     inlier = residuals < 1
 
-    def sum_per_reference(values: Float64) -> Float64:
-        sums = np.bincount(correspondences.references, values, minlength=scene.num_images)
-        return sums.astype(np.float64)
+    frames = correspondences.frames(scene)
 
-    support = sum_per_reference(correspondences.weights * (1 - residuals**2))
+    def sum_per_frame(values: Float64) -> Float64:
+        return np.bincount(frames, values, minlength=scene.num_images).astype(np.float64)
+
+    support = sum_per_frame(correspondences.weights * (1 - residuals**2))
     best = int(np.argmax(support))
-    total = sum_per_reference(correspondences.weights)[best]
-    inlier_weight = sum_per_reference(correspondences.weights * inlier)[best]
+    total = sum_per_frame(correspondences.weights)[best]
+    inlier_weight = sum_per_frame(correspondences.weights * inlier)[best]
     return ScoredPose(
         hypothesis.rotation,
         hypothesis.translation,
         hypothesis.source,
         float(support[best]),
-        int(sum_per_reference(correspondences.depth_weights * inlier)[best]),
+        int(sum_per_frame(correspondences.depth_weights * inlier)[best]),
         float(inlier_weight / total) if total else 0.0,
         hypothesis.focal_px,
     )
@@ -103,8 +109,14 @@ def maximize_support(
         return pose
     rotation, translation = refine_pose(
         (pose.rotation, pose.translation),
-        _get_intrinsics(scene, correspondences, pose.focal_px),
-        _make_segments(scene, correspondences, options),
+        [
+            FrameImage(
+                scene.rigs.relative_pose(correspondences.image, image),
+                _get_intrinsics(scene, image, correspondences, pose.focal_px),
+                _make_segments(scene, correspondences.select(rows), options),
+            )
+            for image, rows in correspondences.split_by_image(scene)
+        ],
         scales=REFINEMENT_SCALES,
     )
     refined = PoseHypothesis(rotation, translation, pose.source, pose.focal_px)
@@ -112,11 +124,11 @@ def maximize_support(
 
 
 def _get_intrinsics(
-    scene: Scene, correspondences: PoseCorrespondences, focal_px: float | None
+    scene: Scene, image: int, correspondences: PoseCorrespondences, focal_px: float | None
 ) -> Float64:
-    """Return fx, fy, cx, cy of the image that the correspondences belong to."""
-    image = int(scene.graph.image_of[correspondences.keypoints[0]])
-    return scene.intrinsics_with_focal(image, focal_px)
+    """Return fx, fy, cx, cy of an image of a frame whose first camera may have another ``fx``."""
+    shares_camera = scene.camera_of[image] == scene.camera_of[correspondences.image]
+    return scene.intrinsics_with_focal(image, focal_px if shares_camera else None)
 
 
 def _make_segments(
@@ -139,21 +151,27 @@ def _compute_residuals(
     options: RegistrationOptions,
 ) -> Float64:
     """Return the residuals (m,) of a pose relative to their thresholds, truncated at 1."""
-    if not len(correspondences.keypoints):
-        return np.empty(0)
-    segments = _make_segments(scene, correspondences, options)
-    intrinsics = _get_intrinsics(scene, correspondences, pose.focal_px)
-    distances_px, depths = measure_segments((pose.rotation, pose.translation), intrinsics, segments)
-    residuals = distances_px / segments.limit
-    depth_residuals = _compute_depth_residuals(
-        scene, correspondences, depths, residuals < 1, options
-    )
-    residuals = np.fmax(residuals, depth_residuals)
-    return np.where(residuals < 1, residuals, 1.0)
+    residuals = [np.empty(0)]
+    for image, rows in correspondences.split_by_image(scene):
+        of_image = correspondences.select(rows)
+        image_pose = scene.rigs.derive_pose(
+            correspondences.image, (pose.rotation, pose.translation), image
+        )
+        segments = _make_segments(scene, of_image, options)
+        intrinsics = _get_intrinsics(scene, image, of_image, pose.focal_px)
+        distances_px, depths = measure_segments(image_pose, intrinsics, segments)
+        distances = distances_px / segments.limit
+        depth_residuals = _compute_depth_residuals(
+            scene, image, of_image, depths, distances < 1, options
+        )
+        residuals.append(np.fmax(distances, depth_residuals))
+    combined = np.concatenate(residuals)
+    return np.where(combined < 1, combined, 1.0)
 
 
 def _compute_depth_residuals(
     scene: Scene,
+    image: int,
     correspondences: PoseCorrespondences,
     depths: Float64,
     is_near: Bool,
@@ -165,7 +183,6 @@ def _compute_depth_residuals(
     segments. The depth residual is NaN if a depth is unknown.
     """
     residuals = np.full(len(depths), np.nan)
-    image = int(scene.graph.image_of[correspondences.keypoints[0]])
     rows = correspondences.keypoints - scene.graph.offsets[image]
     known = correspondences.depth_known & scene.maps[image].keypoint_valid[rows] & (depths > 0)
     if (known & is_near).any():

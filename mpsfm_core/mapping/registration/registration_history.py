@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +43,11 @@ class RegistrationHistory:
         self._contradicting: dict[int, set[int]] = defaultdict(set)
         self._rejected_poses: dict[tuple[int, bytes], Reason] = {}
         self._deregistered: set[int] = set()
+
+    def exclude(self, images: Sequence[int], references: Sequence[int]) -> None:
+        """Exclude reference images from the registration of images of a frame."""
+        for image in images:
+            self.excluded_references[image].update(references)
 
     def count_searches(self, image: int) -> int:
         """Return the number of times that the pose of an image was estimated."""

@@ -1,4 +1,4 @@
-"""World units per meter of a rig, from matches between the images of one frame."""
+"""Scales of rigs and of depth priors, from matches between the images of one frame."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from mpsfm_core.data import Float64, VerifiedPair
 from mpsfm_core.mapping.scene.scene import Scene
 
 MIN_MATCHES = 10
-"""Minimum number of matches within a frame that measure the scale of the rig. [ours]"""
+"""Minimum number of matches within a frame that measure a scale. [ours]"""
 
 
 def estimate_rig_scale(scene: Scene, image: int) -> float | None:
@@ -33,6 +33,53 @@ def estimate_rig_scale(scene: Scene, image: int) -> float | None:
     ]
     scales = np.concatenate([np.zeros(0), *estimates])
     return float(np.median(scales)) if len(scales) >= MIN_MATCHES else None
+
+
+def set_frame_scales(scene: Scene, image: int) -> None:
+    """Set the depth scales of the images of a frame from the depth scale of one of its images.
+
+    The points of an image with a known scale are lifted. The scale of another image is the median
+    ratio of the depth of these points and the depth prior, over the matches of both images. A
+    metric prior without enough matches takes the scale of the given image, if its prior is metric.
+
+    Args:
+        scene: The scene.
+        image: Registered image with a known depth scale.
+    """
+    maps, members = scene.maps, scene.rigs.images_of(image)
+    pairs = [
+        pair
+        for pair in scene.problem.pairs
+        if len(pair) >= MIN_MATCHES and {pair.image_a, pair.image_b} <= set(members)
+    ]
+    pairs.sort(key=len, reverse=True)
+    while measured := next(
+        (
+            (other, scale)
+            for pair in pairs
+            for known, other in ((pair.image_a, pair.image_b), (pair.image_b, pair.image_a))
+            if maps[known].active and not maps[other].active
+            if (scale := _estimate_depth_scale(scene, pair, known, other)) is not None
+        ),
+        None,
+    ):
+        other, scale = measured
+        maps[other].set_scale(scale)
+    for other in members:
+        if not maps[other].active and maps[other].prior.metric and maps[image].prior.metric:
+            maps[other].set_scale(maps[image].scale)
+
+
+def _estimate_depth_scale(scene: Scene, pair: VerifiedPair, known: int, other: int) -> float | None:
+    """Return the depth scale of an image from the points of another image of its frame."""
+    rows = pair.matches if pair.image_a == known else pair.matches[:, ::-1]
+    keypoints, others = (rows + scene.graph.offsets[[known, other]]).T
+    depth, valid = scene.depth_at(keypoints)
+    valid &= scene.keypoint_valid[others]
+    points = scene.at_depth(keypoints[valid], depth[valid])
+    _, z = scene.project(others[valid], points)
+    ratios = z[z > 0] / scene.keypoint_prior[others[valid][z > 0]]
+    return float(np.median(ratios)) if len(ratios) >= MIN_MATCHES else None
 
 
 def _estimate_from_pair(scene: Scene, image: int, pair: VerifiedPair) -> Float64:

@@ -97,16 +97,21 @@ class _TentativeRegistration:
         return [int(image) for image in np.flatnonzero(self.scene.registered & ~before)]
 
     def _register_image(self, image: int, pose: ScoredPose) -> None:
-        """Register an image, and scale its depth prior by temporary points."""
-        scene, depth_map = self.scene, self.scene.maps[image]
+        """Register a frame, and scale the depth priors of its images by temporary points."""
+        scene = self.scene
         before = scene.snapshot()
         scene.register(image, pose.rotation, pose.translation, pose.focal_px)
-        triangulate_image(scene, image, self._triangulation)
-        self._refiner.estimate_scale(image, self._poses[image][0])
-        scale = depth_map.scale if depth_map.active else self._median_scale
+        members = scene.rigs.images_of(image)
+        for member in members:
+            triangulate_image(scene, member, self._triangulation)
+        for member in members:
+            self._refiner.estimate_scale(member, self._poses[image][0])
+        maps = [scene.maps[member] for member in members]
+        scales = [m.scale if m.active else self._median_scale for m in maps]
         scene.restore(before)
         scene.register(image, pose.rotation, pose.translation, pose.focal_px)
-        depth_map.set_scale(scale)
+        for depth_map, scale in zip(maps, scales, strict=True):
+            depth_map.set_scale(scale)
 
     def _register_component(self, image: int, component: Reconstruction) -> None:
         """Register the other images of a component by their poses relative to one of its images."""
@@ -144,6 +149,6 @@ class _TentativeRegistration:
             correspondences = find_correspondences(scene, image, references, options)
             poses = []
             if len(correspondences.keypoints):
-                poses = self._pose_estimator.estimate_poses(image, correspondences, attempt=0)
+                poses = self._pose_estimator.estimate_poses(correspondences, attempt=0)
             self._poses[image] = references, max(poses, key=lambda p: p.support, default=None)
         return self._poses[image][1]

@@ -56,6 +56,12 @@ class RigFrames:
         }
 
     @property
+    def is_first(self) -> Bool:
+        """Bool mask (n,) of the first image of each frame."""
+        is_first: Bool = self.frame_of == np.arange(len(self.frame_of))
+        return is_first
+
+    @property
     def exist(self) -> bool:
         """True if any frame has several images."""
         return bool(self._images)
@@ -138,8 +144,13 @@ class RigFrames:
             pose: Pose ``cam_from_world`` of ``image``.
             other: Image of the same frame.
         """
-        frame_from_world = compose(invert(*self._sensor_from_rig(image)), pose)
-        return compose(self._sensor_from_rig(other), frame_from_world)
+        return pose if other == image else compose(self.relative_pose(image, other), pose)
+
+    def relative_pose(self, image: int, other: int) -> Pose:
+        """Return the pose ``other_from_image`` of two images of a frame, in world units."""
+        if other == image:
+            return np.eye(3), np.zeros(3)
+        return compose(self._sensor_from_rig(other), invert(*self._sensor_from_rig(image)))
 
     def _sensor_from_rig(self, image: int) -> Pose:
         """Return ``sensor_from_rig`` of an image, with the translation in world units."""

@@ -170,8 +170,7 @@ class Scene:
             std: Standard deviation of the scale.
         """
         self.rigs.scale, self.rigs.scale_std = scale, std
-        is_first = self.rigs.frame_of == np.arange(self.num_images)
-        for image in map(int, np.flatnonzero(self.registered & is_first)):
+        for image in map(int, np.flatnonzero(self.registered & self.rigs.is_first)):
             self.register(image, self.rotations[image].copy(), self.translations[image].copy())
 
     def camera(self, image: int) -> PinholeCamera:

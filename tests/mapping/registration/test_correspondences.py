@@ -59,7 +59,7 @@ def scene_with_depth_in(part: Part, seed: int = 0) -> Scene:
 
 def error_deg(scene: Scene, correspondences: PoseCorrespondences) -> float:
     """Return the rotation error of the best pose."""
-    best = estimate_candidate_poses(scene, 1, correspondences, OPTIONS, seed=0, attempt=0)[0]
+    best = estimate_candidate_poses(scene, correspondences, OPTIONS, seed=0, attempt=0)[0]
     return float(rotation_angle_deg(best.rotation @ TRUTH.rotation.T))
 
 

@@ -33,7 +33,7 @@ def room() -> MappingProblem:
 def estimate_poses(scene: Scene, options: RegistrationOptions) -> list[ScoredPose]:
     """Estimate poses of the last image from the other four."""
     correspondences = find_correspondences(scene, 4, [0, 1, 2, 3], options)
-    return estimate_candidate_poses(scene, 4, correspondences, options, seed=0, attempt=0)
+    return estimate_candidate_poses(scene, correspondences, options, seed=0, attempt=0)
 
 
 def guess_last_focal(room: MappingProblem, factor: float) -> Scene:
