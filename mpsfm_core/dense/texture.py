@@ -191,8 +191,9 @@ def _copy_photo(
         return
     photo = view.image
     if layout.scale < 1:
-        size = [max(1, round(layout.scale * side)) for side in view.camera.size]
-        photo = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
+        # Without a size, OpenCV does not round the factor to a ratio of whole sizes.
+        factor = layout.scale
+        photo = cv2.resize(photo, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     corners = np.flatnonzero(charts.views[charts.chart_of] == number)
     blurred = cv2.GaussianBlur(photo, (0, 0), _SEAM_BLUR_PX)
     colors[corners] = sample_nearest(blurred, layout.scale * xy[corners])

@@ -108,8 +108,9 @@ def _sample_texture(texture: UInt8 | None, uv: Float32, covered: Bool) -> Float3
         np.abs(np.diff(uv[..., axis], axis=1))[covered[:, 1:] & covered[:, :-1]] for axis in (0, 1)
     ]
     step = np.median(np.hypot(steps[0] * width, steps[1] * height)) if steps[0].size else 1.0
-    factor = 1 / max(1.0, float(step))
-    small = cv2.resize(texture, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
+    # The ratio of whole sizes is the exact factor, as texture coordinates are relative to the size.
+    size = [max(1, round(side / max(1.0, float(step)))) for side in (width, height)]
+    small = cv2.resize(texture, size, interpolation=cv2.INTER_AREA)
     xy = uv * np.array(small.shape[1::-1], np.float32) - np.float32(0.5)
     colors = cv2.remap(
         small, xy[..., 0], xy[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
