@@ -1,7 +1,8 @@
 """Triangle mesh from the depth maps of all images.
 
 Depth maps are integrated into a truncated signed distance field (TSDF) with inverse-variance
-weights [Curless and Levoy, SIGGRAPH 1996]. Pixels in closed holes
+weights [Curless and Levoy, SIGGRAPH 1996]. Distances along z are converted to distances along the
+surface normal, so that surfaces at grazing angles have no holes. Pixels in closed holes
 (:mod:`~mpsfm_core.dense.hole_filling`) only have an effect where nothing is measured. TSDF blocks
 exist only around surfaces, so that memory does not grow with the volume. Marching cubes of
 scikit-image extracts the triangles.
@@ -20,6 +21,7 @@ from scipy.sparse.csgraph import connected_components
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.data.errors import InputError
+from mpsfm_core.dense.depth_sampling import compute_slant, interpolate_depth, sample_depth
 from mpsfm_core.dense.fusion import compute_consistent_masks
 from mpsfm_core.dense.hole_filling import find_closable_holes
 from mpsfm_core.dense.mesh_visibility import find_observed_triangles
@@ -81,6 +83,9 @@ class _WeightedDepth(NamedTuple):
     """(h, w) z-depth in world units, 0 at holes."""
     weight: Float32
     """(h, w) inverse variance of depth, 0 at holes and close to 0 in closed holes."""
+    slant: Float32
+    """(h, w) distance to the surface along its normal per distance along z, see
+    :func:`compute_slant`."""
     filled: Bool
     """(h, w) mask of the pixels in closed holes."""
 
@@ -115,11 +120,13 @@ class _WeightedDepth(NamedTuple):
         local = transform(self.image.rotation, self.image.translation, vertices)
         xy = project(self.image.camera.resized(width, height), local)
         rows = np.flatnonzero(inside(xy, (width, height)) & (local[:, 2] > 0))
-        depth, weight = (sample_nearest(grid, xy[rows]) for grid in (self.depth, self.weight))
+        weight = sample_nearest(self.weight, xy[rows])
+        depth = sample_depth(self.depth, xy[rows])
         certain = (weight > 0) & ~sample_nearest(self.filled, xy[rows])
         std_tolerance = _TRUNCATION_STDS / np.sqrt(np.where(certain, weight, np.inf))
         max_difference = np.maximum(tolerance, std_tolerance)
-        rows = rows[(depth > 0) & (np.abs(depth - local[rows, 2]) <= max_difference)]
+        distance = np.abs(depth - local[rows, 2]) * sample_nearest(self.slant, xy[rows])
+        rows = rows[(depth > 0) & (distance <= max_difference)]
         return rows, xy[rows]
 
     def may_see(self, low: Float64, high: Float64) -> bool:
@@ -218,7 +225,9 @@ def _weight_depth(image: RegisteredImage, mask: Bool, max_hole_px: float) -> _We
     filled = find_closable_holes(image.depth, mask, max_hole_px)
     weight[filled] = _FILLED_WEIGHT_RATIO * weight[mask].min()
     depth = np.where(mask | filled, image.depth.depth, 0).astype(np.float32)
-    return _WeightedDepth(image, image.camera.resized(width, height).params, depth, weight, filled)
+    intrinsics = image.camera.resized(width, height).params
+    slant = compute_slant(image.depth.depth, intrinsics)
+    return _WeightedDepth(image, intrinsics, depth, weight, slant, filled)
 
 
 def _find_surface_blocks(maps: Sequence[_WeightedDepth], voxel: float) -> Int64:
@@ -254,7 +263,7 @@ def _extract_block_surface(
     for map_ in maps:
         if map_.may_see(origin - truncation, origin + voxel * _BLOCK_SIZE + truncation):
             pose = map_.image.rotation, map_.image.translation
-            camera, grids = map_.intrinsics, (map_.depth, map_.weight)
+            camera, grids = map_.intrinsics, (map_.depth, map_.weight, map_.slant)
             _integrate(origin, voxel, *pose, camera, *grids, truncation, total, weight)
     observed = weight > 0
     field = np.where(observed, total / np.where(observed, weight, 1), np.float32(truncation))
@@ -278,6 +287,7 @@ def _integrate(
     camera: Float64,
     depth: Float32,
     pixel_weight: Float32,
+    slant: Float32,
     truncation: float,
     total: Float32,
     weight: Float32,
@@ -292,6 +302,7 @@ def _integrate(
         camera: (4,) intrinsics fx, fy, cx, cy in pixels of the depth map.
         depth: (h, w) z-depth in world units, 0 at holes.
         pixel_weight: (h, w) weights.
+        slant: (h, w) distance along the normal of the surface per distance along z.
         truncation: Truncation distance of the TSDF in world units.
         total: (n, n, n) weighted sum of signed distances of each voxel, updated in place.
         weight: (n, n, n) sum of weights of each voxel, updated in place.
@@ -314,11 +325,11 @@ def _integrate(
                 v = fy * (v0 + rotation[1, 2] * at) / w + cy
                 if not (0 <= u < width and 0 <= v < height):
                     continue
-                row, column = int(v), int(u)
-                distance = depth[row, column] - w
-                if depth[row, column] <= 0 or distance < -truncation:
+                pixel_depth = interpolate_depth(depth, u, v)
+                distance = (pixel_depth - w) * slant[int(v), int(u)]
+                if pixel_depth <= 0 or distance < -truncation:
                     continue
-                w_pixel = pixel_weight[row, column]
+                w_pixel = pixel_weight[int(v), int(u)]
                 total[i, j, k] += w_pixel * min(distance, truncation)
                 weight[i, j, k] += w_pixel
 

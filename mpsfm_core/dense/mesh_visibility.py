@@ -7,7 +7,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64
-from mpsfm_core.geometry import inside, project, sample_nearest, transform
+from mpsfm_core.dense.depth_sampling import sample_depth
+from mpsfm_core.geometry import inside, project, transform
 from mpsfm_core.geometry.rasterization import rasterize
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 
@@ -78,5 +79,5 @@ def _find_visible(
     rows = np.flatnonzero(visible)
     scaled = xy[rows] * (width / image.camera.width, height / image.camera.height)
     tolerance = _OCCLUSION_TOLERANCE_EDGES * edge_length
-    visible[rows] = local[rows, 2] <= sample_nearest(nearest, scaled) + tolerance
+    visible[rows] = local[rows, 2] <= sample_depth(nearest, scaled) + tolerance
     return visible
