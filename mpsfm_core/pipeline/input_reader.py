@@ -6,7 +6,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import pycolmap
 
@@ -124,6 +124,16 @@ class InputReader:
             self.selections = {
                 name: read_selection(self.image_folder / name) for name in self.videos
             }
+
+    @property
+    def shots(self) -> list[dict[str, float]]:
+        """Time stamps of the keyframes of each shot by image name, empty for cut views."""
+        shots: dict[tuple[str, int], dict[str, float]] = {}
+        for name, selection in self.selections.items() if self.cut is None else ():
+            for frame in selection.keyframes:
+                image = (PurePosixPath(name) / frame.name).as_posix()
+                shots.setdefault((name, frame.shot), {})[image] = frame.time_s
+        return list(shots.values())
 
     def cut_wide_images(self) -> None:
         """Cut panoramas and wide fisheye images into views, and use the views as images."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -16,7 +16,7 @@ import pycolmap
 from mpsfm_core.config import Config
 from mpsfm_core.config.provider_arguments import Provider, configure
 from mpsfm_core.data import MappingProblem, Pose, Rig
-from mpsfm_core.data.decisions import Reason
+from mpsfm_core.data.decisions import DoubtReason, Reason
 from mpsfm_core.data.errors import ConfigError, ReconstructionError
 from mpsfm_core.data.events import EventCallback
 from mpsfm_core.data.result_layout import SUMMARY
@@ -33,6 +33,7 @@ from mpsfm_core.extraction.runner import (
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.models import Poses
+from mpsfm_core.mapping.camera_jumps import find_jumps, remove_matches_across
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.rig_calibration import calibrate_rigs
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
@@ -89,6 +90,8 @@ _MIN_DISTORTION = 0.1
 """Relative displacement of the image corners by lens distortion from which depth is predicted again
 in undistorted images. [tuned: benchmarks.distortion]"""
 _MAX_LISTED_NAMES = 5
+_MAX_JUMP_RUNS = 3
+"""Maximum number of mapper runs without matches of look-alike places in a video. [ours]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -287,10 +290,12 @@ class _Run:
         images, extraction = self._extract(images)
         self._finish_compilation()
         mapping = self._map(extraction.problem.with_poses(self._inputs.known_poses))
+        extraction, mapping = self._map_without_jumps(extraction, mapping)
         undistorted, extraction, mapping = self._map_undistorted(images, extraction, mapping)
         views = undistorted
         if self._config.has_second_pass:
             extraction, views, mapping = self._run_second_pass(undistorted, extraction, mapping)
+            extraction, mapping = self._map_without_jumps(extraction, mapping)
         refined = undistort_images(views, extraction.problem, mapping.reconstructions)
         problem = undistort_problem(undistorted, refined, extraction.problem)
         if refined is not views:
@@ -340,10 +345,7 @@ class _Run:
             extraction = extract(images, config, self._registry, self._stages, self._inputs.matches)
             problem = replace(extraction.problem, rigs=self._inputs.rigs)
             extraction = replace(extraction, problem=problem)
-            self._doubts = extraction.doubts
-            for doubt in extraction.doubts:
-                explanation = explain(doubt)
-                self._stages.warn(f"{explanation.text} {explanation.remedy}")
+            self._add_doubts(extraction.doubts)
         return images, extraction
 
     def _start_compilation(self) -> None:
@@ -377,6 +379,37 @@ class _Run:
             )
             self._part_records = part_mapper.records
             return result
+
+    def _map_without_jumps(
+        self, extraction: Extraction, mapping: MappingResult
+    ) -> tuple[Extraction, MappingResult]:
+        """Map again without matches between look-alike places, if the camera of a video jumps."""
+        shots = [] if self._inputs.known_poses else self._inputs.shots
+        jumps = find_jumps(mapping.reconstructions, shots)
+        for _ in range(_MAX_JUMP_RUNS):
+            problem = remove_matches_across(extraction.problem, jumps, shots)
+            num_removed = len(extraction.problem.pairs) - len(problem.pairs)
+            if not num_removed:
+                break
+            self._stages.notice(
+                f"the camera jumps between the frames {jumps[0][0]} and {jumps[0][1]}, so the "
+                f"matches of {num_removed} pairs of distant frames across a jump are not used"
+            )
+            extraction = replace(extraction, problem=problem)
+            mapping = self._map(problem)
+            jumps = find_jumps(mapping.reconstructions, shots)
+        self._add_doubts(
+            DoubtReason.CAMERA_JUMP.because(image_a=before, image_b=after)
+            for before, after in jumps
+        )
+        return extraction, mapping
+
+    def _add_doubts(self, doubts: Iterable[Reason]) -> None:
+        """Warn of reasons to doubt the result, and store them for the summary."""
+        for doubt in doubts:
+            self._doubts += (doubt,)
+            explanation = explain(doubt)
+            self._stages.warn(f"{explanation.text} {explanation.remedy}")
 
     def _map_undistorted(
         self, images: ImageSet, extraction: Extraction, mapping: MappingResult

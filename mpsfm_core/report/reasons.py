@@ -341,6 +341,12 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "of {other_image}: the photo may show a place that looks like this one.",
         "Compare the photo with the matched images of the model.",
     ),
+    DoubtReason.CAMERA_JUMP: (
+        "the camera of the video jumps",
+        "Between the frames {image_a} and {image_b}, the camera moves far too fast, and they share "
+        "no point: places that look alike may be joined.",
+        "Film the way between both places again, slowly and with textured surfaces in view.",
+    ),
     DoubtReason.MEANINGLESS_SCORES: (
         "meaningless match scores",
         "The scores of the matcher {provider} are not higher for inliers than for outliers in "

@@ -1,0 +1,97 @@
+"""Detection of jumps of a video camera in a reconstruction, which false matches cause.
+
+Rooms that look alike have verified matches. If the mapper places keyframes of two such rooms in the
+same room, the camera jumps somewhere between the rooms, although a camera cannot jump within a
+shot. Matches between distant keyframes before and after the jump are then wrong.
+
+Usage::
+
+    jumps = find_jumps(reconstructions, shots)
+    problem = remove_matches_across(problem, jumps, shots)      # then map again
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from mpsfm_core.data import MappingProblem
+from mpsfm_core.geometry import camera_center, rotation_angle_deg
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+
+Shot = Mapping[str, float]
+"""Time stamp in seconds by name of each keyframe of a shot, ascending."""
+Jump = tuple[str, str]
+"""Names of the successive registered keyframes of a shot between which the camera jumps."""
+
+MIN_SPEED_RATIO = 10.0
+"""Minimum ratio of the speed of a jump to the 90 % quantile of the speed of the camera, for
+translation or rotation. [tuned: benchmarks.walks --look-alike]"""
+_SPEED_QUANTILE = 0.9
+NUM_NEIGHBORS = 10
+"""Number of following keyframes with which a keyframe may be matched across a jump.
+[COLMAP sequential_matching.overlap]"""
+
+
+def find_jumps(reconstructions: Sequence[Reconstruction], shots: Sequence[Shot]) -> list[Jump]:
+    """Find successive keyframes that share no point and between which the camera is too fast.
+
+    Args:
+        reconstructions: Components of the model.
+        shots: Keyframes of all shots.
+    """
+    return [jump for part in reconstructions for jump in _find_jumps_of_part(part, shots)]
+
+
+def remove_matches_across(
+    problem: MappingProblem, jumps: Sequence[Jump], shots: Sequence[Shot]
+) -> MappingProblem:
+    """Remove the pairs of distant keyframes that are on both sides of a jump in the same shot.
+
+    Pairs of keyframes with less than :data:`NUM_NEIGHBORS` keyframes in between remain.
+    """
+    places = {
+        name: (number, place)
+        for number, shot in enumerate(shots)
+        for place, name in enumerate(shot)
+    }
+    cuts = [(*places[before], places[after][1]) for before, after in jumps]
+
+    def is_across(a: str, b: str) -> bool:
+        if a not in places or b not in places or places[a][0] != places[b][0]:
+            return False
+        number = places[a][0]
+        first, last = sorted((places[a][1], places[b][1]))
+        return last - first > NUM_NEIGHBORS and any(
+            number == shot and first <= before and last >= after for shot, before, after in cuts
+        )
+
+    names = [image.name for image in problem.images]
+    pairs = [p for p in problem.pairs if not is_across(names[p.image_a], names[p.image_b])]
+    return replace(problem, pairs=tuple(pairs))
+
+
+def _find_jumps_of_part(part: Reconstruction, shots: Sequence[Shot]) -> Iterator[Jump]:
+    """Yield the jumps in one component."""
+    images = {image.name: image for image in part.confirmed_images}
+    steps: list[tuple[RegisteredImage, RegisteredImage]] = []
+    speeds = []
+    for shot in shots:
+        registered = [(images[name], time_s) for name, time_s in shot.items() if name in images]
+        for (a, start_s), (b, end_s) in pairwise(registered):
+            steps.append((a, b))
+            distance = np.linalg.norm(
+                camera_center(a.rotation, a.translation) - camera_center(b.rotation, b.translation)
+            )
+            turn_deg = rotation_angle_deg(a.rotation @ b.rotation.T)
+            speeds.append([distance / (end_s - start_s), turn_deg / (end_s - start_s)])
+    if not steps:
+        return
+    limits = MIN_SPEED_RATIO * np.quantile(speeds, _SPEED_QUANTILE, axis=0)
+    for (a, b), too_fast in zip(steps, (np.array(speeds) > limits).any(axis=1), strict=True):
+        common = np.intersect1d(a.point_ids[a.point_ids >= 0], b.point_ids)
+        if too_fast and not len(common):
+            yield a.name, b.name

@@ -1,0 +1,98 @@
+"""Tests of jumps of the camera of a video in a reconstruction."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mpsfm_core.data import (
+    DepthPrior,
+    Float64,
+    MappingImage,
+    MappingProblem,
+    NormalPrior,
+    PinholeCamera,
+    VerifiedPair,
+)
+from mpsfm_core.mapping.camera_jumps import find_jumps, remove_matches_across
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+
+CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 32.0, 24.0)
+DEPTH = DepthPrior.from_arrays(np.ones((6, 8), np.float32), np.ones((6, 8), np.float32))
+NAMES = [f"frame_{number:06d}.jpg" for number in range(0, 90, 3)]
+SHOT = {name: 0.1 * row for row, name in enumerate(NAMES)}
+TURN = np.diag([-1.0, 1.0, -1.0])
+"""Rotation by 180 degrees about the vertical axis."""
+
+
+def build_walk(
+    centers: Float64, turned: slice = slice(0), *, linked: bool = False
+) -> Reconstruction:
+    """Return keyframes with the camera centers (n, 3), of which successive ones share a point.
+
+    Args:
+        centers: Camera centers.
+        turned: Keyframes that look backward.
+        linked: If true, the first turned keyframe shares a point with the keyframe before.
+    """
+    images = []
+    is_turned = np.zeros(len(centers), np.bool_)
+    is_turned[turned] = True
+    for row, (center, backward) in enumerate(zip(centers, is_turned, strict=True)):
+        points = np.array([row, row + 1])
+        if backward and not is_turned[row - 1] and not linked:
+            points[0] = -1
+        rotation = TURN if backward else np.eye(3)
+        images.append(
+            RegisteredImage(
+                row, NAMES[row], CAMERA, rotation, -rotation @ center, points, DEPTH, 1.0
+            )
+        )
+    return Reconstruction(tuple(images), np.zeros((99, 3)), np.zeros(99))
+
+
+def walk(step: float = 0.1) -> Float64:
+    """Return the camera centers of a camera that moves straight on."""
+    return step * np.arange(len(NAMES))[:, None] * np.array([0.0, 0.0, 1.0])
+
+
+def test_steady_walk_has_no_jump() -> None:
+    assert find_jumps([build_walk(walk())], [SHOT]) == []
+    assert find_jumps([build_walk(walk())], []) == []
+
+
+def test_find_jumps_returns_the_keyframes_around_a_jump() -> None:
+    centers = walk()
+    centers[20:] *= -1
+    assert find_jumps([build_walk(centers, slice(20, None))], [SHOT]) == [(NAMES[19], NAMES[20])]
+
+
+def test_turn_on_the_spot_is_a_jump_only_without_common_points() -> None:
+    centers = walk()
+    assert find_jumps([build_walk(centers, slice(20, None))], [SHOT]) == [(NAMES[19], NAMES[20])]
+    assert find_jumps([build_walk(centers, slice(20, None), linked=True)], [SHOT]) == []
+
+
+def test_jump_at_a_cut_is_allowed() -> None:
+    shots = [dict(list(SHOT.items())[:20]), dict(list(SHOT.items())[20:])]
+    assert find_jumps([build_walk(walk(), slice(20, None))], shots) == []
+
+
+def test_remove_matches_across_keeps_neighbors_and_pairs_on_one_side() -> None:
+    none = np.zeros((0, 2), np.int64)
+    normals = np.zeros((6, 8, 3), np.float32)
+    normals[..., 2] = -1
+    flat = NormalPrior.from_arrays(normals, np.ones((6, 8), np.float32))
+    images = tuple(
+        MappingImage(n, CAMERA, np.zeros((0, 2)), DEPTH, flat) for n in [*NAMES, "a.jpg"]
+    )
+    ends = [(0, 12), (15, 22), (5, 25), (19, 20), (21, 29), (9, 20), (8, 20), (0, 30)]
+    pairs = tuple(
+        VerifiedPair(a, b, none, np.zeros(0, np.float32), np.eye(3), np.array([1.0, 0, 0]))
+        for a, b in ends
+    )
+    problem = MappingProblem(images, pairs)
+    kept = remove_matches_across(problem, [(NAMES[19], NAMES[20])], [SHOT])
+    assert [(p.image_a, p.image_b) for p in kept.pairs] == [
+        end for end in ends if end not in [(5, 25), (9, 20), (8, 20)]
+    ]
+    assert len(remove_matches_across(problem, [], [SHOT]).pairs) == len(ends)
