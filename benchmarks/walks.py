@@ -306,7 +306,13 @@ def localize_between_true_keyframes(video: Path, seed: int, fps: float = FPS) ->
 
 
 def run_walk(
-    video: Path, poses: Mapping[int, Pose], fps: float, config: str, settings: Sequence[str]
+    video: Path,
+    poses: Mapping[int, Pose],
+    fps: float,
+    config: str,
+    settings: Sequence[str],
+    *,
+    is_loop: bool = False,
 ) -> Record:
     """Reconstruct a video with MP-SfM, and its keyframes with COLMAP; return the errors.
 
@@ -316,6 +322,7 @@ def run_walk(
         fps: Frame rate.
         config: Name of the configuration of MP-SfM.
         settings: Settings that change the configuration.
+        is_loop: True for a walk of :data:`ROUNDS` rounds, whose loop error is measured.
     """
     truth = Trajectory(np.array(sorted(poses)) / fps, tuple(poses[n] for n in sorted(poses)))
     output = video.with_suffix("")
@@ -339,7 +346,7 @@ def run_walk(
         record["mpsfm"] = evaluate_trajectory(
             found, truth, count_frames_outside_largest(output / "trajectory.txt")
         )
-        record["keyframes"] = _evaluate_model(output / "sparse", poses)
+        record["keyframes"] = _evaluate_model(output / "sparse", poses, is_loop)
     start = time.process_time()
     database, mapped = output / "colmap.db", output / "colmap"
     database.unlink(missing_ok=True)
@@ -355,12 +362,12 @@ def run_walk(
     record["colmap_cpu_seconds"] = time.process_time() - start
     if models:
         best = max(models, key=lambda number: models[number].num_reg_images())
-        record["colmap"] = _evaluate_model(mapped / str(best), poses)
+        record["colmap"] = _evaluate_model(mapped / str(best), poses, is_loop)
     return record
 
 
-def _evaluate_model(folder: Path, poses: Mapping[int, Pose]) -> Record:
-    """Return the number of registered keyframes and the ATE of a COLMAP model."""
+def _evaluate_model(folder: Path, poses: Mapping[int, Pose], is_loop: bool) -> Record:
+    """Return the number of registered keyframes of a COLMAP model, and its errors in meters."""
     found = reconstruction_poses(pycolmap.Reconstruction(str(folder)))
     numbered = {str(int(Path(name).stem[-6:])): pose for name, pose in found.items()}
     truth = {str(number): pose for number, pose in poses.items()}
@@ -369,7 +376,7 @@ def _evaluate_model(folder: Path, poses: Mapping[int, Pose]) -> Record:
         "registered": len(found),
         "ate": None if errors is None else errors.ate_rmse,
         "max": None if errors is None else float(errors.centers.max()),
-        "loop": measure_loop_error(numbered, truth),
+        "loop": measure_loop_error(numbered, truth) if is_loop else None,
     }
 
 
@@ -461,7 +468,8 @@ def main() -> None:
             path = folder / f"{'look_alike' if look_alike else 'walk'}{seed}-{config}.json"
             if not path.is_file():
                 video, walk = write_walk(folder, seed, fps, look_alike=look_alike)
-                record = run_walk(video, dict(enumerate(walk)), fps, config, settings)
+                poses = dict(enumerate(walk))
+                record = run_walk(video, poses, fps, config, settings, is_loop=not look_alike)
                 if not look_alike:
                     record["true_keyframes"] = localize_between_true_keyframes(video, seed, fps)
                 path.write_text(json.dumps(record))
