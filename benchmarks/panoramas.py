@@ -33,6 +33,7 @@ from mpsfm_core import reconstruct
 from mpsfm_core.data import DepthPrior, Float64, Pose, UInt8, View
 from mpsfm_core.data.errors import MpsfmError
 from mpsfm_core.data.result_layout import CUT_VIEWS
+from mpsfm_core.evaluation.peers import set_incremental_options
 from mpsfm_core.geometry import camera_center, compose, invert, rotation_angle_deg
 from mpsfm_core.geometry.panorama import make_view_rotations
 from mpsfm_core.inputs.models import reconstruction_poses
@@ -160,13 +161,7 @@ def run_colmap(views: Path) -> list[dict[str, Pose]]:
             pycolmap.apply_rig_config([config], database)
         matching = pycolmap.FeatureMatchingOptions(use_gpu=False, rig_verification=True)
         pycolmap.match_exhaustive(path, matching_options=matching)
-        options = pycolmap.IncrementalPipelineOptions(
-            min_model_size=2,
-            random_seed=0,
-            ba_refine_focal_length=False,
-            ba_refine_extra_params=False,
-            ba_refine_sensor_from_rig=False,
-        )
+        options = set_incremental_options(pycolmap.IncrementalPipelineOptions())
         models = pycolmap.incremental_mapping(path, views, folder, options)
         poses = [reconstruction_poses(model) for model in models.values()]
     return sorted(poses, key=lambda model: -len(model))

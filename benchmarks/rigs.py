@@ -24,7 +24,7 @@ import numpy as np
 import pycolmap
 
 from mpsfm_core.data import Float64, MappingProblem, Pose, Rig
-from mpsfm_core.evaluation.peers import run_peer, write_database
+from mpsfm_core.evaluation.peers import run_peer, set_incremental_options, write_database
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.geometry.similarity import umeyama
 from mpsfm_core.inputs.models import reconstruction_poses
@@ -70,15 +70,7 @@ def run_colmap_with_unknown_rigs(problem: MappingProblem) -> list[dict[str, Pose
         pycolmap.RigConfigCamera(ref_sensor=sensor == 0, image_prefix=f"camera{sensor}/")
         for sensor in range(count)
     ]
-    options = pycolmap.IncrementalPipelineOptions(
-        min_model_size=2,
-        num_threads=1,
-        random_seed=0,
-        ba_refine_focal_length=False,
-        ba_refine_extra_params=False,
-    )
-    options.mapper.abs_pose_refine_focal_length = False
-    options.mapper.abs_pose_refine_extra_params = False
+    options = set_incremental_options(pycolmap.IncrementalPipelineOptions(), refine_rigs=True)
     with tempfile.TemporaryDirectory(prefix="mpsfm-rigs-") as folder:
         path = Path(folder) / "database.db"
         write_database(replace(problem, rigs=sensors), path)

@@ -37,7 +37,9 @@ def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path],
     """
 
     def run(database: Path, output: Path) -> Models:
-        options = _set_incremental(pycolmap.IncrementalPipelineOptions(), structure_less)
+        options = set_incremental_options(
+            pycolmap.IncrementalPipelineOptions(), structure_less=structure_less
+        )
         if tuned:
             options.mapper.init_min_tri_angle = _TUNED_ANGLE_DEG
             options.mapper.ba_local_min_tri_angle = _TUNED_ANGLE_DEG
@@ -50,10 +52,19 @@ def _incremental(*, tuned: bool, structure_less: bool) -> Callable[[Path, Path],
     return run
 
 
-def _set_incremental(
-    options: pycolmap.IncrementalPipelineOptions, structure_less: bool
+def set_incremental_options(
+    options: pycolmap.IncrementalPipelineOptions,
+    *,
+    structure_less: bool = True,
+    refine_rigs: bool = False,
 ) -> pycolmap.IncrementalPipelineOptions:
-    """Set the options of all incremental mappers, and return the same object."""
+    """Set the options of all incremental mappers of COLMAP, and return the same object.
+
+    Args:
+        options: Options to change.
+        structure_less: Allow registration from 2D-2D matches, the default of pycolmap 4.2.
+        refine_rigs: Refine the relative poses of rigs.
+    """
     options.structure_less_registration_fallback = structure_less
     options.min_model_size = 2
     options.extract_colors = False
@@ -61,7 +72,7 @@ def _set_incremental(
     options.random_seed = 0
     options.ba_refine_focal_length = False
     options.ba_refine_extra_params = False
-    options.ba_refine_sensor_from_rig = False
+    options.ba_refine_sensor_from_rig = refine_rigs
     options.mapper.abs_pose_refine_focal_length = False
     options.mapper.abs_pose_refine_extra_params = False
     return options
@@ -71,7 +82,7 @@ def _hierarchical(database: Path, output: Path) -> Models:
     """Run COLMAP's hierarchical mapper, in parts of at most 500 images with 50 common images."""
     options = pycolmap.HierarchicalPipelineOptions()
     options.num_threads = options.num_workers = thread_limit()
-    _set_incremental(options.incremental_options, structure_less=False)
+    set_incremental_options(options.incremental_options, structure_less=False)
     models: Models = pycolmap.hierarchical_mapping(database, output, output, options)
     return models
 
