@@ -22,6 +22,7 @@ from mpsfm_core.mapping.registration.registration_history import RegistrationHis
 from mpsfm_core.mapping.registration.threshold_schedule import ThresholdSchedule
 from mpsfm_core.mapping.scene.scene import Scene, Snapshot
 from mpsfm_core.mapping.state import StateDict, Stateful
+from mpsfm_core.support.memory import release_free_memory
 
 MAX_ROTATION_DEG = 3.0
 """Rotation of a camera in one global refinement above which depth consistency decides whether the
@@ -135,6 +136,7 @@ class ModelMaintenance:
         with self.event_log.timed("global refinement"):
             self.refiner.refine_globally(final=final, depth_maps=depth_maps)
             self.scene.tracks.compact()
+            release_free_memory()
         self._undo_jump(before)
         self.history.clear()
         self._last_size = self.size, len(self.scene.tracks)
@@ -158,6 +160,7 @@ class ModelMaintenance:
         images = self.scene.registered & ~self._checked
         self._checked |= images
         conflicting = self._find_conflicts(np.flatnonzero(images), max_violations, compared)
+        release_free_memory()
         conflicting = self._select_conflicting_frames(conflicting)
         for image, violation_ratio in conflicting:
             ratio = round(float(violation_ratio), 4)

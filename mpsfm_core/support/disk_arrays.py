@@ -14,6 +14,8 @@ from typing import Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mpsfm_core.support.memory import release_free_memory
+
 _log = logging.getLogger(__name__)
 _T = TypeVar("_T", bound=np.generic)
 _Item = TypeVar("_Item")
@@ -90,6 +92,7 @@ class DiskArrays:
             return None
         if self._chunk is None or self._used + size > len(self._chunk):
             self._release_pages()
+            release_free_memory()
             self._chunk, self._used = self._create_file(max(size, _MIN_FILE_BYTES)), 0
             if self._chunk is None:
                 return None

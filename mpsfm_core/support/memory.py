@@ -1,10 +1,12 @@
-"""Memory that this process may use, and the peak memory of its child processes."""
+"""Memory that this process may use or does not need, and the peak memory of child processes."""
 
 from __future__ import annotations
 
+import ctypes
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 
 import psutil
 
@@ -25,6 +27,20 @@ def measure_memory(groups: ControlGroups | None = None) -> tuple[float, float]:
     total = min([machine.total, *(limit.total for limit in limits)])
     free = min([machine.available, *(limit.free for limit in limits)])
     return total / MB, free / MB
+
+
+def release_free_memory() -> None:
+    """Return freed memory to the operating system, where the C library can (glibc).
+
+    Otherwise, memory that freed arrays leave between used memory stays with the process.
+    """
+    with suppress(OSError, TypeError, AttributeError):
+        _c_library().malloc_trim(0)
+
+
+@cache
+def _c_library() -> ctypes.CDLL:
+    return ctypes.CDLL(None)
 
 
 class ChildMemoryMonitor:

@@ -55,6 +55,14 @@ def test_estimate_grows_with_images_pixels_and_outputs() -> None:
     assert sparse.memory_mb < many.memory_mb and sparse.output_mb < many.output_mb
 
 
+def test_estimate_of_many_images_is_small_because_priors_are_on_disk() -> None:
+    config = make_config(dense={"enabled": False})
+    few, many, most = (
+        estimate_resources([SIZE] * n, config, ()).memory_mb for n in (100, 1000, 5000)
+    )
+    assert 1 < (most - many) / 4000 < 2 < few / 100
+
+
 def test_estimate_counts_workers_and_networks_of_each_worker() -> None:
     def memory_mb(workers: int, *networks: int) -> float:
         return estimate_resources([(1920, 1080)] * 10, make_config(), networks, workers).memory_mb

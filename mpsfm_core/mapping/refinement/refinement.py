@@ -86,7 +86,7 @@ MIN_SCALE_POINTS = 20
 """Smallest number of well triangulated points for which the depth scale shared by several images is
 estimated again. [ours]"""
 
-CACHED_BYTES = 1 << 28
+CACHED_BYTES = 1 << 26
 """Size limit of the cached depth integrators of all images, bytes. [ours]"""
 MEDIAN_ERROR = float(np.sqrt(2 * np.log(2)))
 """Median length of a vector of two standard normal variables, such as a reprojection error."""
