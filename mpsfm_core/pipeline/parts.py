@@ -188,7 +188,8 @@ class MapPart:
         problem = problem_from_state(unflatten_state(arrays))
         with limit_threads(self.threads), measure_part(problem) as records:
             self.map(problem)
-        write_file(self.record_file(key), json.dumps(asdict(records[0])))
+        if not self.record_file(key).exists():  # a repeated part only loads its checkpoint
+            write_file(self.record_file(key), json.dumps(asdict(records[0])))
 
     def read_record(self, key: str) -> PartRecord | None:
         """Return the record of a part that a worker mapped, or None without a worker."""
