@@ -147,7 +147,8 @@ def reconstruct(
             next_problem is None or is_refuted
         ):
             break
-    checkpointer.save_completed(runs)
+    if not is_complete:
+        checkpointer.save_completed(runs)
     selected = select_run(runs, distinct)
     models = list(selected.models)
     distinct = calibrate_rigs(distinct, models) or distinct
