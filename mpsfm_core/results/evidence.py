@@ -30,6 +30,9 @@ def count_explained_matches(
 ) -> dict[tuple[str, str], int]:
     """Count the matches of each registered image pair whose keypoints share a 3D point.
 
+    Pairs of a duplicate and its original are left out, because they have the same pose, and most of
+    their matches observe no point of another view.
+
     Args:
         reconstruction: reconstruction of some images of the mapping problem.
         problem: mapping problem with images and verified pairs.
@@ -37,18 +40,20 @@ def count_explained_matches(
     Returns:
         Number of explained matches by pair of image names.
     """
-    images = problem.images
-    return {
-        (images[pair.image_a].name, images[pair.image_b].name): int(mask.sum())
-        for pair, mask in find_explained_matches(reconstruction.confirmed_images, problem)
-    }
+    counts = {}
+    for pair, mask in find_explained_matches(reconstruction.confirmed_images, problem):
+        a, b = problem.images[pair.image_a], problem.images[pair.image_b]
+        if a.duplicate_of != b.name and b.duplicate_of != a.name:
+            counts[a.name, b.name] = int(mask.sum())
+    return counts
 
 
 def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -> dict[str, Any]:
     """Describe the evidence for the poses of a reconstruction as plain data.
 
     The images of a frame of a rig have one pose, so they count as one image: they have the same
-    evidence, and only points that several frames observe support their pose.
+    evidence, and only points that several frames observe support their pose. A duplicate has the
+    share of explained matches of its original.
 
     Args:
         reconstruction: reconstruction of some images of the mapping problem.
@@ -77,6 +82,13 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
         for name in names:
             num_matched[frame_of[name]] += matched[names]
             num_explained[frame_of[name]] += count
+    for image in problem.images:
+        if image.name in frame_of and image.duplicate_of in frame_of:
+            frame, original = frame_of[image.name], frame_of[image.duplicate_of]
+            num_matched[frame], num_explained[frame] = (
+                num_matched[original],
+                num_explained[original],
+            )
     ratios = num_explained / np.maximum(num_matched, 1)
     num_frames = _count_frames(frames, len(reconstruction.points))
     is_shared = num_frames >= (2 if len(frame_of) > len(frames) else 1)

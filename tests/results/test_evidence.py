@@ -23,6 +23,25 @@ def test_explained_matches_count_common_points_of_a_pair(solved) -> None:
     assert explained == {("images/0.png", "images/1.png"): 10}
 
 
+def test_evidence_of_duplicate_has_the_explained_ratio_of_its_original(solved) -> None:
+    problem, model = solved.problem, solved.best
+    original, duplicate, third = (image.index for image in model.images[:3])
+    names = [problem.images[index].name for index in (original, duplicate)]
+    images = list(problem.images)
+    images[duplicate] = replace(images[duplicate], duplicate_of=names[0])
+    right = np.stack([np.arange(10)] * 2, axis=1)
+    wrong = np.stack([np.arange(10), np.arange(10) + 1], axis=1)
+    scores = np.ones(len(right), np.float32)
+    pairs = (
+        VerifiedPair(original, duplicate, wrong, scores, np.eye(3), np.zeros(3)),
+        VerifiedPair(original, third, right, scores, np.eye(3), np.zeros(3)),
+    )
+    changed = replace(problem, images=tuple(images), pairs=pairs)
+    assert tuple(names) not in count_explained_matches(model, changed)
+    evidence = describe_evidence(model, changed)["images"]
+    assert [evidence[name]["explained_ratio"] for name in names] == [1.0, 1.0]
+
+
 def test_evidence_of_connected_model_has_one_part(solved) -> None:
     model = solved.best
     evidence = describe_evidence(model, solved.problem)
