@@ -372,7 +372,10 @@ class ReversesPoses(ToldGroup):
 
 @pytest.mark.parametrize(
     ("factory", "message"),
-    [(IntrinsicsOfFirst, "intrinsics of view . of a group"), (ReversesPoses, "rotation of view 2 of a group")],
+    [
+        (IntrinsicsOfFirst, "intrinsics of view . of a group"),
+        (ReversesPoses, "rotation of view 2 of a group"),
+    ],
 )
 def test_multiview_provider_with_wrong_cameras_of_large_groups_fails_its_check(
     caught: Callable[..., None], factory: type, message: str
