@@ -194,7 +194,7 @@ class DoubtReason(ReasonCode):
     """At the pose of a localized photo, the ratio ``violation_ratio`` of its depth map contradicts
     the depth of an image of the model."""
     CAMERA_JUMP = ("camera-jump", "image_a", "image_b")
-    """The camera of a video jumps between two successive keyframes, which share no 3D point."""
+    """The camera of a video jumps between two successive keyframes, which share few 3D points."""
     MEANINGLESS_SCORES = ("meaningless-scores", "provider", "num_pairs")
     """The match scores of a matcher are not higher for inliers than for outliers."""
 

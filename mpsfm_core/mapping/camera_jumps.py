@@ -27,9 +27,12 @@ Shot = Mapping[str, float]
 Jump = tuple[str, str]
 """Names of the successive registered keyframes of a shot between which the camera jumps."""
 
-MIN_SPEED_RATIO = 10.0
+MIN_SPEED_RATIO = 4.0
 """Minimum ratio of the speed of a jump to the 90 % quantile of the speed of the camera, for
 translation or rotation. [tuned: benchmarks.walks --look-alike]"""
+MIN_COMMON_POINTS = 15
+"""Number of common points from which two keyframes have no jump in between.
+[COLMAP two-view min_num_inliers]"""
 _SPEED_QUANTILE = 0.9
 NUM_NEIGHBORS = 10
 """Number of following keyframes with which a keyframe may be matched across a jump.
@@ -37,7 +40,7 @@ NUM_NEIGHBORS = 10
 
 
 def find_jumps(reconstructions: Sequence[Reconstruction], shots: Sequence[Shot]) -> list[Jump]:
-    """Find successive keyframes that share no point and between which the camera is too fast.
+    """Find successive keyframes with few common points between which the camera is too fast.
 
     Args:
         reconstructions: Components of the model.
@@ -93,5 +96,5 @@ def _find_jumps_of_part(part: Reconstruction, shots: Sequence[Shot]) -> Iterator
     limits = MIN_SPEED_RATIO * np.quantile(speeds, _SPEED_QUANTILE, axis=0)
     for (a, b), too_fast in zip(steps, (np.array(speeds) > limits).any(axis=1), strict=True):
         common = np.intersect1d(a.point_ids[a.point_ids >= 0], b.point_ids)
-        if too_fast and not len(common):
+        if too_fast and len(common) < MIN_COMMON_POINTS:
             yield a.name, b.name

@@ -344,7 +344,7 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
     DoubtReason.CAMERA_JUMP: (
         "the camera of the video jumps",
         "Between the frames {image_a} and {image_b}, the camera moves far too fast, and they share "
-        "no point: places that look alike may be joined.",
+        "few points: places that look alike may be joined.",
         "Film the way between both places again, slowly and with textured surfaces in view.",
     ),
     DoubtReason.MEANINGLESS_SCORES: (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from mpsfm_core.data import (
     DepthPrior,
@@ -24,30 +25,28 @@ TURN = np.diag([-1.0, 1.0, -1.0])
 """Rotation by 180 degrees about the vertical axis."""
 
 
-def build_walk(
-    centers: Float64, turned: slice = slice(0), *, linked: bool = False
-) -> Reconstruction:
-    """Return keyframes with the camera centers (n, 3), of which successive ones share a point.
+def build_walk(centers: Float64, turned: slice = slice(0), num_common: int = 0) -> Reconstruction:
+    """Return keyframes with the camera centers (n, 3), of which successive ones share 20 points.
 
     Args:
         centers: Camera centers.
         turned: Keyframes that look backward.
-        linked: If true, the first turned keyframe shares a point with the keyframe before.
+        num_common: Number of points that the first turned keyframe shares with the keyframe before.
     """
     images = []
     is_turned = np.zeros(len(centers), np.bool_)
     is_turned[turned] = True
     for row, (center, backward) in enumerate(zip(centers, is_turned, strict=True)):
-        points = np.array([row, row + 1])
-        if backward and not is_turned[row - 1] and not linked:
-            points[0] = -1
+        points = np.arange(20 * row, 20 * row + 40)
+        if backward and not is_turned[row - 1]:
+            points[num_common:20] = -1
         rotation = TURN if backward else np.eye(3)
         images.append(
             RegisteredImage(
                 row, NAMES[row], CAMERA, rotation, -rotation @ center, points, DEPTH, 1.0
             )
         )
-    return Reconstruction(tuple(images), np.zeros((99, 3)), np.zeros(99))
+    return Reconstruction(tuple(images), np.zeros((700, 3)), np.zeros(700))
 
 
 def walk(step: float = 0.1) -> Float64:
@@ -66,10 +65,10 @@ def test_find_jumps_returns_the_keyframes_around_a_jump() -> None:
     assert find_jumps([build_walk(centers, slice(20, None))], [SHOT]) == [(NAMES[19], NAMES[20])]
 
 
-def test_turn_on_the_spot_is_a_jump_only_without_common_points() -> None:
-    centers = walk()
-    assert find_jumps([build_walk(centers, slice(20, None))], [SHOT]) == [(NAMES[19], NAMES[20])]
-    assert find_jumps([build_walk(centers, slice(20, None), linked=True)], [SHOT]) == []
+@pytest.mark.parametrize(("num_common", "jumps"), [(0, 1), (14, 1), (15, 0)])
+def test_turn_on_the_spot_is_a_jump_with_few_common_points(num_common: int, jumps: int) -> None:
+    part = build_walk(walk(), slice(20, None), num_common)
+    assert find_jumps([part], [SHOT]) == [(NAMES[19], NAMES[20])] * jumps
 
 
 def test_jump_at_a_cut_is_allowed() -> None:
