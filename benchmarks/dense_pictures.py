@@ -1,0 +1,128 @@
+"""Create the pictures of clouds and meshes in the gallery of the documentation.
+
+    python -m benchmarks.dense_pictures [--scenes room street_0 ...] [--output DIR]
+
+The scenes are generated streets (:mod:`benchmarks.street`) and the sample scene. A picture shows
+the cloud without and with the removal of points that no other view confirms or that are next to
+depth edges (``dense.check_validity``), and the textured mesh, from a camera beside the photos.
+"""
+
+from __future__ import annotations
+
+import argparse
+import zlib  # noqa: F401, because zlib fails if pycolmap, which has its own, is imported first
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+import mpsfm_core as mpsfm
+from benchmarks.street import make_street
+from mpsfm_core.data import Float64, PinholeCamera, Pose, UInt8, View
+from mpsfm_core.dense.densify import densify
+from mpsfm_core.dense.fusion import fuse_depth_maps
+from mpsfm_core.dense.mesh import mesh_depth_maps
+from mpsfm_core.dense.options import DenseOptions, MeshOptions
+from mpsfm_core.dense.texture import build_texture
+from mpsfm_core.evaluation.rendering import Geometry, render
+from mpsfm_core.geometry import camera_center
+from mpsfm_core.inputs.images import load_images
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+
+ROOT = Path(__file__).resolve().parents[1]
+SAMPLE_SCENE = ROOT / "examples" / "sample_scene"
+ROOM, STREET = "room", "street_"
+SCENES = [ROOM, *(f"{STREET}{seed}" for seed in range(4))]
+"""The sample scene, and generated streets with their seeds."""
+WIDTH = 366
+"""Width of one rendering in pixels; a picture has three renderings."""
+MOVED = {"back": 0.3, "right": 0.35, "up": 0.25}
+"""Distance of the rendered camera from the middle photo, relative to the median depth."""
+_QUALITY = 80
+_MAX_TEXTURE_SIZE = 4096
+
+
+class Scene(NamedTuple):
+    """Reconstruction of a scene before multi-view stereo, and its views by image name."""
+
+    reconstruction: Reconstruction
+    view_of: Callable[[str], View]
+    up: Float64 | None
+    """(3,) direction of the zenith, or None if it is upwards in the middle photo."""
+
+
+def main() -> None:
+    """Parse the command line and write one picture per scene."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--scenes", nargs="+", default=SCENES, choices=SCENES, metavar="SCENE")
+    parser.add_argument("--output", type=Path, default=ROOT / "docs" / "pictures")
+    arguments = parser.parse_args()
+    for name in arguments.scenes:
+        scene = _reconstruct_sample_scene() if name == ROOM else _generate_street(name)
+        picture = cv2.cvtColor(draw_scene(scene), cv2.COLOR_RGB2BGR)
+        path = arguments.output / f"dense_{name}.jpg"
+        cv2.imwrite(str(path), picture, [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        print(path, flush=True)
+
+
+def _generate_street(name: str) -> Scene:
+    street = make_street(int(name.removeprefix(STREET)))
+    return Scene(street.reconstruction, street.views.__getitem__, np.array([0.0, 0, 1]))
+
+
+def _reconstruct_sample_scene() -> Scene:
+    """Reconstruct the sample scene without the stage ``dense``."""
+    photos, intrinsics = SAMPLE_SCENE / "images", SAMPLE_SCENE / "intrinsics.yaml"
+    config = mpsfm.load_config("fast-cpu", ["dense.enabled=false"])
+    result = mpsfm.reconstruct(photos, None, config, intrinsics=intrinsics)
+    images = load_images(photos, intrinsics)
+    rows = {name: row for row, name in enumerate(images.names)}
+    view_of = lambda name: images.view(rows[name])  # noqa: E731
+    return Scene(result.mapping.reconstructions[0], view_of, None)
+
+
+def draw_scene(scene: Scene) -> UInt8:
+    """Render the clouds without and with validity, and the textured mesh, side by side."""
+    camera, pose = _place_camera(scene)
+    renderings = []
+    for check_validity in (False, True):
+        options = DenseOptions(check_validity=check_validity)
+        dense, _ = densify(scene.reconstruction, scene.view_of, options)
+        cloud = fuse_depth_maps(dense, scene.view_of)
+        none = np.zeros((0, 3), np.int64)
+        renderings.append(render(Geometry(cloud.points, cloud.colors, none), camera, pose))
+    mesh = mesh_depth_maps(dense, scene.view_of, MeshOptions())
+    textured = build_texture(mesh, dense, scene.view_of, _MAX_TEXTURE_SIZE)
+    gray = np.full((len(textured.vertices), 3), 128, np.uint8)
+    surface = Geometry(textured.vertices, gray, textured.triangles, textured.uv, textured.texture)
+    renderings.append(render(surface, camera, pose))
+    shown = [np.where(each.covered[..., None], each.colors, 255) for each in renderings]
+    picture: UInt8 = np.round(np.hstack(shown)).astype(np.uint8)
+    return picture
+
+
+def _place_camera(scene: Scene) -> tuple[PinholeCamera, Pose]:
+    """Return a camera that looks at the scene from the right of the middle photo, and above it."""
+    image = scene.reconstruction.images[len(scene.reconstruction.images) // 2]
+    right, down, forward = image.rotation
+    up = -down if scene.up is None else scene.up
+    depth = float(np.median(image.depth.depth[image.depth.valid]))
+    target = camera_center(image.rotation, image.translation) + depth * forward
+    offset = MOVED["right"] * right + MOVED["up"] * up - (1 + MOVED["back"]) * forward
+    size = WIDTH, round(WIDTH * image.camera.height / image.camera.width)
+    return image.camera.resized(*size), _look_at(target + depth * offset, target, up)
+
+
+def _look_at(eye: Float64, target: Float64, up: Float64) -> Pose:
+    """Return the pose of an upright camera at ``eye`` that looks at ``target``."""
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return rotation, -rotation @ eye
+
+
+if __name__ == "__main__":
+    main()
