@@ -49,7 +49,7 @@ from mpsfm_core.testing.ground_truth_provider import (
     GroundTruthOptions,
 )
 from mpsfm_core.testing.observed_instance import ObservedInstance, observe_instance
-from mpsfm_core.testing.outcome import CheckSkipped, CheckUnmeasured
+from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUnmeasured
 from mpsfm_core.testing.painted_views import depth_unit, normal_colors, paint_normals
 from mpsfm_core.testing.process_state import read_process_settings
 
@@ -150,6 +150,7 @@ class ContractCase:
         self._prepared: WeakSet[Example] = WeakSet()
         self._detector: Any = None
         self._example: Example | None = None
+        self._resolved: set[str] = set()
         self._answers: LruCache[bytes, Any] = LruCache(_MAX_ANSWER_BYTES, _count_bytes)
         self.process_before = read_process_settings()
         """Global settings of this process before the first instance of the provider was created."""
@@ -253,6 +254,21 @@ class ContractCase:
             options = self._make_setup(Path(folder)).options
             provider = self._create(self.registry, self.kind, self.name, options)
             return self.run(self.example, provider)
+
+    def require_resolved_weights(self) -> None:
+        """Require that the provider opened its weights files by ``context.resolve_weights``.
+
+        Raises:
+            CheckFailed: the provider did not ask for a weights file of its specification.
+        """
+        options = self.registry.validate_options(self.spec.kind, self.name, self.setup.options)
+        files = self.spec.weights(options) if callable(self.spec.weights) else self.spec.weights
+        missing = [file.uri for file in files if str(file.uri) not in self._resolved]
+        if missing:
+            self.run(self.example)
+        missing = [file.uri for file in files if str(file.uri) not in self._resolved]
+        if missing:
+            raise CheckFailed(f"the provider opens {missing[0]} without context.resolve_weights")
 
     def run_with_normal_colors(self, example: Example) -> tuple[Any, TrueMaps]:
         """Run the provider on a view whose colors encode x, y and z of the normals.
@@ -399,8 +415,13 @@ class ContractCase:
         """Pass the mask of the input view to the ground-truth provider in a ``with`` block."""
         assert self._ground_truth is not None
         self._ground_truth.mask = mask
+        self._ground_truth.returned.clear()
         try:
             yield
+            if any(pickle.dumps(prior) != before for prior, before in self._ground_truth.returned):
+                self._ground_truth.wrong_inputs.append(
+                    "a prior of its own that the wrapper changed"
+                )
         finally:
             self._ground_truth.mask = None
 
@@ -475,7 +496,13 @@ class ContractCase:
         options: Mapping[str, Any],
         wrap: tuple[ProviderConfig, ...] = (),
     ) -> Any:
-        context = ProviderContext(WeightStore().resolve, device=self._device)
+        resolve = WeightStore().resolve
+
+        def record(uri: str, sha256: str | None = None) -> Path:
+            self._resolved.add(str(uri))
+            return resolve(uri, sha256)
+
+        context = ProviderContext(record, device=self._device)
         return registry.create(kind, name, options, context, wrap)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
@@ -50,6 +51,8 @@ class GroundTruth:
     def __init__(self) -> None:
         self.received_depth: list[bool] = []
         """One value per call of the normals provider, True if the call received a depth prior."""
+        self.returned: list[tuple[DepthPrior | NormalPrior, bytes]] = []
+        """Priors that the provider returned to the wrapper, and their pickled values."""
         self.mask: Bool | None = None
         """Mask of the view that the wrapper receives, or None if the view has no mask."""
         self.wrong_inputs: list[str] = []
@@ -89,6 +92,11 @@ class GroundTruth:
         depth = read_depth(view.image)
         spread = np.full(depth.shape, RELATIVE_STD)
         return depth, read_normals(view.image), depth > 0, spread
+
+    def record(self, prior: DepthPrior | NormalPrior) -> None:
+        """Store a returned prior while a wrapper is checked, to detect that it is modified."""
+        if self.mask is not None:
+            self.returned.append((prior, pickle.dumps(prior)))
 
     def receive_depth(self, view: View, depth: DepthPrior | None) -> None:
         """Record the depth prior that a wrapper passes to its normals provider."""
@@ -186,7 +194,9 @@ class GroundTruthDepth:
         depth, _, valid, spread = self._ground_truth.predict(view, self._options)
         depth = self._options.scale * depth
         variance = (spread * depth) ** 2 if self._options.variance else None
-        return DepthPrior.from_arrays(depth, variance, valid, metric=self._options.metric)
+        prior = DepthPrior.from_arrays(depth, variance, valid, metric=self._options.metric)
+        self._ground_truth.record(prior)
+        return prior
 
 
 class GroundTruthNormals:
@@ -201,7 +211,9 @@ class GroundTruthNormals:
         self._ground_truth.receive_depth(view, depth)
         _, normals, valid, spread = self._ground_truth.predict(view, self._options)
         variance = (2 * spread) ** 2 if self._options.variance else None
-        return NormalPrior.from_arrays(normals, variance, valid, camera=view.camera)
+        prior = NormalPrior.from_arrays(normals, variance, valid, camera=view.camera)
+        self._ground_truth.record(prior)
+        return prior
 
 
 def _make_spec(kind: Kind, factory: type) -> ProviderSpec:

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import closing, redirect_stdout
 from dataclasses import dataclass, field
+from itertools import combinations
 from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
@@ -37,6 +38,8 @@ _PAIRS = [
     ("b.jpg", "right/München 1.JPG"),
 ]
 """Candidate pairs with equal file names in different folders, a space and an upper-case suffix."""
+_RIGS = (("left", ""), ("right", ""), ("right", "b"))
+"""Folders of images, and suffixes of their file names, which are equal for the first two."""
 _KINDS_WITH_CALIBRATION = {
     "depth": DepthCalibration,
     "multiview": DepthCalibration,
@@ -101,6 +104,7 @@ def check_hook_filter_pairs(case: HookCase) -> str:
     turned = _filter(case, [(b, a) for a, b in reversed(_PAIRS)])
     if {frozenset(pair) for pair in turned or ()} != {frozenset(pair) for pair in kept}:
         raise CheckFailed("mpsfm_filter_pairs depends on the order of pairs or of their images")
+    _require_equal_file_names(case)
     _filter(case, [])
     _filter(case, _PAIRS[:1])
     started = time.perf_counter()
@@ -224,7 +228,10 @@ def check_hook_exports(case: HookCase) -> str:
 
 
 def check_hook_export_formats(case: HookCase) -> str:
-    """Require that each export format names an existing function and the files that it writes."""
+    """Require that each export format names an existing function and the files that it writes.
+
+    The function exports a small synthetic model. It may raise ``InputError`` for missing data.
+    """
     formats = case.call("mpsfm_export_formats")
     if not isinstance(formats, Sequence) or isinstance(formats, str):
         raise CheckFailed(f"mpsfm_export_formats returns {formats!r}, not a list of formats")
@@ -237,6 +244,7 @@ def check_hook_export_formats(case: HookCase) -> str:
             raise CheckFailed(f"export format {entry.name!r}: {error}") from error
         if not callable(write) or not entry.entries:
             raise CheckFailed(f"export format {entry.name!r} writes no file")
+        _require_declared_entries(entry, write)
     return ", ".join(entry.name for entry in formats)
 
 
@@ -375,6 +383,21 @@ def run_small_reconstruction(stages: Stages) -> list[Any]:
     return scenes
 
 
+def _require_equal_file_names(case: HookCase) -> None:
+    """Require that the filter does not take images in two folders for one image."""
+    names = [[f"{folder}/{number}{suffix}.jpg" for number in (1, 2, 3)] for folder, suffix in _RIGS]
+    counts = []
+    for right in (names[1], names[2]):
+        pairs = [pair for images in (names[0], right) for pair in combinations(images, 2)]
+        pairs += list(zip(names[0], right, strict=True))
+        counts.append(len(_filter(case, pairs) or pairs))
+    if counts[0] < counts[1]:
+        raise CheckFailed(
+            f"mpsfm_filter_pairs keeps {counts[0]} pairs of images in two folders with equal file "
+            f"names, and {counts[1]} with different file names"
+        )
+
+
 class _CountedHooks(Registry):
     """Registry of one plugin, which raises exceptions of hooks and measures their time."""
 
@@ -396,6 +419,35 @@ class _CountedHooks(Registry):
         self.calls[name] += 1
         self.slowest = max(self.slowest, (name, seconds), key=lambda entry: entry[1])
         return [answer]
+
+
+def _require_declared_entries(entry: ExportFormat, write: Callable[..., None]) -> None:
+    """Require that an export of a small model writes the declared files and no others."""
+    import pycolmap  # The import is local, because pytest loads this module when it collects tests.
+
+    from mpsfm_core.results.exports.source import ExportSource
+
+    options = pycolmap.SyntheticDatasetOptions()
+    options.num_points3D = 50
+    model = pycolmap.synthesize_dataset(options)
+    with tempfile.TemporaryDirectory(prefix="mpsfm-export-") as folder:
+        sparse, output = Path(folder, "sparse"), Path(folder, "export")
+        sparse.mkdir()
+        output.mkdir()
+        model.write(str(sparse))
+        try:
+            write(ExportSource.read(sparse), output)
+        except InputError:
+            return
+        except Exception as error:
+            what = f"{type(error).__name__}: {error}"
+            raise CheckFailed(f"export format {entry.name!r} raises {what}") from error
+        written = {path.name for path in output.iterdir()}
+    if not written or not written <= set(entry.entries):
+        raise CheckFailed(
+            f"export format {entry.name!r} writes {sorted(written)}, and declares "
+            f"{sorted(entry.entries)}"
+        )
 
 
 def _filter(case: HookCase, pairs: list[tuple[str, str]]) -> list[tuple[str, str]] | None:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.providers import ProviderSpec, hookimpl
+from mpsfm_core.providers import ExportFormat, ProviderSpec, hookimpl
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import CheckResult, hook_checks
 from mpsfm_core.testing.hook_checks import run_hook_checks
@@ -49,6 +49,12 @@ def test_hooks_of_template_pass(template: Registry) -> None:
     assert results[0].message.startswith("keeps 1 of 4 pairs")
 
 
+def names(pair: Any) -> Any:
+    """Return the file names of a pair without their folders, and the pair if they are equal."""
+    files = frozenset(Path(name).name for name in pair)
+    return files if len(files) == 2 else frozenset(pair)
+
+
 @pytest.mark.parametrize(
     ("filter_pairs", "message"),
     [
@@ -64,6 +70,10 @@ def test_hooks_of_template_pass(template: Registry) -> None:
         ),
         (lambda pairs: [(a, b) for a, b in pairs if a < b], "depends on the order"),
         (lambda pairs: list(pairs) if pairs[0] else [], "raises IndexError"),
+        (
+            lambda pairs: [p for i, p in enumerate(pairs) if names(p) not in map(names, pairs[:i])],
+            "in two folders with equal file names",
+        ),
         (lambda pairs: [*pairs, *pairs], "returns a pair twice"),
         (lambda pairs: pairs.sort(reverse=True), "modifies its argument"),
         (lambda pairs: sys.stdout.write("filtered") and pairs, "prints 'filtered"),
@@ -185,6 +195,15 @@ def test_calibration_of_foreign_provider_fails() -> None:
 def test_exports_name_existing_modules() -> None:
     (result,) = check(mpsfm_exports=lambda: {"net": "no_such_module"})
     assert "'net' is a str" in result.message
+
+
+def test_export_of_undeclared_files_fails() -> None:
+    def write(source: Any, folder: Path) -> None:
+        (folder / source.model.cameras[1].model.name).touch()
+
+    formats = [ExportFormat("mine", "Text for tests.", ("cameras.txt",), write)]
+    (result,) = check(mpsfm_export_formats=lambda: formats)
+    assert result.status == "fail" and "and declares ['cameras.txt']" in result.message
 
 
 def test_plugin_without_hooks_is_an_error() -> None:

@@ -8,9 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mpsfm_core.providers import ProviderSpec
+from mpsfm_core.providers.kinds.camera import CameraPrior
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import CheckResult, run_checks
 from mpsfm_core.testing.scaffold import write_plugin
@@ -85,6 +87,11 @@ def with_radial(prior: Any, radial: float = 0.0) -> Any:
             "camera-gravity",
             "degrees off",
         ),
+        (
+            lambda p, v, c: replace(p, gravity_std_deg=np.deg2rad(p.gravity_std_deg)),
+            "camera-gravity",
+            "is no std in degrees",
+        ),
         (lambda p, v, c: with_radial(p, -0.2), "camera-radial", "-0.2 for a view without"),
         (lambda p, v, c: scaled(p, 25.0), "camera-size", "an angle of view of 3 degrees"),
         (lambda p, v, c: None, "camera-focal", "cannot tell"),
@@ -102,6 +109,25 @@ def test_check_names_fault_of_camera_provider(
 
     result = run_check(template, changed, check)
     assert (result.status, message in result.message) == ("fail", True), result
+
+
+def test_default_focal_length_of_black_view_fails(template: ProviderSpec) -> None:
+    def factory(options: Any, context: Any) -> Any:
+        module = importlib.import_module("camera_template.model")
+        correct = module.CameraTemplate(options, context)
+
+        class WithDefault:
+            def calibrate(self, view: Any) -> Any:
+                down = np.array([0.0, 1.0, 0.0])
+                default = CameraPrior(200.0, 6.0, gravity=down, gravity_std_deg=2.0)
+                return correct.calibrate(view) or default
+
+        return WithDefault()
+
+    registry = Registry()
+    registry.add(replace(template, factory=factory))
+    (result,) = run_checks(registry, "camera", template.name, only={"camera-focal"})
+    assert result.status == "fail" and "below 10 % for a black view" in result.message
 
 
 def test_gravity_that_is_not_mirrored_fails(template: ProviderSpec) -> None:

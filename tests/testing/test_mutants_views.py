@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import os
 import tempfile
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -21,19 +23,24 @@ from mpsfm_core import (
     NormalPrior,
     PairMatches,
     ProviderContext,
+    ProviderSpec,
+    SparseMatches,
     View,
 )
 from mpsfm_core.data import Float64, PairDepth, PinholeCamera
+from mpsfm_core.providers import WeightsFile
 from mpsfm_core.providers.builtin.mutual_nearest import MutualNearest
 from mpsfm_core.providers.builtin.options import MutualNearestOptions, SiftOptions
 from mpsfm_core.providers.builtin.sift import Sift
-from mpsfm_core.testing import ContractSetup
+from mpsfm_core.providers.registry import Registry
+from mpsfm_core.testing import ContractSetup, run_checks
 from mpsfm_core.testing.painted_views import read_depth, read_normals
 from tests.support import reference_providers as ref
 from tests.support.reference_providers import (
     PaintedDepth,
     PaintedMask,
     PaintedNormals,
+    Thumbnail,
     ToldGroup,
     ToldMatcher,
     Wrapper,
@@ -138,6 +145,48 @@ class DropsPositiveZ(PaintedNormals):
         return normal_prior(normals, view)
 
 
+class SizeInModule(PaintedDepth):
+    """Fault: all instances share the size of the last view, so that a race cuts the map."""
+
+    size = (0, 0)
+
+    def predict(self, view: View) -> DepthPrior:
+        SizeInModule.size = view.image.shape[:2]
+        time.sleep(0.005)  # the network runs
+        depth = read_depth(view.image)
+        return depth_prior(depth[: self.size[0], : self.size[1]])
+
+
+class EverySecondPixel(PaintedDepth):
+    """Fault: uses the second pixel of each two pixels of a view above one megapixel."""
+
+    def predict(self, view: View) -> DepthPrior:
+        depth = read_depth(view.image)
+        if depth.size > 1_000_000:
+            depth = depth[1::2, 1::2].repeat(2, axis=0).repeat(2, axis=1)
+        return depth_prior(depth)
+
+
+class StretchesColors(PaintedDepth):
+    """Fault: normalizes an image by its own minimum and maximum."""
+
+    def predict(self, view: View) -> DepthPrior:
+        low, high = float(view.image.min()), float(view.image.max())
+        return depth_prior(read_depth((view.image - low) * (255 / max(high - low, 1))))
+
+
+class MeaninglessDepth(PaintedNormals):
+    """Fault: normals next to holes depend on the meaningless depth in the holes."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> NormalPrior:
+        assert depth is not None
+        normals = read_normals(view.image)
+        if depth.shape == normals.shape[:2]:
+            mean = cv2.blur(depth.depth, (5, 5))
+            normals[depth.valid & (mean > 1.3 * depth.depth)] *= (-1, 1, 1)
+        return normal_prior(normals, view)
+
+
 class ExcludesVisible(PaintedMask):
     """Fault: takes the mask of the view for the pixels to exclude."""
 
@@ -157,6 +206,9 @@ class ExcludesVisible(PaintedMask):
         ("depth", "global-state", "logger of mpsfm_core", SilencesCore, ()),
         ("depth", "depth-joint", "for a view with a mask", JointIgnoresMask, ("joint-normals",)),
         ("depth", "depth-focal", "192 x 72 view is", FocalOfArea, ("estimates-focal",)),
+        ("depth", "large-view", "of the map is shifted", EverySecondPixel, ()),
+        ("depth", "few-colors", "relative error", StretchesColors, ()),
+        ("normals", "normals-depth-input", "meaningless", MeaninglessDepth, ("needs-depth",)),
         ("normals", "normals-away-from-axis", "z are .* off", NegatesPositiveZ, ()),
         ("normals", "normals-away-from-axis", "only 0 of", DropsPositiveZ, ()),
         ("mask", "masked", "most values are invalid", ExcludesVisible, ()),
@@ -178,6 +230,17 @@ def test_faulty_map_provider_fails_its_check(
 class Detector(Sift):
     def __init__(self, options: Any, context: ProviderContext) -> None:
         super().__init__(SiftOptions(), context)
+
+
+class StretchesContrast(Detector):
+    """Fault: makes the image of a view writable, and stretches its contrast in place."""
+
+    def extract(self, view: View) -> Features:
+        image = view.image
+        if image.max() < 200:
+            image.flags.writeable = True
+            image[:] = cv2.normalize(image, None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
+        return super().extract(view)
 
 
 class HalfPrecision(Detector):
@@ -265,6 +328,7 @@ class DropsVisible(Detector):
 @pytest.mark.parametrize(
     ("factory", "check", "message"),
     [
+        (StretchesContrast, "inputs-unchanged", "modifies its input image"),
         (HalfPrecision, "features-large-view", "is rounded to 2 px"),
         (TilesWithoutOverlap, "features-large-view", r"differ by \(\+224.0, \+0.0\) px"),
         (ConstantScales, "features-large-view", "is 1 times as large|are 1 times as large"),
@@ -305,6 +369,22 @@ class FactorOfFirst(ReducingMatcher):
         return points[0] * factors[0], points[1] * factors[0]
 
 
+class LargerFirst(ReducingMatcher):
+    """Fault: matches the larger view first, and does not swap the points back."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        first, second = (b, a) if b.image.size > a.image.size else (a, b)
+        dense = super().match(first, second).dense
+        assert dense is not None
+        points = (
+            np.minimum(p, v.camera.size) for p, v in ((dense.points_a, a), (dense.points_b, b))
+        )
+        return PairMatches(dense=DenseMatches(*points, dense.scores))
+
+    def enlarge(self, points: Any, factors: Any) -> tuple[Float64, Float64]:
+        return points[0] * factors[0], points[1] * factors[1]
+
+
 class IntegerCenters(ReducingMatcher):
     def enlarge(self, points: Any, factors: Any) -> tuple[Float64, Float64]:
         first, second = ((p - 0.5) * f + 0.5 for p, f in zip(points, factors, strict=True))
@@ -315,13 +395,71 @@ class IntegerCenters(ReducingMatcher):
     ("factory", "check", "message"),
     [
         (FactorOfFirst, "matcher-mixed-sizes", "have a scale of 0.5 and 0.5 in x and y"),
-        (IntegerCenters, "matcher-mixed-sizes", r"shifted by \(-0.50, -0.5"),
+        (LargerFirst, "matcher-mixed-sizes", "have a scale of 1 and 1 in x and y"),
+        (IntegerCenters, "matcher-mixed-sizes", r"shifted by \(-0\.[45]"),
     ],
 )
 def test_faulty_dense_matcher_fails_its_check(
     caught: Callable[..., None], factory: type, check: str, message: str
 ) -> None:
     caught("matcher", factory, check, message, None, "dense")
+
+
+class DropsBeyondFirst(MutualNearest):
+    """Fault: drops matches whose position in the second view is beyond the size of the first."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(MutualNearestOptions(), context)
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        found = super().match(a, b, fa, fb).sparse
+        assert found is not None
+        inside = (fb.keypoints[found.indices[:, 1]] < a.camera.size).all(axis=1)
+        return PairMatches(SparseMatches(found.indices[inside], found.scores[inside]))
+
+
+class Crop224(Thumbnail):
+    """Fault: describes the central 224 x 224 pixels, and not a resized view."""
+
+    def describe(self, view: View) -> Any:
+        top, left = (max(0, (side - 224) // 2) for side in view.image.shape[:2])
+        image = np.ascontiguousarray(view.image[top : top + 224, left : left + 224])
+        camera = replace(view.camera, width=image.shape[1], height=image.shape[0])
+        return super().describe(View(view.name, image, camera))
+
+
+@pytest.mark.parametrize(
+    ("kind", "factory", "check", "message", "capabilities"),
+    [
+        ("matcher", DropsBeyondFirst, "matcher-sizes", "outer quarter of the overlap", ("sparse",)),
+        ("retrieval", Crop224, "retrieval-sizes", "copy of the view, but .* three steps", ()),
+    ],
+)
+def test_provider_with_fault_for_large_views_fails_its_check(
+    caught: Callable[..., None],
+    kind: Any,
+    factory: type,
+    check: str,
+    message: str,
+    capabilities: tuple[str, ...],
+) -> None:
+    caught(kind, factory, check, message, None, *capabilities)
+
+
+def test_instances_that_share_the_size_of_a_view_fail_in_threads(
+    caught: Callable[..., None],
+) -> None:
+    caught("depth", SizeInModule, "threads", "in two parallel threads", PAINTED)
+
+
+def test_provider_that_opens_its_weights_itself_fails(tmp_path: Path) -> None:
+    path = tmp_path / "tiny.npz"
+    np.savez(path, weights=np.zeros(1))
+    registry = Registry()
+    weights = (WeightsFile(str(path)),)
+    registry.add(ProviderSpec("depth", "opens-weights", PaintedDepth, weights=weights))
+    (result,) = run_checks(registry, "depth", "opens-weights", PAINTED, only={"construction"})
+    assert result.status == "fail" and "without context.resolve_weights" in result.message
 
 
 class DepthOfLargerFirst(ToldMatcher):
@@ -423,6 +561,17 @@ class ReducesImageOnly(CallsTwice):
         return View(view.name, image, camera)
 
 
+class ChangesPrior(Wrapper):
+    """Fault: makes the variance of the wrapped provider writable, and doubles the std in place."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        prior = super().predict(view, depth)
+        if prior.variance is not None:
+            prior.variance.flags.writeable = True
+            prior.variance[:] *= 4
+        return prior
+
+
 class CropsImageOnly(CallsTwice):
     def change(self, view: View) -> View:
         image = np.ascontiguousarray(view.image[8:-8, 8:-8])
@@ -436,6 +585,7 @@ class CropsImageOnly(CallsTwice):
         (RotatesImageOnly, "wrapper-inputs", "the camera of .*, rotated by 90 degrees"),
         (MirrorsWithoutMask, "wrapper-inputs", "the mask of another view for 'mirrored"),
         (ReducesImageOnly, "wrapper-inputs", "the camera of a resized copy"),
+        (ChangesPrior, "wrapper-inputs", "a prior of its own that the wrapper changed"),
         (CropsImageOnly, "wrapper-inputs", "the camera of a part"),
     ],
 )

@@ -32,6 +32,10 @@ _SIZE_TOLERANCE = 0.1
 _ANGLE_RANGE_DEG = (5.0, 170.0)
 """Smallest and largest plausible angle of view."""
 _GRAVITY_TOLERANCE_DEG = 3.0
+_MIN_GRAVITY_STD_DEG = 0.1
+"""Smallest plausible std of gravity; the error of networks is 0.4 to 2 degrees [GeoCalib]."""
+_MIN_UNKNOWN_STD = 0.1
+"""Smallest relative std of the focal length of a view that shows nothing."""
 _RADIAL_TOLERANCE = 0.05
 
 
@@ -138,9 +142,17 @@ def compare_with_true_camera(
 def check_camera_focal(case: CheckedProvider) -> str:
     """Require that the estimated focal length in pixels is within 4 std of the true one.
 
-    A view of half the width around the image center has the same focal length.
+    A view of half the width around the image center has the same focal length. A test network that
+    decodes painted colors knows no focal length of a black view, so the provider has to return None
+    or a std of at least 10 % for this view.
     """
     case.require_truth("painted", "prepared", "image")
+    if case.truth_source == "painted":
+        view = case.example.view
+        black = replace(view, image=np.zeros_like(view.image))
+        unknown: CameraPrior | None = case.run_on_view(black, case.example)
+        if unknown is not None and unknown.focal_std_px < _MIN_UNKNOWN_STD * unknown.focal_px:
+            raise DataError("focal_std_px", "is below 10 % for a black view")
     width, height = case.example.camera.size
     center = case.example.crop(width // 4, height // 4, width // 2, height // 2)
     compare_with_true_camera(case, center, case.run(center))
@@ -214,10 +226,15 @@ def check_camera_mirror(case: CheckedProvider) -> str:
 
 
 def check_camera_gravity(case: CheckedProvider) -> str:
-    """Require gravity in the camera frame, which points down along y for an upright camera."""
+    """Require gravity in the camera frame, which points down along y for an upright camera.
+
+    The std of gravity is in degrees: no network knows gravity to 0.1 degrees.
+    """
     case.require_capability("estimates-gravity")
     case.require_truth("painted", "prepared", "image")
     prior = _require_estimate(case.run(case.example))
+    if prior.gravity_std_deg is not None and prior.gravity_std_deg < _MIN_GRAVITY_STD_DEG:
+        raise DataError("gravity_std_deg", f"{prior.gravity_std_deg:.2g} is no std in degrees")
     return _require_true_gravity(prior, case.example)
 
 

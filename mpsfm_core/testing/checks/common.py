@@ -55,11 +55,13 @@ _MAX_ROUNDS = 20
 _STEP_OF_EQUAL_PIXELS = 8
 """Distance of the rows and columns at which two different views in the check ``no-state`` have
 equal pixels."""
+_FLOOR = (0, 112, 48, 32)
+"""Left, top, width and height in pixels of a part of the example view that shows the floor only."""
 _PANORAMA_RATIO = 5
 """Ratio between the sides of the views in the check ``panorama``."""
-_STRIP_SIZE = (2048, 320)
-"""Width and height in pixels of a painted view as wide as photos, whose height limits the run
-time."""
+_LARGE_PORTRAIT_SIZE = (640, 1728)
+"""Width and height in pixels of a painted view of more than one megapixel, whose width limits the
+run time."""
 _THREADS_TIME_S = 0.2
 """Time in seconds after which the check ``threads`` makes no further calls."""
 
@@ -81,8 +83,13 @@ def check_specification(case: ContractCase) -> str:
 
 
 def check_construction(case: ContractCase) -> None:
-    """Require that the factory constructs the provider with the options of the ContractSetup."""
+    """Require that the factory constructs the provider with the options of the ContractSetup.
+
+    Constructor or first call have to open the weights files of the specification by
+    ``context.resolve_weights``. Only this function downloads files and compares their SHA-256.
+    """
     assert case.provider is not None
+    case.require_resolved_weights()
 
 
 def check_light_import(case: ContractCase) -> str:
@@ -139,10 +146,18 @@ def check_no_state(case: ContractCase) -> None:
 def check_inputs_unchanged(case: ContractCase) -> None:
     """Require that the provider does not modify the view, depth or features that it receives.
 
-    Other providers of the same run use the same arrays.
+    Other providers of the same run use the same arrays. A second view has a small range of colors,
+    because a provider may stretch the contrast of a view in place.
     """
+    image = np.array(case.small_example.view.image)
+    _require_inputs_unchanged(case, image)
+    if case.setup.prepare is None:
+        _require_inputs_unchanged(case, (80 + 0.25 * image).astype(np.uint8))
+
+
+def _require_inputs_unchanged(case: ContractCase, image: UInt8) -> None:
+    """Require that a call with a masked view of the given image modifies no input."""
     example = case.small_example
-    image = np.array(example.view.image)
     mask = np.ones(image.shape[:2], np.bool_)
     mask[:, : image.shape[1] // 3] = False
     view = View(example.name, image, example.camera, mask)
@@ -214,9 +229,10 @@ def check_intrinsics_declared(case: ContractCase) -> None:
 def check_threads(case: ContractCase) -> None:
     """Require that two instances in two threads give the same output as each instance alone.
 
-    A run creates one instance of a provider per thread.
+    A run creates one instance of a provider per thread. The views of both threads have different
+    sizes.
     """
-    examples = [case.example, case.example.partner]
+    examples = [case.example, case.small_example]
     alone = [case.run(example) for example in examples]
     instances = [case.provider, case.observed.provider]
     parallel: list[Any] = [None] * len(examples)
@@ -313,13 +329,23 @@ def check_panorama(case: ContractCase) -> str:
     return " and ".join(_run_and_compare(case, example) for example in (wide, tall))
 
 
+def check_few_colors(case: ContractCase) -> str:
+    """Require accurate output for a part of a view that has a small range of colors.
+
+    A network must not receive colors that are stretched to the range from 0 to 1, or normalized by
+    the mean and std of each image.
+    """
+    case.require_truth("painted")
+    return _run_and_compare(case, case.example.crop(*_FLOOR))
+
+
 def check_large_view(case: ContractCase) -> str:
     """Require accurate output for a view of 12.2 megapixels (masks) or 2.2 megapixels (others).
 
     Photos of users are usually larger than the input of a network. The large view repeats the
-    pixels of a small view, so that the ground truth is known. Two painted views do not repeat
-    pixels: one in portrait format with 0.7 megapixels, and a strip of 2048 x 320 pixels for depth.
-    Wrappers and providers that read files receive a view of 0.4 megapixels.
+    pixels of a small view, so that the ground truth is known. A painted view in portrait format
+    does not repeat pixels and has 1.1 megapixels for depth, 0.7 megapixels for others. Wrappers and
+    providers that read files receive a view of 0.4 megapixels.
     """
     width, height = case.example.camera.size
     if case.kind in ("features", "matcher", "retrieval"):
@@ -328,10 +354,9 @@ def check_large_view(case: ContractCase) -> str:
         return _run_and_compare(case, case.example.sized(4 * width, 4 * height))
     # The portrait view first, because a failure of the larger view has the same cause.
     if case.truth_source == "painted":
-        _run_and_compare(case, case.example.sized(5 * height, 5 * width))
-        if case.kind in ("depth", "multiview"):
-            large = case.example.sized(_STRIP_SIZE[0], _STRIP_SIZE[0] * height // width)
-            _run_and_compare(case, large.crop(0, large.camera.height // 2, *_STRIP_SIZE))
+        is_depth = case.kind in ("depth", "multiview")
+        size = _LARGE_PORTRAIT_SIZE if is_depth else (5 * height, 5 * width)
+        _run_and_compare(case, case.example.sized(*size))
     factor = 21 if case.kind == "mask" else 9
     small, auxiliary = case.example, case.make_auxiliary_input(case.example.view, case.example)
     image = small.view.image.repeat(factor, axis=0).repeat(factor, axis=1)
@@ -423,6 +448,7 @@ COMMON = (
     check_odd_size,
     check_portrait,
     check_panorama,
+    check_few_colors,
     check_one_pixel,
     check_thin_view,
     check_large_view,
@@ -511,7 +537,7 @@ def _run_on_image(case: ContractCase, image: UInt8) -> None:
 
 
 def _find_plugin_modules(case: ContractCase) -> list[str]:
-    """Return the entry-point modules of the installed distribution that contains the provider."""
+    """Return the entry points of the installed distribution that contains the provider."""
     distribution = case.registry.version(case.spec.kind, case.name).partition(" ")[0]
     entries = metadata.entry_points(group=ENTRY_POINT_GROUP)
-    return [e.module for e in entries if e.dist is not None and e.dist.name == distribution]
+    return [e.value for e in entries if e.dist is not None and e.dist.name == distribution]

@@ -44,9 +44,11 @@ _LARGE_FACTOR = 21
 _SMALL_SIZE, _WIDE_SIZE = (256, 192), (2048, 256)
 """Widths and heights in pixels of views below and above the input size of dense matchers. The
 height of the wide view limits the run time."""
+_SMALL_SHIFT = np.array([64.0, 0.0])
+"""Position in pixels of the small view in the wide one."""
 _WIDE_SHIFT = np.array([256.0, 0.0])
-"""Position in pixels of the second wide view in the texture of the first, a multiple of the cells
-of a network that reduces the view to 32 or 40 columns."""
+"""Position in pixels of the second wide view in the first, a multiple of the cells of a network
+that reduces the wide view to 32 or 40 columns."""
 _MIXED_TOLERANCE_PX = 0.3
 """Largest accepted shift of matches to the same side in x and y, in pixels or multiples of
 ``std_px``. Integer pixel centers shift matches by 0.5 pixels if one view is reduced to half the
@@ -107,8 +109,9 @@ def check_matcher_sizes(case: ContractCase) -> str:
 
     The second view is a wide, a portrait or a larger rectangle of a neighboring view, at the same
     scale. A dense matcher may resize all views to one size and fail for some of these pairs, but
-    has to match at least one pair. Each rectangle is matched in one order, because the other three
-    orders take another 7 % of the run time. The check ``matcher-order`` swaps the views.
+    has to match at least one pair. The matches have to cover the overlap. Each rectangle is matched
+    in one order, because the other three orders take another 7 % of the run time. The check
+    ``matcher-order`` swaps the views.
     """
     case.require_truth("image")
     width, height = case.example.camera.size
@@ -121,6 +124,7 @@ def check_matcher_sizes(case: ContractCase) -> str:
     for pair in pairs:
         try:
             texts.append(_require_correct(case, *pair, _MIN_CORRECT_RATIO_OF_HARD_PAIRS))
+            _require_covered_overlap(case, *pair)
         except CheckFailed as failed:
             failures.append(str(failed))
     if failures and (len(failures) == len(pairs) or not case.declares("dense")):
@@ -141,8 +145,8 @@ def check_matcher_mixed_sizes(case: ContractCase) -> str:
     case.require_truth("image")
     texts = []
     for size_a, size_b, shift in (
-        (_SMALL_SIZE, _WIDE_SIZE, np.zeros(2)),
-        (_WIDE_SIZE, _SMALL_SIZE, np.zeros(2)),
+        (_SMALL_SIZE, _WIDE_SIZE, -_SMALL_SHIFT),
+        (_WIDE_SIZE, _SMALL_SIZE, _SMALL_SHIFT),
         (_WIDE_SIZE, _WIDE_SIZE, _WIDE_SHIFT),
     ):
         matches = point_matches(case.run_on_views(_noise_views(shift, size_a, size_b)), None)
@@ -479,6 +483,25 @@ def _require_correct(
     return f"{right:.0%} of {len(matches)} matches are correct"
 
 
+def _require_covered_overlap(case: ContractCase, a: Example, b: Example) -> None:
+    """Require correct matches in all parts of the first view that the second view shows."""
+    matches = match_points(case, a, b, case.run_on_examples(a, b))
+    limit = MATCH_TOLERANCE_STD * max(1.0, matches.std_px)
+    points = matches.points_a[match_errors_px(a, b, matches) < limit]
+    x, y = (np.linspace(0, side, 16) + 0.5 for side in a.camera.size)
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    shown = grid[a.correspondences(b, grid).visible]
+    if len(points) < 2 * MIN_MATCHES or not len(shown):
+        return
+    low, size = shown.min(axis=0), np.ptp(shown, axis=0)
+    position = (points - low) / size
+    outer = np.concatenate([(position < 0.25).mean(0), (position > 0.75).mean(0)])
+    if outer.min() < _MIN_SIDE_RATIO:
+        raise CheckFailed(
+            f"only {outer.min():.0%} of the correct matches are in one outer quarter of the overlap"
+        )
+
+
 def _require_enough(count: int) -> None:
     """Require that the matcher finds matches between views that overlap."""
     if count < MIN_MATCHES:
@@ -613,18 +636,25 @@ def _match_with_noise(case: ContractCase, a: Example, b: Example, amplitude: int
 def _noise_views(
     shift: Float64, size_a: tuple[int, int], size_b: tuple[int, int]
 ) -> tuple[View, View]:
-    """Return two views of one random texture, of which the second starts at ``shift``."""
+    """Return two views of one random texture.
+
+    Args:
+        shift: Position (x, y) of the second view in the first, in pixels.
+        size_a: Width and height of the first view.
+        size_b: Width and height of the second view.
+    """
     import cv2  # The import is local, because pytest loads this module when it collects tests.
 
-    x, y = map(int, shift)
-    width, height = max(size_a[0], size_b[0] + x), max(size_a[1], size_b[1] + y)
+    corners = [np.maximum(sign * shift, 0).astype(int) for sign in (-1, 1)]
+    ends = [corner + size for corner, size in zip(corners, (size_a, size_b), strict=True)]
+    width, height = np.max(ends, axis=0).tolist()
     noise = np.random.default_rng(0).normal(size=(height, width, 3))
     fine, coarse = (cv2.GaussianBlur(noise, (0, 0), sigma) * sigma for sigma in (1.5, 5.0))
     image = np.clip(128 + 90 * (fine + coarse), 0, 255).astype(np.uint8)
     views = []
-    for name, (left, top), (columns, rows) in (("a", (0, 0), size_a), ("b", (x, y), size_b)):
-        part = np.ascontiguousarray(image[top : top + rows, left : left + columns])
-        camera = PinholeCamera(columns, rows, 1000.0, 900.0, 560.0, 470.0)
+    for name, (left, top), (right, bottom) in zip("ab", corners, ends, strict=True):
+        part = np.ascontiguousarray(image[top:bottom, left:right])
+        camera = PinholeCamera(part.shape[1], part.shape[0], 1000.0, 900.0, 560.0, 470.0)
         views.append(View(f"noise/{name}.png", part, camera))
     return views[0], views[1]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
@@ -26,6 +27,8 @@ from mpsfm_core.testing.std_errors import require_normals_std
 _MIN_POSITIVE_Z = 0.1
 """Smallest z component of normals in ``check_normals_away_from_axis``, larger than the error of
 encoded colors."""
+_MEANINGLESS_DEPTH = 7.0
+"""Depth in meters at invalid pixels, which a provider must ignore."""
 FLIP_TOLERANCE_DEG = 15.0
 """Largest accepted angle in degrees between normals of a view and of the mirrored view if the
 ground truth is unknown. Trained networks are not exactly symmetric."""
@@ -153,7 +156,8 @@ def check_normals_away_from_axis(case: ContractCase) -> str:
 def check_normals_depth_input(case: ContractCase) -> str:
     """Require the same normals for depth in another unit and for a depth map of half the size.
 
-    The check applies to providers that declare ``needs-depth``.
+    The normals must not depend on depth and variance at invalid pixels. The check applies to
+    providers that declare ``needs-depth``.
     """
     case.require_capability("needs-depth")
     case.require_truth("painted", "prepared", "image")
@@ -175,6 +179,7 @@ def check_normals_depth_input(case: ContractCase) -> str:
         if angle > NORMALS_TOLERANCE_DEG:
             raise CheckFailed(f"the normals are {angle:.0f} degrees off for depth {what}")
         worst = max(worst, angle)
+    _require_no_use_of_invalid_depth(case)
     return f"angle {worst:.2f} degrees"
 
 
@@ -209,6 +214,34 @@ CHECKS = (
     check_normals_variance,
     check_normals_calibration,
 )
+
+
+def _require_no_use_of_invalid_depth(case: ContractCase) -> None:
+    """Require equal valid normals if depth and variance at invalid pixels change."""
+    example = case.example
+    case.prepare(example)
+    given: DepthPrior = case.make_auxiliary_input(example.view, example)
+    if given.variance is None or given.valid.all():
+        return
+    first, second = (
+        case.run_on_view(example.view, example, case.provider, depth)
+        for depth in (
+            given,
+            replace(
+                given,
+                depth=np.where(given.valid, given.depth, np.float32(_MEANINGLESS_DEPTH)),
+                variance=np.where(given.valid, given.variance, np.float32(1)),
+            ),
+        )
+    )
+    both = first.valid & second.valid if first.shape == second.shape else np.zeros(1, np.bool_)
+    changed = 1 - both.sum() / max(first.valid.sum(), second.valid.sum(), 1)
+    if both.any():
+        changed += float((first.normals[both] != second.normals[both]).mean())
+    if changed > 0:
+        raise CheckFailed(
+            f"{changed:.2%} of the normals depend on the meaningless depth at invalid pixels"
+        )
 
 
 def _run(case: ContractCase) -> NormalPrior:

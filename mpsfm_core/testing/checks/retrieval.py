@@ -75,7 +75,8 @@ def check_retrieval_overlap(case: ContractCase) -> str:
 def check_retrieval_sizes(case: ContractCase) -> str:
     """Require a higher similarity to a smaller, larger or cropped copy than to another scene.
 
-    Photos of one scene may have different sizes and landscape or portrait format.
+    Photos of one scene may have different sizes and landscape or portrait format. Smaller and
+    larger copies must also be more similar than a view that is moved by three steps.
     """
     case.require_truth("image", "prepared")
     width, height = case.example.camera.size
@@ -94,6 +95,13 @@ def check_retrieval_sizes(case: ContractCase) -> str:
             raise CheckFailed(
                 f"the similarity is {value:.3f} to a {name} copy of the view, but {unrelated:.3f} "
                 f"to another scene"
+            )
+    moved = float(vector @ case.run(example.partner.partner.partner))
+    for name in ("smaller", "larger", "eight times larger"):
+        if similarity[name] <= moved - _MIN_MARGIN * abs(moved):
+            raise CheckFailed(
+                f"the similarity is {similarity[name]:.3f} to a {name} copy of the view, but "
+                f"{moved:.3f} to a view moved by three steps"
             )
     return f"similarity at least {min(similarity.values()):.3f} to copies of other sizes"
 

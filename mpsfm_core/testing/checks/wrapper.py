@@ -156,7 +156,8 @@ def check_wrapper_inputs(case: ContractCase) -> None:
     """Require that the wrapped provider receives camera, mask and depth prior of its input view.
 
     If a wrapper mirrors, rotates, crops or resizes the view, the intrinsics, the mask and the depth
-    prior have to change in the same way. The wrapper may drop the mask. The check uses a landscape
+    prior have to change in the same way. The wrapper may drop the mask, and must not modify the
+    prior of the wrapped provider. The check uses a landscape
     and a portrait view, because a wrapper may rotate only one of them.
     """
     provider = case.create_provider()
