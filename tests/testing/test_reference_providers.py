@@ -60,6 +60,7 @@ def spec(kind: Kind, name: str, *capabilities: str, options: str | None = None) 
                 "name-does-not-matter",
                 "large-view",
                 "panorama",
+                "few-colors",
                 "matcher-sizes",
                 "matcher-mixed-sizes",
                 "matcher-scores",
@@ -70,9 +71,9 @@ def spec(kind: Kind, name: str, *capabilities: str, options: str | None = None) 
         (
             spec("multiview", "ToldGroup", *EVERYTHING, options="ToldOptions"),
             told_group,
-            {"name-does-not-matter", "depth-channel-order", "depth-intrinsics"},
+            {"name-does-not-matter", "depth-channel-order", "depth-intrinsics", "few-colors"},
         ),
-        (spec("retrieval", "Thumbnail"), None, {"large-view", "panorama"}),
+        (spec("retrieval", "Thumbnail"), None, {"large-view", "panorama", "few-colors"}),
         (spec("mask", "PaintedMask"), PAINTED, set()),
         (
             spec("wrapper", "Wrapper", "wraps-depth", "wraps-normals"),
@@ -87,6 +88,7 @@ def spec(kind: Kind, name: str, *capabilities: str, options: str | None = None) 
                 "depth-joint",
                 "depth-focal",
                 "normals-away-from-axis",
+                "few-colors",
                 "normals-channel-order",
                 "normals-variance",
                 "normals-depth-input",
