@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+Parsed = TypeVar("Parsed")
 
 MAX_BYTES = 4_000_000_000
 """Maximum bytes of the unpacked arrays of an NPZ file, unless the file itself is larger.
@@ -49,10 +53,26 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
                     f"the file unpacks to {size / 1e6:.0f} megabytes, but only "
                     f"{MAX_BYTES / 1e6:.0f} are allowed"
                 )
-            file.seek(0)
-            with np.load(file, allow_pickle=False) as arrays:
-                return {name: arrays[name] for name in arrays.files}
+            return parse_arrays(partial(_read_arrays, file))
         except (OSError, ValueError):
             raise
         except Exception as error:  # zipfile and numpy raise unrelated exception classes
             raise ValueError(f"the NPZ file is damaged: {type(error).__name__}: {error}") from error
+
+
+def parse_arrays(read: Callable[[], Parsed]) -> Parsed:
+    """Call a function that reads arrays by numpy, twice if Python fails to parse their headers.
+
+    Python 3.11 and 3.12.0 may raise SystemError ("AST constructor recursion depth mismatch") if
+    several threads parse at the same time (CPython issue 106905).
+    """
+    try:
+        return read()
+    except SystemError:
+        return read()
+
+
+def _read_arrays(file: BinaryIO) -> dict[str, NDArray[Any]]:
+    file.seek(0)
+    with np.load(file, allow_pickle=False) as arrays:
+        return {name: arrays[name] for name in arrays.files}

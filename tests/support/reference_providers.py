@@ -31,6 +31,7 @@ from mpsfm_core.data import (
 from mpsfm_core.data.options import Options
 from mpsfm_core.geometry import pixel_centers, resize_map
 from mpsfm_core.providers import ProviderContext
+from mpsfm_core.support.npz import read_npz
 from mpsfm_core.testing.examples import Example, indoor_example
 from mpsfm_core.testing.painted_views import NORMALS_STD, RELATIVE_STD, read_depth, read_normals
 
@@ -136,10 +137,10 @@ class ToldMatcher:
         path = self.options.folder / f"{_name(view)}.npz"
         if not path.exists():
             return None
-        with np.load(path) as stored:
-            width, height, *intrinsics = stored["camera"].tolist()
-            camera = PinholeCamera(int(width), int(height), *intrinsics)
-            return replace(indoor_example("textured"), pose=stored["pose"], camera=camera)
+        stored = read_npz(path)
+        width, height, *intrinsics = stored["camera"].tolist()
+        camera = PinholeCamera(int(width), int(height), *intrinsics)
+        return replace(indoor_example("textured"), pose=stored["pose"], camera=camera)
 
     def matches(self, points_a: Float64, points_b: Float64) -> DenseMatches:
         """Return matches between exact positions."""
@@ -180,8 +181,8 @@ class ToldGroup:
         path = self.options.folder / f"group-{_name(view)}.npz"
         if not path.exists():
             return np.ones(view.image.shape[:2]), np.eye(3, 4), view.camera.params
-        with np.load(path) as stored:
-            return stored["depth"], stored["pose"], stored["intrinsics"]
+        stored = read_npz(path)
+        return stored["depth"], stored["pose"], stored["intrinsics"]
 
 
 class Wrapper:

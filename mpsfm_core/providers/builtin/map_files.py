@@ -16,7 +16,7 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.inputs.image_decoding import check_size, find_map_orientation, orient
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.providers.builtin.options import FileOptions
-from mpsfm_core.support.npz import read_npz
+from mpsfm_core.support.npz import parse_arrays, read_npz
 
 _SUFFIXES = (".npz", ".npy", ".exr", ".png", ".tif", ".tiff")
 _SINGLE_CHANNELS = ("Z", "Y", "depth.Z", "Depth.Z", "R", "V")
@@ -154,7 +154,9 @@ def _read_numpy(path: Path, main: str) -> dict[str, NDArray[Any]]:
     if path.suffix == ".npz":
         return read_npz(path)
     # Load the file into memory first, because numpy does not close a damaged file.
-    return {main: np.lib.format.read_array(io.BytesIO(path.read_bytes()), allow_pickle=False)}
+    data = path.read_bytes()
+    array = parse_arrays(lambda: np.lib.format.read_array(io.BytesIO(data), allow_pickle=False))
+    return {main: array}
 
 
 def _read_image(path: Path) -> NDArray[Any]:

@@ -9,7 +9,7 @@ from mpsfm_core.testing import ContractSetup
 
 _REAL = "sift-nn"
 _STAND_IN = "mpsfm_vismatch.stand_in"
-_SMALL = {"network": f"{_STAND_IN}:Matching", "resize": 96}
+_SMALL = {"network": f"{_STAND_IN}:Matching", "resize": 128}
 """Options of a matcher with small images, where comparing all pixels is fast."""
 _NOT_INVARIANT = {"matcher-sizes": "comparing patches is not invariant to scale"}
 _TOO_COARSE = {
