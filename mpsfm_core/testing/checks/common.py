@@ -322,10 +322,8 @@ def check_panorama(case: ContractCase) -> str:
     if not case.description.predicts_maps:
         raise CheckSkipped("the check applies to providers of maps only")
     width, height = case.example.camera.size
-    large = case.example.sized(2 * width, 2 * height)
-    row, column = height - height // 4, width // 2
-    wide = large.crop(0, row, 2 * width, 2 * width // _PANORAMA_RATIO)
-    tall = large.crop(column, 0, 2 * height // _PANORAMA_RATIO, 2 * height)
+    wide = case.example.crop(0, height // 4, width, width // _PANORAMA_RATIO)
+    tall = case.example.crop(width // 4, 0, height // _PANORAMA_RATIO, height)
     return " and ".join(_run_and_compare(case, example) for example in (wide, tall))
 
 
