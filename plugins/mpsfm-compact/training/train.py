@@ -61,8 +61,8 @@ def train(
     and a later call resumes from ``last.pt``.
     """
     torch.manual_seed(seed)
-    torch.backends.cudnn.benchmark = True
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    torch.backends.cudnn.benchmark = device.type == "cuda"
     shards = list(find_shards(data))
     training_shards = [s for s in shards if not any(name in s.name for name in held_out)]
     judged = [s for s in shards if s not in training_shards]
