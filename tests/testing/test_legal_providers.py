@@ -30,7 +30,6 @@ from mpsfm_core.providers import Capability, Kind
 from mpsfm_core.providers.builtin.mutual_nearest import mutual_nearest
 from mpsfm_core.providers.builtin.options import SiftOptions
 from mpsfm_core.providers.builtin.plugin import mpsfm_providers as builtin_providers
-from mpsfm_core.providers.builtin.sift import Sift
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import ContractSetup, run_checks
 from mpsfm_core.testing.contract import schedule_checks
@@ -42,6 +41,7 @@ from tests.support.reference_providers import (
     Wrapper,
     depth_prior,
 )
+from tests.support.sparse_providers import SiftDetector
 
 SLOW_CHECKS = {"second-process", "memory-released", "offline", "speed"}
 """Checks of the process, which are omitted because other tests cover them."""
@@ -145,9 +145,8 @@ class CoarseNormals:
         return NormalPrior.from_arrays(normals, camera=view.camera)
 
 
-class Detector(Sift):
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(SiftOptions(max_keypoints=2000), context)
+class Detector(SiftDetector):
+    sift_options = SiftOptions(max_keypoints=2000)
 
 
 class UprightPatches:

@@ -23,14 +23,19 @@ from mpsfm_core import (
     SparseMatches,
     View,
 )
-from mpsfm_core.providers.builtin.mutual_nearest import MutualNearest
-from mpsfm_core.providers.builtin.options import MutualNearestOptions, SiftOptions
+from mpsfm_core.providers.builtin.options import SiftOptions
 from mpsfm_core.providers.builtin.sift import Sift
 from mpsfm_core.testing import ContractSetup
 from mpsfm_core.testing.contract import check_id, list_checks
 from mpsfm_core.testing.painted_views import RELATIVE_STD, read_depth
 from tests.support import reference_providers as ref
-from tests.support.reference_providers import PaintedDepth, PaintedMask, Thumbnail, Wrapper
+from tests.support.reference_providers import (
+    PaintedDepth,
+    PaintedMask,
+    Thumbnail,
+    Wrapper,
+)
+from tests.support.sparse_providers import NearestMatcher, SiftDetector
 from tests.testing import (
     test_mutants_any_kind,
     test_mutants_camera,
@@ -192,9 +197,8 @@ def test_faulty_map_provider_fails_its_check(
     caught(kind, factory, check, message, setup, *capabilities)
 
 
-class Detector(Sift):
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(SiftOptions(max_keypoints=800), context)
+class Detector(SiftDetector):
+    sift_options = SiftOptions(max_keypoints=800)
 
     def select(self, features: Features, keep: np.ndarray) -> Features:
         assert features.scales is not None
@@ -261,10 +265,7 @@ def test_faulty_features_provider_fails_its_check(
     caught("features", factory, check, message)
 
 
-class Nearest(MutualNearest):
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(MutualNearestOptions(), context)
-
+class Nearest(NearestMatcher):
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
         sparse = super().match(a, b, fa, fb).sparse
         assert sparse is not None
@@ -321,11 +322,11 @@ class DistanceScores(Nearest):
         return slice(None), 1 - found.scores
 
 
-class DenseSift(MutualNearest):
+class DenseSift(NearestMatcher):
     """Correct dense matcher, which detects features inside."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(MutualNearestOptions(), context)
+        super().__init__(options, context)
         self.detector = Sift(SiftOptions(), context)
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:

@@ -23,19 +23,23 @@ from mpsfm_core import (
 )
 from mpsfm_core.geometry import pixel_centers
 from mpsfm_core.geometry import rays as view_rays
-from mpsfm_core.providers.builtin.mutual_nearest import MutualNearest
-from mpsfm_core.providers.builtin.options import MutualNearestOptions, SiftOptions
-from mpsfm_core.providers.builtin.sift import Sift
+from mpsfm_core.providers.builtin.options import SiftOptions
 from mpsfm_core.testing import ContractSetup
 from mpsfm_core.testing.examples import Example
-from tests.support.reference_providers import PaintedMask, Thumbnail, ToldMatcher, ToldOptions, tell
+from tests.support.reference_providers import (
+    PaintedMask,
+    Thumbnail,
+    ToldMatcher,
+    ToldOptions,
+    tell,
+)
+from tests.support.sparse_providers import NearestMatcher, SiftDetector
 
 PAINTED = ContractSetup(truth_source="painted")
 
 
-class Detector(Sift):
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(SiftOptions(max_keypoints=400), context)
+class Detector(SiftDetector):
+    sift_options = SiftOptions(max_keypoints=400)
 
 
 class RowsFirst(Detector):
@@ -97,10 +101,7 @@ def test_faulty_features_provider_fails_its_check(
     caught("features", factory, check, message)
 
 
-class Nearest(MutualNearest):
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(MutualNearestOptions(), context)
-
+class Nearest(NearestMatcher):
     def match(self, *arguments: Any) -> PairMatches:
         matches = super().match(*arguments)
         assert matches.sparse is not None
@@ -156,20 +157,14 @@ class Distances(Nearest):
         return SparseMatches(indices[keep], scores[keep])
 
 
-class WantsFeatures(MutualNearest):
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(MutualNearestOptions(), context)
-
+class WantsFeatures(NearestMatcher):
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
         if not (len(fa) and len(fb)):
             raise IndexError("index 0 is out of bounds for axis 0 with size 0")
         return super().match(a, b, fa, fb)
 
 
-class WantsTwoNeighbours(MutualNearest):
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(MutualNearestOptions(), context)
-
+class WantsTwoNeighbours(NearestMatcher):
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
         if len(fb) == 1:
             raise ValueError("kth(=1) out of bounds (1)")
@@ -338,11 +333,10 @@ def test_faulty_mask_provider_fails_its_check(
     caught("mask", factory, check, message, PAINTED)
 
 
-class NotScaledBack(Sift):
+class NotScaledBack(SiftDetector):
     """Fault: reduces views above 640 pixels and returns keypoints of the reduced image."""
 
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(SiftOptions(resize=640), context)
+    sift_options = SiftOptions(resize=640)
 
     def extract(self, view: View) -> Features:
         features = super().extract(view)
@@ -350,11 +344,10 @@ class NotScaledBack(Sift):
         return replace(features, keypoints=factor * features.keypoints)
 
 
-class ScaledFromPixelCenters(Sift):
+class ScaledFromPixelCenters(SiftDetector):
     """Fault: scales keypoints of a reduced image back as if pixel centers were integers."""
 
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(SiftOptions(resize=1024), context)
+    sift_options = SiftOptions(resize=1024)
 
     def extract(self, view: View) -> Features:
         features = super().extract(view)
@@ -389,19 +382,14 @@ def test_features_of_large_views(
     caught("features", factory, check, message)
 
 
-class GivenFeatures(MutualNearest):
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(MutualNearestOptions(), context)
-
-
-class LimitedMatcher(GivenFeatures):
+class LimitedMatcher(NearestMatcher):
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
         if max(len(fa), len(fb)) > 2048:
             raise ValueError("index 2048 is out of bounds")
         return super().match(a, b, fa, fb)
 
 
-class UnlocksDescriptors(GivenFeatures):
+class UnlocksDescriptors(NearestMatcher):
     """Fault: makes the descriptors of the given features writable, and normalizes them in place."""
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
@@ -411,7 +399,7 @@ class UnlocksDescriptors(GivenFeatures):
         return super().match(a, b, fa, fb)
 
 
-class IndexesBestFeatures(GivenFeatures):
+class IndexesBestFeatures(NearestMatcher):
     """Fault: returns indices into the 1024 features with the best scores."""
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
@@ -425,7 +413,7 @@ def _select_best(features: Features) -> Features:
     return Features(features.keypoints[rows], features.descriptors[rows])
 
 
-class ReversesScores(GivenFeatures):
+class ReversesScores(NearestMatcher):
     """Fault: reverses the scores if the names of the views are not in alphabetical order."""
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
@@ -435,7 +423,7 @@ class ReversesScores(GivenFeatures):
         return PairMatches(sparse=SparseMatches(found.sparse.indices, scores.copy()))
 
 
-class DropsRightSide(GivenFeatures):
+class DropsRightSide(NearestMatcher):
     """Fault: normalizes x by the height, and drops matches outside of the unit square."""
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:

@@ -20,8 +20,7 @@ from mpsfm_core import (
     SparseMatches,
     View,
 )
-from mpsfm_core.providers.builtin.mutual_nearest import MutualNearest
-from mpsfm_core.providers.builtin.options import MutualNearestOptions, SiftOptions
+from mpsfm_core.providers.builtin.options import SiftOptions
 from mpsfm_core.providers.builtin.sift import Sift
 from mpsfm_core.testing import ContractSetup
 from mpsfm_core.testing.painted_views import read_depth, read_normals
@@ -33,6 +32,7 @@ from tests.support.reference_providers import (
     depth_prior,
     normal_prior,
 )
+from tests.support.sparse_providers import NearestMatcher, SiftDetector
 
 PAINTED = ContractSetup(truth_source="painted")
 
@@ -171,11 +171,10 @@ def test_faulty_map_provider_fails_its_check(
     caught(kind, factory, check, message, setup, *capabilities)
 
 
-class Reduced(Sift):
+class Reduced(SiftDetector):
     """Detector that reduces the longer side of a view to 320 pixels."""
 
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(SiftOptions(max_keypoints=2000), context)
+    sift_options = SiftOptions(max_keypoints=2000)
 
     def extract(self, view: View) -> Features:
         scale = 320 / max(view.camera.size)
@@ -198,11 +197,10 @@ class IntegerCenters(Reduced):
         return (xy - 0.5) * factor + 0.5
 
 
-class KeepsTheWeakest(Sift):
+class KeepsTheWeakest(SiftDetector):
     """Fault: a limit keeps the keypoints with the lowest contrast."""
 
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(SiftOptions(max_keypoints=3000), context)
+    sift_options = SiftOptions(max_keypoints=3000)
 
     def extract(self, view: View) -> Features:
         found = super().extract(view)
@@ -216,11 +214,10 @@ class KeepsTheWeakest(Sift):
         return Features(found.keypoints[keep], found.descriptors[keep])
 
 
-class SortsManyDescriptors(Sift):
+class SortsManyDescriptors(SiftDetector):
     """Fault: sorts keypoints but no descriptors if there are more than 1500 keypoints."""
 
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(SiftOptions(max_keypoints=3000), context)
+    sift_options = SiftOptions(max_keypoints=3000)
 
     def extract(self, view: View) -> Features:
         found = super().extract(view)
@@ -244,12 +241,7 @@ def test_faulty_features_provider_fails_its_check(
     caught("features", factory, check, message)
 
 
-class Given(MutualNearest):
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(MutualNearestOptions(), context)
-
-
-class DummyMatch(Given):
+class DummyMatch(NearestMatcher):
     """Fault: clips the index of a missing match to the last feature, with a score of 1."""
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
@@ -262,7 +254,7 @@ class DummyMatch(Given):
         return PairMatches(SparseMatches(indices, np.append(found.scores, np.float32(1))))
 
 
-class SortedScores(Given):
+class SortedScores(NearestMatcher):
     """Fault: sorts the scores without the matches."""
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
@@ -271,7 +263,7 @@ class SortedScores(Given):
         return PairMatches(SparseMatches(found.indices, np.sort(found.scores)[::-1].copy()))
 
 
-class Coordinates8(Given):
+class Coordinates8(NearestMatcher):
     """Fault: drops matches whose coordinates exceed 1024 pixels."""
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
@@ -281,7 +273,7 @@ class Coordinates8(Given):
         return PairMatches(SparseMatches(found.indices[inside], found.scores[inside]))
 
 
-class DenseSift(Given):
+class DenseSift(NearestMatcher):
     """Dense matcher of SIFT features."""
 
     std_px = 1.0

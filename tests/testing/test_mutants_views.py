@@ -29,8 +29,7 @@ from mpsfm_core import (
 )
 from mpsfm_core.data import Float64, PairDepth, PinholeCamera
 from mpsfm_core.providers import WeightsFile
-from mpsfm_core.providers.builtin.mutual_nearest import MutualNearest
-from mpsfm_core.providers.builtin.options import MutualNearestOptions, SiftOptions
+from mpsfm_core.providers.builtin.options import SiftOptions
 from mpsfm_core.providers.builtin.sift import Sift
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import ContractSetup, run_checks
@@ -47,6 +46,7 @@ from tests.support.reference_providers import (
     depth_prior,
     normal_prior,
 )
+from tests.support.sparse_providers import NearestMatcher, SiftDetector
 from tests.testing.test_mutants_multiview import EVERYTHING, told
 
 PAINTED = ContractSetup(truth_source="painted")
@@ -227,12 +227,7 @@ def test_faulty_map_provider_fails_its_check(
     logging.getLogger("mpsfm_core").setLevel(level)
 
 
-class Detector(Sift):
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(SiftOptions(), context)
-
-
-class StretchesContrast(Detector):
+class StretchesContrast(SiftDetector):
     """Fault: makes the image of a view writable, and stretches its contrast in place."""
 
     def extract(self, view: View) -> Features:
@@ -243,7 +238,7 @@ class StretchesContrast(Detector):
         return super().extract(view)
 
 
-class HalfPrecision(Detector):
+class HalfPrecision(SiftDetector):
     """Fault: keypoints in half precision are rounded to 2 pixels beyond 2048 pixels."""
 
     def extract(self, view: View) -> Features:
@@ -252,7 +247,7 @@ class HalfPrecision(Detector):
         return replace(features, keypoints=np.minimum(rounded, view.camera.size))
 
 
-class TilesWithoutOverlap(Detector):
+class TilesWithoutOverlap(SiftDetector):
     """Fault: the offset of tiles of 512 pixels ignores that they overlap by 32 pixels."""
 
     def extract(self, view: View) -> Features:
@@ -280,7 +275,7 @@ def reduced(view: View, limit: int) -> tuple[View, Float64]:
     return View(view.name, small, camera), view.camera.size / size
 
 
-class ConstantScales(Detector):
+class ConstantScales(SiftDetector):
     """Fault: the scale of all keypoints is in pixels of the reduced image."""
 
     def extract(self, view: View) -> Features:
@@ -290,7 +285,7 @@ class ConstantScales(Detector):
         return replace(features, keypoints=features.keypoints * factors, scales=scales)
 
 
-class OneFactor(Detector):
+class OneFactor(SiftDetector):
     """Fault: rounds the reduced sides to multiples of 32, and scales both by one factor."""
 
     def extract(self, view: View) -> Features:
@@ -304,7 +299,7 @@ class OneFactor(Detector):
         return features.select((features.keypoints <= view.camera.size).all(axis=1))
 
 
-class SwapsTall(Detector):
+class SwapsTall(SiftDetector):
     def extract(self, view: View) -> Features:
         features = super().extract(view)
         if view.camera.height < 1.8 * view.camera.width:
@@ -314,7 +309,7 @@ class SwapsTall(Detector):
         )
 
 
-class DropsVisible(Detector):
+class DropsVisible(SiftDetector):
     """Fault: drops the keypoints where the mask of the view is True."""
 
     def extract(self, view: View) -> Features:
@@ -343,11 +338,11 @@ def test_faulty_features_provider_fails_its_check(
     caught("features", factory, check, message)
 
 
-class ReducingMatcher(MutualNearest):
+class ReducingMatcher(NearestMatcher):
     """Dense matcher that reduces both views to 1024 pixels."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(MutualNearestOptions(), context)
+        super().__init__(options, context)
         self.detector = Sift(SiftOptions(), context)
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
@@ -405,11 +400,8 @@ def test_faulty_dense_matcher_fails_its_check(
     caught("matcher", factory, check, message, None, "dense")
 
 
-class DropsBeyondFirst(MutualNearest):
+class DropsBeyondFirst(NearestMatcher):
     """Fault: drops matches whose position in the second view is beyond the size of the first."""
-
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(MutualNearestOptions(), context)
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
         found = super().match(a, b, fa, fb).sparse
@@ -562,7 +554,7 @@ class ReducesImageOnly(CallsTwice):
 
 
 class ChangesPrior(Wrapper):
-    """Fault: makes the variance of the wrapped provider writable, and doubles the std in place."""
+    """Fault: doubles the std in the arrays of the wrapped provider, instead of a copy."""
 
     def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
         prior = super().predict(view, depth)
