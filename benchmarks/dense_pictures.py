@@ -2,15 +2,15 @@
 
     python -m benchmarks.dense_pictures [--scenes room street_0 ...] [--output DIR]
 
-The scenes are generated streets (:mod:`benchmarks.street`) and the sample scene. A picture shows
-the cloud without and with the removal of points that no other view confirms or that are next to
-depth edges (``dense.check_validity``), and the textured mesh, from a camera beside the photos.
+The scenes are the sample scene and the generated streets of :mod:`benchmarks.street`. A picture
+shows, from left to right, the point cloud with the option ``dense.check_validity`` off, the point
+cloud with the option on, and the textured mesh. The option removes points that no other view
+confirms, and points next to depth edges.
 """
 
 from __future__ import annotations
 
 import argparse
-import zlib  # noqa: F401, because zlib fails if pycolmap, which has its own, is imported first
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -30,6 +30,7 @@ from mpsfm_core.evaluation.rendering import Geometry, render
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+from mpsfm_core.testing.synthetic.scenes import look_at
 
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE_SCENE = ROOT / "examples" / "sample_scene"
@@ -41,7 +42,6 @@ WIDTH = 366
 MOVED = {"back": 0.3, "right": 0.35, "up": 0.25}
 """Distance of the rendered camera from the middle photo, relative to the median depth."""
 _QUALITY = 80
-_MAX_TEXTURE_SIZE = 4096
 
 
 class Scene(NamedTuple):
@@ -54,7 +54,7 @@ class Scene(NamedTuple):
 
 
 def main() -> None:
-    """Parse the command line and write one picture per scene."""
+    """Write a picture of each scene that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--scenes", nargs="+", default=SCENES, choices=SCENES, metavar="SCENE")
     parser.add_argument("--output", type=Path, default=ROOT / "docs" / "pictures")
@@ -84,17 +84,18 @@ def _reconstruct_sample_scene() -> Scene:
 
 
 def draw_scene(scene: Scene) -> UInt8:
-    """Render the clouds without and with validity, and the textured mesh, side by side."""
+    """Render the cloud with all points, the cloud without doubtful points, and the mesh."""
     camera, pose = _place_camera(scene)
     renderings = []
     for check_validity in (False, True):
-        options = DenseOptions(check_validity=check_validity)
-        dense, _ = densify(scene.reconstruction, scene.view_of, options)
+        dense_options = DenseOptions(check_validity=check_validity)
+        dense, _ = densify(scene.reconstruction, scene.view_of, dense_options)
         cloud = fuse_depth_maps(dense, scene.view_of)
         none = np.zeros((0, 3), np.int64)
         renderings.append(render(Geometry(cloud.points, cloud.colors, none), camera, pose))
-    mesh = mesh_depth_maps(dense, scene.view_of, MeshOptions())
-    textured = build_texture(mesh, dense, scene.view_of, _MAX_TEXTURE_SIZE)
+    options = MeshOptions()
+    mesh = mesh_depth_maps(dense, scene.view_of, options)
+    textured = build_texture(mesh, dense, scene.view_of, options.max_texture_size)
     gray = np.full((len(textured.vertices), 3), 128, np.uint8)
     surface = Geometry(textured.vertices, gray, textured.triangles, textured.uv, textured.texture)
     renderings.append(render(surface, camera, pose))
@@ -112,16 +113,8 @@ def _place_camera(scene: Scene) -> tuple[PinholeCamera, Pose]:
     target = camera_center(image.rotation, image.translation) + depth * forward
     offset = MOVED["right"] * right + MOVED["up"] * up - (1 + MOVED["back"]) * forward
     size = WIDTH, round(WIDTH * image.camera.height / image.camera.width)
-    return image.camera.resized(*size), _look_at(target + depth * offset, target, up)
-
-
-def _look_at(eye: Float64, target: Float64, up: Float64) -> Pose:
-    """Return the pose of an upright camera at ``eye`` that looks at ``target``."""
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    rotation = np.stack([right, np.cross(forward, right), forward])
-    return rotation, -rotation @ eye
+    pose = look_at(target + depth * offset, target, up)
+    return image.camera.resized(*size), (pose[:, :3], pose[:, 3])
 
 
 if __name__ == "__main__":

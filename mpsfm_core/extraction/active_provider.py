@@ -80,6 +80,11 @@ class ActiveProvider:
         return all(block["code"] is not None for block in self.identity["providers"])
 
     @property
+    def is_cached(self) -> bool:
+        """True if all results of the provider are in the cache for later runs and workers."""
+        return self.is_reusable and not self.can("uncached")
+
+    @property
     def instance(self) -> Any:
         """Provider instance of the calling thread."""
         if not hasattr(self._local, "provider"):

@@ -87,9 +87,7 @@ class ExtractionContext:
             remote_items: Small descriptions of the items, which are sent to remote workers instead.
         """
         workers = min((p.workers for p in providers), default=worker_count(self.config.runtime))
-        is_cached = (providers or remote_items is not None) and all(
-            provider.is_reusable and not provider.can("uncached") for provider in providers
-        )
+        is_cached = (providers or remote_items is not None) and all(p.is_cached for p in providers)
         ahead = (
             self.run_remotely(stage, items if remote_items is None else remote_items)
             if self.run_remotely and is_cached and not local

@@ -56,7 +56,7 @@ class FeatureTable:
 
     def key(self, index: int) -> str:
         """Return the cache key of the features of an image."""
-        if self._provider.can("uncached") or not self._provider.is_reusable:
+        if not self._provider.is_cached:
             return digest(self[index])
         return self._context.key(self._provider, self._context.view_inputs(index, self._provider))
 

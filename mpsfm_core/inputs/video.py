@@ -239,6 +239,13 @@ def read_selection(folder: Path) -> VideoSelection:
         ) from error
 
 
+def require_output_folder(path: Path, output: Path | None) -> Path:
+    """Return the output folder for the frames of a video, or raise :class:`InputError` for None."""
+    if output is None:
+        raise InputError(f"{path}: the frames of a video need an output folder")
+    return output
+
+
 def choose_frames(
     video: Path, options: VideoOptions, progress: Progress | None = None
 ) -> VideoSelection:

@@ -56,6 +56,8 @@ def remove_matches_across(
 
     Pairs of keyframes with less than :data:`NUM_NEIGHBORS` keyframes in between remain.
     """
+    if not jumps:
+        return problem
     places = {
         name: (number, place)
         for number, shot in enumerate(shots)

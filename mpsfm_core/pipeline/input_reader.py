@@ -14,6 +14,7 @@ from mpsfm_core.data import Pose, Rig
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.data.result_layout import CUT_VIEWS, IMAGES, MASKS_OF_VIEWS
 from mpsfm_core.inputs.image_search import (
+    MAX_LISTED,
     check_images_folder,
     check_output_folder,
     find_images,
@@ -30,7 +31,12 @@ from mpsfm_core.inputs.matches import (
 from mpsfm_core.inputs.models import Poses, describe_name_difference, match_names, read_poses
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.inputs.rigs import read_rigs
-from mpsfm_core.inputs.video import VideoSelection, extract_frames, read_selection
+from mpsfm_core.inputs.video import (
+    VideoSelection,
+    extract_frames,
+    read_selection,
+    require_output_folder,
+)
 from mpsfm_core.inputs.view_cutting import (
     MAX_FIELD_OF_VIEW_DEG,
     CutImages,
@@ -41,7 +47,6 @@ from mpsfm_core.inputs.view_cutting import (
 from mpsfm_core.pipeline.stages import Stages
 
 _log = logging.getLogger(__name__)
-_MAX_LISTED_NAMES = 5
 
 
 @dataclass(frozen=True)
@@ -108,8 +113,8 @@ class InputReader:
         self.videos = find_videos(path, self._output)
         if not self.videos:
             check_images_folder(path, self._output)
-        elif self._output is None:
-            raise InputError(f"{path}: the frames of a video need an output folder")
+        else:
+            require_output_folder(path, self._output)
 
     def extract_video_frames(self) -> None:
         """Write keyframes of videos to the output folder, and use the keyframes as images."""
@@ -288,6 +293,6 @@ def _read_known_poses(
     unmatched = sorted(poses.keys() - set(matched.values()))
     if unmatched:
         text = "%s: %d of its %d images are not among the photos: %s"
-        listed = ", ".join(unmatched[:_MAX_LISTED_NAMES])
+        listed = ", ".join(unmatched[:MAX_LISTED])
         _log.warning(text, model, len(unmatched), len(poses), listed)
     return {name: poses[model_name] for name, model_name in matched.items()}

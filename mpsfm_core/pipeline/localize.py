@@ -34,7 +34,12 @@ from mpsfm_core.inputs.image_search import check_output_folder, find_images
 from mpsfm_core.inputs.images import ImageSet, SourceImage, load_images
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.models import reconstruction_poses
-from mpsfm_core.inputs.video import extract_frames, is_video, read_selection
+from mpsfm_core.inputs.video import (
+    extract_frames,
+    is_video,
+    read_selection,
+    require_output_folder,
+)
 from mpsfm_core.mapping.localization import (
     FixedModel,
     LocalizedImage,
@@ -188,16 +193,14 @@ def localize(
                 check_output_folder(folder, Path(photos))
             stack.enter_context(lock_output_folder(folder))
         video = Path(photos) if is_video(Path(photos)) else None
-        if video is not None and folder is None:
-            raise InputError(f"{video}: the frames of a video need an output folder")
+        frames_folder = None if video is None else require_output_folder(video, folder)
         source = ExportSource.read(Path(model), None if images is None else Path(images))
         with stages.stage("providers"):
             config = config.model_copy(update={"fast_pass": None})
             config = resolve_providers(config, registry, stages).config
         run = _Localization(source, config, registry, stages)
-        if video is not None:
-            assert folder is not None
-            photos, sequence = run.extract_keyframes(video, folder), True
+        if video is not None and frames_folder is not None:
+            photos, sequence = run.extract_keyframes(video, frames_folder), True
         queries = run.load_queries(Path(photos), given_cameras)
         if extend:
             _require_new_names(source, queries)

@@ -89,7 +89,6 @@ _log = logging.getLogger(__name__)
 _MIN_DISTORTION = 0.1
 """Relative displacement of the image corners by lens distortion from which depth is predicted again
 in undistorted images. [tuned: benchmarks.distortion]"""
-_MAX_LISTED_NAMES = 5
 _MAX_JUMP_RUNS = 3
 """Maximum number of mapper runs without matches of look-alike places in a video. [ours]"""
 

@@ -110,7 +110,7 @@ class PairMatcher:
     @property
     def is_cached(self) -> bool:
         """True if all results of the matchers are in the cache."""
-        return all(p.is_reusable and not p.can("uncached") for p in self._providers)
+        return all(provider.is_cached for provider in self._providers)
 
     def match_pair(self, pair: Pair, located: LocatedFeatures) -> CandidateMatches:
         """Match an image pair with the features of all images, whose descriptors may be empty."""

@@ -76,10 +76,8 @@ class AbsolutePoseEstimator:
             options = options.model_copy(update={"estimate_focal": False})
         estimate = partial(estimate_candidate_poses, options=options, seed=seed, attempt=attempt)
         poses = estimate(self.scene, correspondences)
-        image, reference = (
-            correspondences.image,
-            find_reverse_reference(self.scene, correspondences),
-        )
+        image = correspondences.image
+        reference = find_reverse_reference(self.scene, correspondences)
         if reference is None:
             return poses
         with reverse_registration(self.scene, image, reference, options) as reverse:

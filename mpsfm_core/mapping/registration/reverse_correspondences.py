@@ -34,7 +34,7 @@ def find_reverse_reference(scene: Scene, correspondences: PoseCorrespondences) -
         depth of the new frame has no metric scale.
     """
     maps, image = scene.maps, correspondences.image
-    if not len(correspondences.keypoints) or not maps[image].prior.metric:
+    if not (scene.rigs.exist and len(correspondences.keypoints) and maps[image].prior.metric):
         return None
     reference = int(np.bincount(correspondences.frames(scene)).argmax())
     has_rig = any(len(scene.rigs.images_of(k)) > 1 for k in (image, reference))

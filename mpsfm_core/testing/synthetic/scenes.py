@@ -294,15 +294,15 @@ def project(
     return np.nan_to_num(geometry.project(camera, local), nan=0.0), local[:, 2]
 
 
-def look_at(eye: ArrayLike, target: ArrayLike) -> Float64:
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Float64:
     """Return ``cam_from_world`` (3, 4) of an upright camera at ``eye`` that looks at ``target``.
 
-    The viewing direction from ``eye`` to ``target`` must not be vertical.
+    The viewing direction from ``eye`` to ``target`` must not be parallel to ``up``.
     """
     position = np.asarray(eye, np.float64)
     forward = np.asarray(target, np.float64) - position
     forward /= np.linalg.norm(forward)
-    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right = np.cross(forward, np.asarray(up, np.float64))
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     return np.column_stack([rotation, -rotation @ position])
