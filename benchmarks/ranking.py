@@ -57,7 +57,8 @@ class Case(NamedTuple):
     problem: MappingProblem
     truth: Poses
     room: tuple[int, ...] = ()
-    """For the scene of two rooms: number of the room of each image, -1 in the corridor."""
+    """Number of the room in which each image was taken, -1 for the corridor; empty for all scenes
+    except the one with two rooms."""
 
 
 def rotate(pose: Pose, axis: Float64, angle_deg: float, center: Float64) -> Pose:

@@ -381,7 +381,7 @@ def _evaluate_model(folder: Path, poses: Mapping[int, Pose], is_loop: bool) -> R
 
 
 def measure_loop_error(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> float | None:
-    """Measure the median error of the keyframes after the first round of a walk, in meters.
+    """Measure how far the camera positions of the second round are off, in meters (median).
 
     The model is aligned with the true poses of the keyframes at the start of the first round, so
     the error is the drift of one round if the loop is not closed.

@@ -40,10 +40,10 @@ from mpsfm_core.support.npz import read_npz
 from mpsfm_core.support.threads import limit_threads
 
 MAX_WHOLE_IMAGES = 2000
-"""Number of images above which workers map parts, if the size of parts is ``auto``. Four workers
-then save more time than they need to start. [tuned: benchmarks.scale]"""
+"""Number of images above which workers map parts, if ``mapping.parts`` is ``auto``. Four workers
+then save more time than their start takes. [tuned: benchmarks.scale]"""
 AUTO_PART_IMAGES = 500
-"""Number of images per part if the size of parts is ``auto``. [tuned: benchmarks.scale]"""
+"""Number of images in each part if ``mapping.parts`` is ``auto``. [tuned: benchmarks.scale]"""
 _STEP = "parts"
 _NEVER_S = 1e9
 """Seconds between checkpoints if only completed parts are stored."""
@@ -136,7 +136,7 @@ class PartMapper:
 
 @dataclass(frozen=True)
 class PartRecord:
-    """Time and memory of the mapping of a part, for ``summary.json``."""
+    """Time and memory that one part took; ``summary.json`` lists the records of all parts."""
 
     images: int
     seconds: float

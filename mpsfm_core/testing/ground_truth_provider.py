@@ -94,7 +94,7 @@ class GroundTruth:
         return depth, read_normals(view.image), depth > 0, spread
 
     def record(self, prior: DepthPrior | NormalPrior) -> None:
-        """Store a returned prior while a wrapper is checked, to detect that it is modified."""
+        """Store a copy of a returned prior, by which a check finds out if a wrapper modifies it."""
         if self.mask is not None:
             self.returned.append((prior, pickle.dumps(prior)))
 

@@ -663,7 +663,11 @@ def _noise_views(
 
 
 def _require_true_scale(matches: DenseMatches, shift: Float64, where: str) -> str:
-    """Require scale 1 and the true shift of matches, or return "" if the matches do not agree."""
+    """Require that matches between two views of equal scale have the true shift.
+
+    Returns:
+        Text with the ratio of correct matches, or "" if too few matches agree on a scale and shift.
+    """
     if len(matches) < 2 * MIN_MATCHES:
         return ""
     limit = MATCH_TOLERANCE_STD * max(1.0, matches.std_px)

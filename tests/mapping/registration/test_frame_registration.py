@@ -51,7 +51,7 @@ def keep_matches(problem: MappingProblem, max_matches: int) -> MappingProblem:
 
 
 def register_first_frame(rig_problem: RigProblem, problem: MappingProblem) -> Scene:
-    """Return a scene in which the first frame is registered in its true pose."""
+    """Return a scene that has only the first frame of the rig registered, in its true pose."""
     scene, (pose, *_) = Scene(problem), rig_problem.poses
     scene.register(0, pose[:, :3], pose[:, 3])
     scene.maps[0].set_scale(1.0)
