@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple, TypeVar
 
 import numpy as np
@@ -108,17 +109,53 @@ def fuse_depth_maps(
     return FusedPointCloud(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def compute_consistent_masks(
+def count_consistent_views(images: Sequence[RegisteredImage]) -> list[UInt8]:
+    """Count the images (h, w) that are consistent with each pixel, including its own image.
+
+    The count is 0 at pixels with large depth std and at inconsistent pixels, which the cloud omits.
+    """
+
+    def build_counts(row: int, pixels: Int64, votes: _ConsistencyVotes) -> UInt8:
+        counts = np.zeros(images[row].depth.shape, np.uint8)
+        counts.ravel()[pixels[votes.consistent]] = votes.views[votes.consistent]
+        return counts
+
+    return _vote_on_images(images, build_counts)
+
+
+def find_seen_through(
     images: Sequence[RegisteredImage],
+    measured: Sequence[Bool],
+    pixels: Sequence[Bool],
+    max_relative_std: float,
 ) -> list[Bool]:
-    """Compute for each image the mask (h, w) of pixels with low depth std and consistent depth."""
+    """Find the pixels through which more images see than measure a surface at their depth.
 
-    def build_mask(row: int, pixels: Int64, votes: _ConsistencyVotes) -> Bool:
-        mask = np.zeros(images[row].depth.shape, np.bool_)
-        mask.ravel()[pixels[votes.consistent]] = True
-        return mask
+    Args:
+        images: Images with confirmed poses.
+        measured: Mask (h, w) of the pixels of each image that vote.
+        pixels: Mask (h, w) of the tested pixels of each image.
+        max_relative_std: Maximum relative depth std of the tested pixels; larger stds are reduced.
+    """
+    neighbors = select_source_views(images, _MAX_NEIGHBORS)
+    voting = [
+        replace(image, depth=replace(image.depth, valid=mask))
+        for image, mask in zip(images, measured, strict=True)
+    ]
 
-    return _vote_on_images(images, build_mask)
+    def find_in_image(row: int) -> Bool:
+        tested = np.flatnonzero(pixels[row])
+        points, variance = _unproject_pixels(images[row], tested)
+        variance = np.minimum(
+            variance, (max_relative_std * images[row].depth.depth.ravel()[tested]) ** 2
+        )
+        voters = [(voting[j], measured[j], False) for j in neighbors[row]]
+        votes = _vote_on_points(points, variance, voters, _MAX_DIFFERENCE_STDS)
+        seen_through = np.zeros(pixels[row].shape, np.bool_)
+        seen_through.ravel()[tested[~votes.consistent]] = True
+        return seen_through
+
+    return parallel_map(find_in_image, range(len(images)))
 
 
 def _vote_on_images(

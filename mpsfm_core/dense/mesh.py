@@ -3,9 +3,9 @@
 Depth maps are integrated into a truncated signed distance field (TSDF) with inverse-variance
 weights [Curless and Levoy, SIGGRAPH 1996]. Distances along z are converted to distances along the
 surface normal, so that surfaces at grazing angles have no holes. Pixels in closed holes
-(:mod:`~mpsfm_core.dense.hole_filling`) only have an effect where nothing is measured. TSDF blocks
-exist only around surfaces, so that memory does not grow with the volume. Marching cubes of
-scikit-image extracts the triangles.
+(:mod:`~mpsfm_core.dense.hole_filling`) only have an effect where nothing is measured and no other
+image sees through them. TSDF blocks exist only around surfaces, so that memory does not grow with
+the volume. Marching cubes of scikit-image extracts the triangles.
 """
 # mypy: allow-untyped-decorators
 
@@ -22,8 +22,8 @@ from scipy.sparse.csgraph import connected_components
 from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.depth_sampling import compute_slant, interpolate_depth, sample_depth
-from mpsfm_core.dense.fusion import compute_consistent_masks
-from mpsfm_core.dense.hole_filling import find_closable_holes
+from mpsfm_core.dense.fusion import count_consistent_views, find_seen_through
+from mpsfm_core.dense.hole_filling import MAX_STEP, find_closable_holes
 from mpsfm_core.dense.mesh_visibility import find_observed_triangles
 from mpsfm_core.dense.options import MeshOptions
 from mpsfm_core.geometry import (
@@ -157,11 +157,17 @@ def mesh_depth_maps(
     """
     marching_cubes, simplify = _import_libraries()
     images = reconstruction.dense_images
-    masks = compute_consistent_masks(images)
+    counts = count_consistent_views(images)
+    confirmed = [views > 1 for views in counts]
+    holes = [
+        find_closable_holes(image.depth, mask, options.max_hole_px) & (views == 0)
+        for image, mask, views in zip(images, confirmed, counts, strict=True)
+    ]
+    seen_through = find_seen_through(images, confirmed, holes, MAX_STEP)
     maps = [
-        _weight_depth(image, mask, options.max_hole_px)
-        for image, mask in zip(images, masks, strict=True)
-        if mask.any()
+        _weight_depth(image, views > 0, hole & ~open_space)
+        for image, views, hole, open_space in zip(images, counts, holes, seen_through, strict=True)
+        if views.any()
     ]
     if not maps:
         raise InputError(
@@ -215,14 +221,13 @@ def _import_libraries() -> tuple[Any, Any]:
     return marching_cubes, simplify
 
 
-def _weight_depth(image: RegisteredImage, mask: Bool, max_hole_px: float) -> _WeightedDepth:
-    """Weight the pixels of a mask by their variance, and close narrow holes of the mask."""
+def _weight_depth(image: RegisteredImage, mask: Bool, filled: Bool) -> _WeightedDepth:
+    """Weight the pixels of a mask by their variance, and add the pixels in closed holes."""
     height, width = image.depth.shape
     variance = image.depth.variance
     assert variance is not None  # The mapper's refined depth maps always have a variance.
     min_variance = np.finfo(np.float32).tiny
     weight = np.where(mask, 1 / np.maximum(variance, min_variance), 0).astype(np.float32)
-    filled = find_closable_holes(image.depth, mask, max_hole_px)
     weight[filled] = _FILLED_WEIGHT_RATIO * weight[mask].min()
     depth = np.where(mask | filled, image.depth.depth, 0).astype(np.float32)
     intrinsics = image.camera.resized(width, height).params

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 from mpsfm_core.cli import build_app
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import InputError
+from mpsfm_core.dense.fusion import find_seen_through
 from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
 from mpsfm_core.dense.mesh_visibility import find_observed_triangles
 from mpsfm_core.dense.options import MeshOptions
@@ -125,13 +126,13 @@ def hole_distance(room: Room, points: np.ndarray) -> np.ndarray:
 
 
 def with_hole(room: Room, step: float = 1.0) -> Reconstruction:
-    """Return true depth with a hole of unknown std, 16 pixels wide, and a depth step around it."""
+    """Return true depth with an uncertain hole, 16 pixels wide, and a depth step around it."""
     distance = hole_distance(room, surface(room)).reshape(-1, CAMERA.height, CAMERA.width)
     images = []
     for image, hole in zip(measured(room, std=0.0).images, distance < 1, strict=True):
         depth, variance = image.depth.depth.copy(), np.asarray(image.depth.variance).copy()
         depth[hole] *= step
-        variance[hole] = depth[hole] ** 2
+        variance[hole] = (0.3 * depth[hole]) ** 2
         images.append(replace(image, depth=DepthPrior.from_arrays(depth, variance)))
     return replace(room.reconstruction, images=tuple(images))
 
@@ -154,6 +155,17 @@ def test_mesh_does_not_close_wide_hole_or_hole_with_step(
     options = MeshOptions(max_hole_px=max_hole_px)
     mesh = mesh_depth_maps(with_hole(room, step), room.views.__getitem__, options)
     assert (hole_distance(room, mesh.vertices) > 0.7).all()
+
+
+def test_find_seen_through_nearer_pixels_than_surface_excluded(room: Room) -> None:
+    images = list(measured(room, std=0.0).images)
+    masks = [np.ones(image.depth.shape, np.bool_) for image in images]
+    assert np.mean(find_seen_through(images, masks, masks, 0.02)[0]) < 0.1
+    near = images[0].depth.depth.copy()
+    near[10:20, 40:60] *= 0.8
+    images[0] = replace(images[0], depth=DepthPrior.from_arrays(near, (0.3 * near) ** 2))
+    seen_through = find_seen_through(images, masks, masks, 0.02)[0]
+    assert seen_through[10:20, 40:60].mean() > 0.9
 
 
 def test_mesh_without_valid_pixels_raises(room: Room) -> None:
