@@ -165,7 +165,7 @@ def extract_features(
     with _extraction(images, config, registry, ("features", "masks"), on_event) as context:
         assert context.config.features is not None
         table = FeatureTable(context, context.config.features)
-        table.extract()
+        table.extract(range(len(images)))
     return FeatureSet(images.names, table, context.config.features)
 
 

@@ -70,7 +70,7 @@ class MappingImage:
     """Pose ``cam_from_group`` that a multi-view network predicts, in the unit of its depth maps."""
     duplicate_of: str | None = None
     """Name of an earlier image with the same view (a copy, an exposure bracket or a frame of a
-    camera at rest), or None."""
+    camera at rest), which has the same keypoints, or None."""
 
     def __post_init__(self) -> None:
         require_array(self, "keypoints", np.float64, (None, 2))
@@ -220,6 +220,24 @@ class MappingProblem:
     def num_keypoints(self, image: int) -> int:
         """Return the number of keypoints of an image."""
         return len(self.images[image].keypoints)
+
+    @property
+    def originals(self) -> dict[int, int]:
+        """Index of the original image by index of the duplicate."""
+        row_of = {image.name: row for row, image in enumerate(self.images)}
+        return {
+            row: row_of[image.duplicate_of]
+            for row, image in enumerate(self.images)
+            if image.duplicate_of in row_of
+        }
+
+    @property
+    def distinct_pairs(self) -> tuple[VerifiedPair, ...]:
+        """Verified pairs of images that are no duplicates."""
+        originals = self.originals
+        return tuple(
+            p for p in self.pairs if p.image_a not in originals and p.image_b not in originals
+        )
 
     def frame_of_images(self) -> Int64:
         """Return the frame (n,) of each image, as the index of the first image of the frame."""

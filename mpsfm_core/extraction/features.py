@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -26,8 +26,8 @@ NO_FEATURES = Features(np.empty((0, 2)), np.empty((0, 0), dtype=np.float32))
 class FeatureSource(Protocol):
     """Features of the images of a run, by image index."""
 
-    def extract(self) -> list[Features]:
-        """Return the features of all images, possibly without descriptors to save memory."""
+    def extract(self, images: Sequence[int]) -> list[Features]:
+        """Return the features of images, possibly without descriptors to save memory."""
 
     def __getitem__(self, index: int) -> Features:
         """Return the features of an image with descriptors."""
@@ -46,9 +46,8 @@ class FeatureTable:
             CACHED_BYTES, lambda f: f.descriptors.nbytes
         )
 
-    def extract(self) -> list[Features]:
-        """Compute features of all images; return them without descriptors, to limit memory."""
-        images = range(len(self._context.images))
+    def extract(self, images: Sequence[int]) -> list[Features]:
+        """Compute features of images; return them without descriptors, to limit memory."""
         return self._context.each("features", images, self._without_descriptors, self._provider)
 
     def __getitem__(self, index: int) -> Features:
@@ -78,6 +77,32 @@ class FeatureTable:
         if mask is None:
             return features
         return features.select(sample_nearest(mask, features.keypoints))
+
+
+class SharedFeatures:
+    """Feature source in which duplicates have the features of their originals.
+
+    Args:
+        source: Features of the originals.
+        originals: Index of the original image by index of the duplicate.
+    """
+
+    def __init__(self, source: FeatureSource, originals: Mapping[int, int]) -> None:
+        self._source = source
+        self._originals = originals
+
+    def extract(self, images: Sequence[int]) -> list[Features]:
+        """Return the features of images; the features of a duplicate are not computed."""
+        distinct = sorted({self._originals.get(index, index) for index in images})
+        features = dict(zip(distinct, self._source.extract(distinct), strict=True))
+        return [features[self._originals.get(index, index)] for index in images]
+
+    def __getitem__(self, index: int) -> Features:
+        return self._source[self._originals.get(index, index)]
+
+    def key(self, index: int) -> str:
+        """Return a text that identifies the features of an image in cache keys."""
+        return self._source.key(self._originals.get(index, index))
 
 
 class FeatureSet(Mapping[str, Features]):
@@ -118,9 +143,9 @@ class GivenFeatures:
                 )
         self._features = [features.get(name, NO_FEATURES) for name in names]
 
-    def extract(self) -> list[Features]:
-        """Return the features of all images."""
-        return self._features
+    def extract(self, images: Sequence[int]) -> list[Features]:
+        """Return the features of images."""
+        return [self._features[index] for index in images]
 
     def __getitem__(self, index: int) -> Features:
         return self._features[index]

@@ -92,7 +92,7 @@ def describe(
     return {
         "pairs_proposed": graph.num_proposed,
         "pairs_matched": len(graph.candidates),
-        "pairs_verified": len(problem.pairs),
+        "pairs_verified": len(problem.distinct_pairs),
         "pairs": pairs,
         "failed": {names[index]: reason for index, reason in sorted(context.failures.items())},
         "images": {image.name: _image(image) for image in problem.images},

@@ -20,12 +20,14 @@ from mpsfm_core.data import Features, MappingImage, MappingProblem, SparseMatche
 from mpsfm_core.data.decisions import Reason
 from mpsfm_core.extraction.active_provider import thread_count
 from mpsfm_core.extraction.context import ExtractionContext
+from mpsfm_core.extraction.duplicates import find_duplicates
 from mpsfm_core.extraction.events import ExtractionEvents, NullExtractionEvents
 from mpsfm_core.extraction.features import (
     NO_FEATURES,
     FeatureSet,
     FeatureSource,
     FeatureTable,
+    SharedFeatures,
 )
 from mpsfm_core.extraction.match_graph import MatchGraph, Priors
 from mpsfm_core.extraction.matching.dense_matches import NO_POINTS
@@ -34,13 +36,13 @@ from mpsfm_core.extraction.matching.pair_matching import (
     CandidateMatches,
     PairMatcher,
     PairVerifier,
+    add_duplicates,
     adjust_assembled,
     adjust_problem_keypoints,
     assemble_matches,
     merge_matches,
 )
 from mpsfm_core.extraction.output_checks import find_meaningless_scores, find_partial_coverage
-from mpsfm_core.extraction.pairs.duplicates import find_duplicates
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.extraction.pairs.selection import PairSelection
 from mpsfm_core.extraction.priors.multiview import GroupPriors
@@ -250,9 +252,11 @@ def match_images(
             pairs are allowed.
         verified: Pairs that an earlier pass verified, which connect components.
     """
-    located = [NO_FEATURES] * len(context.images) if source is None else source.extract()
-    duplicates = find_duplicates(located, [image.pinhole.size for image in context.images])
-    selection = PairSelection(context, source, unconstrained, duplicates)
+    originals, images = find_duplicates(context), range(len(context.images))
+    source = source and SharedFeatures(source, originals)
+    located = [NO_FEATURES] * len(images) if source is None else source.extract(images)
+    distinct = [image for image in images if image not in originals]
+    selection = PairSelection(context, source, unconstrained, distinct)
     matcher = PairMatcher(context, source)
     verifier = PairVerifier(context, located, matcher)
     candidates = matcher.match(selection.choose() if pairs is None else pairs, located)
@@ -264,6 +268,7 @@ def match_images(
         candidates += matcher.match(further_pairs, located)
         geometries += verifier.verify(candidates[len(geometries) :])
     assembled = adjust_assembled(context, assemble_matches(candidates, geometries, located))
+    assembled = add_duplicates(assembled, originals)
     names = context.images.names
     features = {} if source is None else FeatureSet(names, source, context.config.features)
     proposed = selection.proposed if pairs is None else len(pairs)
@@ -276,7 +281,7 @@ def match_images(
         context.config.verification.min_inliers,
         proposed,
         matcher,
-        {names[image]: names[original] for image, original in duplicates.items()},
+        {names[image]: names[original] for image, original in originals.items()},
     )
 
 
@@ -293,7 +298,8 @@ def match_queries(
         between: Pairs of queries that are matched, too.
     """
     source = feature_table(context)
-    located = [NO_FEATURES] * len(context.images) if source is None else source.extract()
+    images = range(len(context.images))
+    located = [NO_FEATURES] * len(images) if source is None else source.extract(images)
     pairs = PairSelection(context, source).choose_references(num_references)
     matcher = PairMatcher(context, source)
     candidates = matcher.match(sorted([*pairs, *between]), located)
@@ -338,12 +344,13 @@ def predict_priors(context: ExtractionContext, graph: MatchGraph | None) -> Prio
     groups = _predict_groups(context, () if graph is None else graph.assembled.pairs)
     candidates = [] if graph is None else list(graph.candidates)
     matcher = None if graph is None else graph.matcher
-    predicted = PriorPredictor(context, matcher, candidates, groups).run()
+    originals = find_duplicates(context)
+    predicted = PriorPredictor(context, matcher, candidates, groups).run(originals)
     depth = {name: prior for name, (prior, _) in zip(names, predicted, strict=True)}
     normals = {name: prior for name, (_, prior) in zip(names, predicted, strict=True)}
     if groups is None or context.config.depth.use != FROM_MULTIVIEW:
         return Priors(depth, normals)
-    places = {name: groups.place(index) for index, name in enumerate(names)}
+    places = {name: groups.place(originals.get(index, index)) for index, name in enumerate(names)}
     poses = {name: pose for name, (_, pose) in places.items() if pose is not None}
     numbers = {name: number for name, (number, _) in places.items()}
     return Priors(depth, normals, numbers, poses)

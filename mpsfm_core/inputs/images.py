@@ -27,6 +27,7 @@ from mpsfm_core.inputs.image_decoding import (
     check_decodable,
     check_size,
     decode_rgb,
+    orient,
     read_bytes,
     upright_size,
 )
@@ -75,6 +76,8 @@ FOCAL_LOG_STD: Mapping[FocalSource, float] = MappingProxyType(
 are rounded, and the default ratio must cover wide-angle and telephoto lenses. [ours]"""
 CACHED_BYTES = 512 << 20
 """Size in bytes of the cache of undistorted images, because the matcher reads each image often."""
+_THUMBNAIL = 32, 32
+"""Width and height of thumbnails, which show where the edges of an image are."""
 _CACHED_MAPS = 2
 """Number of cached undistortion maps; a map takes 8 bytes per pixel, and images share cameras."""
 _READERS = 4
@@ -106,6 +109,8 @@ class SourceImage:
     """Mask file of the original image, None if the image has no mask."""
     pixels: UInt8 | None = None
     """Pixels (H, W, 3) uint8 RGB of an image in memory, None for an image file."""
+    thumbnail: UInt8 | None = None
+    """Upright gray thumbnail, or None for formats that OpenCV does not decode."""
     predicted_log_std: float | None = None
     """Std of the log focal length that a camera provider predicted, None without prediction."""
     camera_model: CameraModel = CameraModel.SIMPLE_RADIAL
@@ -203,6 +208,13 @@ class ImageSet:
                 run.
         """
         return self._views.get(index, lambda: self._load(self.images[index]))
+
+    def thumbnail(self, index: int) -> UInt8:
+        """Return a gray thumbnail of the original image, or of the view for rare file formats."""
+        stored = self.images[index].thumbnail
+        if stored is not None:
+            return stored
+        return _make_thumbnail(cv2.cvtColor(self.view(index).image, cv2.COLOR_RGB2GRAY))
 
     def with_focals(
         self, focals: Mapping[int, float], log_stds: Mapping[int, float] | None = None
@@ -478,6 +490,7 @@ class _ProbedImage:
     fault: str = ""
     gps: GpsPosition | None = None
     is_transparent: bool = False
+    thumbnail: UInt8 | None = None
 
     @property
     def oriented_size(self) -> tuple[tuple[int, int], int]:
@@ -547,6 +560,7 @@ def _source_image(
         file.digest,
         orientation,
         file.gps,
+        thumbnail=file.thumbnail,
         camera_model=CameraModel.SIMPLE_RADIAL if is_known else options.camera_model,
     )
 
@@ -598,7 +612,8 @@ def _probe(path: Path, options: InputOptions) -> _ProbedImage:
     except InputError as error:
         return _ProbedImage((0, 0), ImageHeader(None, 1, {}), "", str(error))
     digest = hashlib.sha256(data).hexdigest()
-    return _ProbedImage(size, header, digest, "", read_gps(data), is_transparent)
+    thumbnail = None if reduced is None else _make_thumbnail(orient(reduced, header.orientation))
+    return _ProbedImage(size, header, digest, "", read_gps(data), is_transparent, thumbnail)
 
 
 def _report_left_out(left_out: Mapping[str, str], total: int, options: InputOptions) -> None:
@@ -641,6 +656,11 @@ def _resize(image: UInt8, size: tuple[int, int]) -> UInt8:
         return image
     resized: UInt8 = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
     return resized
+
+
+def _make_thumbnail(gray: UInt8) -> UInt8:
+    thumbnail: UInt8 = cv2.resize(gray, _THUMBNAIL, interpolation=cv2.INTER_AREA)
+    return thumbnail
 
 
 def _count_bytes(view: View) -> int:

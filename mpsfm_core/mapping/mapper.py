@@ -156,8 +156,7 @@ def reconstruct(
         models[0] = register_tentatively(models[0], models[1:], distinct, options)
     report = sum_step_times(selected.report, [run.report for run in runs])
     if distinct is not problem:
-        max_error_px = options.triangulation.max_error_px
-        models = [register_duplicates(model, problem, max_error_px) for model in models]
+        models = [register_duplicates(model, problem) for model in models]
         report = replace(report, image_reasons=report_duplicates(report, models, problem))
     return MappingResult(tuple(models), report)
 

@@ -40,12 +40,11 @@ def count_explained_matches(
     Returns:
         Number of explained matches by pair of image names.
     """
-    counts = {}
-    for pair, mask in find_explained_matches(reconstruction.confirmed_images, problem):
-        a, b = problem.images[pair.image_a], problem.images[pair.image_b]
-        if a.duplicate_of != b.name and b.duplicate_of != a.name:
-            counts[a.name, b.name] = int(mask.sum())
-    return counts
+    distinct = replace(problem, pairs=problem.distinct_pairs)
+    return {
+        (problem.images[pair.image_a].name, problem.images[pair.image_b].name): int(mask.sum())
+        for pair, mask in find_explained_matches(reconstruction.confirmed_images, distinct)
+    }
 
 
 def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -> dict[str, Any]:

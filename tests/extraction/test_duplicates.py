@@ -2,66 +2,66 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
 import mpsfm_core as mpsfm
-from mpsfm_core.data import Features, Float64
-from mpsfm_core.extraction.pairs.duplicates import find_duplicates
+from mpsfm_core.data import UInt8
+from mpsfm_core.extraction.duplicates import group_similar, measure_aligned_ratio
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
-SIZE = (640, 480)
+CAMERA = mpsfm.PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
 
 
-def make_features(keypoints: Float64) -> Features:
-    return Features(keypoints, np.empty((len(keypoints), 0), np.float32))
+def render_views(count: int) -> list[UInt8]:
+    return [room_scene().render(CAMERA, pose).rgb for pose in arc_poses(count, 10.0)]
 
 
-def random_keypoints(seed: int, count: int = 2000) -> Float64:
-    return np.random.default_rng(seed).uniform((0, 0), SIZE, (count, 2))
+def brighten(image: UInt8) -> UInt8:
+    brighter: UInt8 = np.clip(1.2 * image.astype(float) + 10, 0, 255).astype(np.uint8)
+    return brighter
 
 
-def edit(keypoints: Float64, seed: int = 9) -> Float64:
-    """Keep 60 % of the keypoints, as in a brightened copy, and add others."""
-    kept = keypoints[np.random.default_rng(seed).random(len(keypoints)) < 0.6]
-    return np.concatenate([kept, random_keypoints(seed, len(keypoints) - len(kept))])
+def move(image: UInt8, shift_px: float) -> UInt8:
+    """Move an image to the right by a shift in pixels."""
+    warp = np.array([[1.0, 0.0, shift_px], [0.0, 1.0, 0.0]])
+    return np.asarray(cv2.warpAffine(image, warp, image.shape[1::-1]), np.uint8)
 
 
-def find(*keypoints: Float64, size: tuple[int, int] = SIZE) -> dict[int, int]:
-    sizes = [SIZE, *[size] * (len(keypoints) - 1)]
-    return find_duplicates([make_features(xy) for xy in keypoints], sizes)
+def make_thumbnail(image: UInt8) -> UInt8:
+    return np.asarray(cv2.resize(image[..., 1], (32, 32), interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def test_find_duplicates_of_copies_gives_the_first_image() -> None:
-    first, second = random_keypoints(0), random_keypoints(1)
-    assert find(first, second, edit(first), first.copy(), edit(second)) == {2: 0, 3: 0, 4: 1}
+def test_group_similar_pairs_edited_copies_of_the_same_size() -> None:
+    first, second, third = render_views(3)
+    thumbnails = [make_thumbnail(v) for v in (first, second, brighten(first), third, first)]
+    assert group_similar(thumbnails, [(320, 240)] * 5) == [{2: [0], 4: [0, 2]}]
+    assert group_similar(thumbnails, [*[(320, 240)] * 4, (640, 480)]) == [{2: [0]}]
 
 
-def test_find_duplicates_of_other_views_is_empty() -> None:
-    first = random_keypoints(0)
-    assert find(first, random_keypoints(1), first + 3.0) == {}
-    assert find(first, first * 0.5, size=(320, 240)) == {}
+def test_group_similar_of_images_without_contrast_is_empty() -> None:
+    blank = np.full((32, 32), 90, np.uint8)
+    assert group_similar([blank, blank], [(320, 240)] * 2) == []
 
 
-def test_find_duplicates_ignores_chance_and_few_keypoints() -> None:
-    """Dense keypoints share many pixels by chance; a few shared keypoints are no evidence."""
-    dense = [random_keypoints(seed, 50_000) for seed in range(2)]
-    assert find(*dense) == {}
-    few = random_keypoints(0, 10)
-    assert find(few, few.copy()) == {}
-    assert find(np.empty((0, 2)), np.empty((0, 2))) == {}
+def test_measure_aligned_ratio_is_high_for_edited_copies_only() -> None:
+    first, second = render_views(2)
+    assert measure_aligned_ratio(first, brighten(first)) > 0.8
+    assert measure_aligned_ratio(first, move(first, 0.3)) > 0.8
+    assert measure_aligned_ratio(first, move(first, 2.0)) < 0.1
+    assert measure_aligned_ratio(first, second) < 0.1
+    assert measure_aligned_ratio(np.zeros_like(first), first) == 0.0
 
 
 @pytest.mark.slow
-def test_match_images_matches_a_brightened_copy_with_its_original_only() -> None:
-    camera = mpsfm.PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
-    views = [room_scene().render(camera, pose).rgb for pose in arc_poses(3, 10.0)]
-    bright = np.clip(1.2 * views[1].astype(float) + 10, 0, 255).astype(np.uint8)
-    pixels = {"a": views[0], "b": views[1], "c": views[2], "d": bright}
-    graph = mpsfm.match_images(
-        mpsfm.load_images(pixels, cameras=camera),
-        config="sift",
-        overrides=["adjustment.enabled=false"],
-    )
+def test_match_images_gives_a_brightened_copy_the_keypoints_of_its_original() -> None:
+    views = render_views(3)
+    pixels = {"a": views[0], "b": views[1], "c": views[2], "d": brighten(views[1])}
+    images = mpsfm.load_images(pixels, cameras=CAMERA)
+    graph = mpsfm.match_images(images, config="sift", overrides=["adjustment.enabled=false"])
     assert graph.duplicates == {"d": "b"}
     assert set(graph.verified) == {("a", "b"), ("a", "c"), ("b", "c"), ("b", "d")}
+    np.testing.assert_array_equal(graph.keypoints["d"], graph.keypoints["b"])
+    assert len(graph.verified["b", "d"]) == len(graph.keypoints["b"])
+    np.testing.assert_array_equal(graph.features["d"].keypoints, graph.features["b"].keypoints)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, cast
 
@@ -267,6 +267,29 @@ def assemble_matches(
     )
 
 
+def add_duplicates(assembled: AssembledMatches, originals: Mapping[int, int]) -> AssembledMatches:
+    """Give duplicates the keypoints of their originals, and a verified pair with all keypoints.
+
+    Args:
+        assembled: Verified pairs and keypoints of the originals.
+        originals: Index of the original image by index of the duplicate.
+    """
+    source = [originals.get(image, image) for image in range(len(assembled.keypoints))]
+    pairs = list(assembled.pairs)
+    for duplicate, original in originals.items():
+        rows = np.arange(len(assembled.keypoints[original]), dtype=np.int64)
+        matches, scores = np.stack([rows, rows], axis=1), np.ones(len(rows), np.float32)
+        pairs.append(
+            VerifiedPair(original, duplicate, matches, scores, np.eye(3), np.zeros(3), False)
+        )
+    return AssembledMatches(
+        tuple(sorted(pairs, key=lambda pair: (pair.image_a, pair.image_b))),
+        [assembled.keypoints[image] for image in source],
+        [assembled.std_px[image] for image in source],
+        [assembled.std_factor[image] for image in source],
+    )
+
+
 def adjust_assembled(context: ExtractionContext, assembled: AssembledMatches) -> AssembledMatches:
     """Adjust the keypoints of all verified matches, if keypoint adjustment is enabled."""
     options = context.config.adjustment
@@ -284,15 +307,13 @@ def adjust_assembled(context: ExtractionContext, assembled: AssembledMatches) ->
 def adjust_problem_keypoints(context: ExtractionContext, problem: MappingProblem) -> MappingProblem:
     """Adjust the keypoints of a mapping problem that has detected keypoints."""
     images = problem.images
-    found = adjust_assembled(
-        context,
-        AssembledMatches(
-            problem.pairs,
-            [image.keypoints for image in images],
-            [image.keypoint_std_px for image in images],
-            [_std_factor(image) for image in images],
-        ),
+    distinct = AssembledMatches(
+        problem.distinct_pairs,
+        [image.keypoints for image in images],
+        [image.keypoint_std_px for image in images],
+        [_std_factor(image) for image in images],
     )
+    found = add_duplicates(adjust_assembled(context, distinct), problem.originals)
     moved = (
         replace(image, keypoints=keypoints, keypoint_std_factor=factor)
         for image, keypoints, factor in zip(images, found.keypoints, found.std_factor, strict=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from functools import cached_property
 from typing import Any
 
@@ -32,8 +32,7 @@ class PairSelection:
         table: Features of the images, or None without a feature provider.
         unconstrained: Images to match again after the fast first pass, of which each pair contains
             at least one; if None, all pairs are allowed.
-        duplicates: Index of the original image by index of the duplicate, which shows the same
-            view. A duplicate is only matched with its original.
+        images: Indices of the images, without duplicates; by default all images of the context.
     """
 
     def __init__(
@@ -41,13 +40,13 @@ class PairSelection:
         context: ExtractionContext,
         table: FeatureSource | None,
         unconstrained: Collection[int] | None = None,
-        duplicates: Mapping[int, int] | None = None,
+        images: Sequence[int] | None = None,
     ) -> None:
         self.proposed = 0
         """Number of selected image pairs before plugins filter the pairs."""
         self._unconstrained = unconstrained
-        self._duplicates = duplicates or {}
         self._context = context
+        self._images = range(len(context.images)) if images is None else images
         self._table = table
         self._similarity: PairSimilarity | None = None
         self._selected: set[Pair] = set()
@@ -58,22 +57,22 @@ class PairSelection:
         Raises:
             ConfigError: ``pairs.mode`` is ``retrieval``, but no retrieval provider is configured.
         """
-        options, count = self._context.config.pairs, len(self._context.images)
+        options, count = self._context.config.pairs, len(self._images)
         if options.mode == "sequential":
-            return self._select(pairs.sequential_pairs(count, options))
+            return self._select_rows(pairs.sequential_pairs(count, options))
         if options.mode == "retrieval":
-            return self._select(pairs.retrieval_pairs(self._descriptors(), options))
+            return self._select_rows(pairs.retrieval_pairs(self._descriptors(), options))
         if options.mode == "exhaustive" or count - 1 <= options.partners:
-            return self._select(pairs.exhaustive_pairs(count))
+            return self._select_rows(pairs.exhaustive_pairs(count))
         self._similarity = self._compute_similarity()
         if self._similarity is None:
-            return self._select(pairs.exhaustive_pairs(count))
+            return self._select_rows(pairs.exhaustive_pairs(count))
         similar = pairs.most_similar_pairs(
             self._similarity, self._partners, images=self._unconstrained
         )
-        return self._select(
-            similar + pairs.numbered_neighbor_pairs(self._context.images.names, options)
-        )
+        names = [self._context.images[image].name for image in self._images]
+        neighbors = pairs.numbered_neighbor_pairs(names, options)
+        return self._select(similar + self._number_pairs(neighbors))
 
     def choose_references(self, num_references: int) -> list[Pair]:
         """Pair each query image with its most similar images of a model.
@@ -148,13 +147,17 @@ class PairSelection:
             return config.pairs.partners
         return config.fast_pass.partners
 
+    def _number_pairs(self, rows: Sequence[Pair]) -> list[Pair]:
+        """Convert pairs of positions in the list of distinct images to pairs of image indices."""
+        return [(self._images[a], self._images[b]) for a, b in rows]
+
+    def _select_rows(self, rows: Sequence[Pair]) -> list[Pair]:
+        return self._select(self._number_pairs(rows))
+
     def _select(self, chosen: Sequence[Pair]) -> list[Pair]:
         """Sort and record image pairs, and apply the pair filters of plugins."""
-        images, duplicates = self._unconstrained, self._duplicates
-        distinct = {(a, b) for a, b in chosen if a not in duplicates and b not in duplicates}
-        distinct |= {(original, image) for image, original in duplicates.items()}
-        distinct -= self._selected
-        unique = sorted((a, b) for a, b in distinct if images is None or a in images or b in images)
+        images, untried = self._unconstrained, set(chosen) - self._selected
+        unique = sorted((a, b) for a, b in untried if images is None or a in images or b in images)
         self._selected.update(unique)
         self.proposed += len(unique)
         names = self._context.images.names
@@ -169,21 +172,24 @@ class PairSelection:
         """
         if self._context.config.retrieval is not None:
             descriptors = np.stack(self._descriptors()).astype(np.float64)
-            return pair_similarity.rank_images(descriptors, pair_similarity.NUM_CANDIDATES)
-        if self._table is None:
+            found = pair_similarity.rank_images(descriptors, pair_similarity.NUM_CANDIDATES)
+        elif self._table is None:
             return None
-        scores = self._match_scores(self._table)
-        return pair_similarity.diffuse_similarity(scores, len(self._context.images))
+        else:
+            scores = self._match_scores(self._table)
+            found = pair_similarity.diffuse_similarity(scores, len(self._images))
+        return PairSimilarity(np.asarray(self._images)[found.pairs], found.values)
 
     def _match_scores(self, table: FeatureSource) -> PairSimilarity:
-        context, count = self._context, len(self._context.images)
+        """Return the match scores of candidate pairs of positions in the list of images."""
+        context, count = self._context, len(self._images)
         key = content_key(
-            hash_module(pair_similarity.__name__), [table.key(index) for index in range(count)]
+            hash_module(pair_similarity.__name__), [table.key(image) for image in self._images]
         )
         cached: Float64 | None = context.cache.load("pair-similarity", key, np.ndarray)
         if cached is not None:
             return PairSimilarity(cached[:, :2].astype(np.int64), cached[:, 2])
-        strongest = [pair_similarity.strongest_descriptors(table[index]) for index in range(count)]
+        strongest = [pair_similarity.strongest_descriptors(table[image]) for image in self._images]
         pairs = pair_similarity.candidate_pairs(strongest)
         partners = np.split(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(1, count)))
 
@@ -211,8 +217,7 @@ class PairSelection:
         )
 
     def _descriptors(self) -> list[Any]:
-        images = range(len(self._context.images))
-        return self._context.each("retrieval", images, self.describe, self._retrieval)
+        return self._context.each("retrieval", self._images, self.describe, self._retrieval)
 
     @cached_property
     def _retrieval(self) -> ActiveProvider:

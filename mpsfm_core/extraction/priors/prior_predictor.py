@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from mpsfm_core.config import Config
@@ -51,18 +53,25 @@ class PriorPredictor:
         self._disk = DiskArrays(cache_folder(config.runtime.cache_dir))
         self._best = _best_pairs(candidates) if config.depth.use == FROM_MATCHER else None
 
-    def run(self) -> list[tuple[DepthPrior, NormalPrior]]:
+    def run(self, originals: Mapping[int, int]) -> list[tuple[DepthPrior, NormalPrior]]:
         """Compute depth and normals of each image on the mapper's grid, with variances.
 
         The maps of many images are in temporary files of the cache folder.
+
+        Args:
+            originals: Index of the original image by index of the duplicate, which has the maps of
+                its original.
         """
-        images = range(len(self._context.images))
+        count = len(self._context.images)
+        images = [image for image in range(count) if image not in originals]
         depth = self._raw.depth
         if not depth.can("uncached"):
             self._context.each("depth", images, self._predict_only, depth)
         slowest = self._raw.normals or depth
         local = self._best is not None or self._groups is not None
-        return self._context.each("normals", images, self._prepare_maps, slowest, local=local)
+        maps = self._context.each("normals", images, self._prepare_maps, slowest, local=local)
+        maps_of = dict(zip(images, maps, strict=True))
+        return [maps_of[originals.get(image, image)] for image in range(count)]
 
     def _predict_only(self, index: int) -> None:
         """Predict depth into the disk cache, because full-size maps may exceed the memory."""

@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.decisions import Reason
 from mpsfm_core.mapping.options import MapperOptions
@@ -23,44 +21,28 @@ def remove_duplicates(problem: MappingProblem, options: MapperOptions) -> Mappin
     Duplicates are kept if the user provides poses, or if no pair of different views remains.
     """
     is_posed = any(image.known_pose is not None for image in problem.images)
-    originals = tuple(
-        replace(image, known_pose=None) if image.duplicate_of else image for image in problem.images
-    )
-    pairs = tuple(
-        pair
-        for pair in problem.pairs
-        if not any(originals[i].duplicate_of for i in (pair.image_a, pair.image_b))
-    )
+    pairs = problem.distinct_pairs
     if not pairs or (is_posed and options.known_poses != "guess"):
         return problem
-    return MappingProblem(originals, pairs, problem.rigs)
+    images = tuple(
+        replace(image, known_pose=None) if image.duplicate_of else image for image in problem.images
+    )
+    return MappingProblem(images, pairs, problem.rigs)
 
 
-def register_duplicates(
-    model: Reconstruction, problem: MappingProblem, max_error_px: float
-) -> Reconstruction:
-    """Register the duplicates of the registered images in the poses of their originals.
+def register_duplicates(model: Reconstruction, problem: MappingProblem) -> Reconstruction:
+    """Register the duplicates of the registered images with poses and points of their originals.
 
     Args:
         model: Reconstruction without some or all duplicates.
-        problem: Mapping problem with the matches of duplicates and originals.
-        max_error_px: Maximum distance in pixels of matched keypoints that observe the same point,
-            for keypoints with a standard deviation of 1 px.
+        problem: Mapping problem with duplicates, which have the keypoints of their originals.
     """
-    registered = {image.name: image for image in model.images}
-    pairs = {(pair.image_a, pair.image_b): pair for pair in problem.pairs}
-    duplicates = []
-    for index, image in enumerate(problem.images):
-        original = registered.get(image.duplicate_of or "")
-        pair = pairs.get((original.index, index)) if original else None
-        if original and pair and image.name not in registered:
-            ends = image.keypoints[pair.matches[:, 1]]
-            offsets = ends - problem.images[original.index].keypoints[pair.matches[:, 0]]
-            is_near = (offsets**2).sum(axis=1) <= (max_error_px * image.keypoint_std_px) ** 2
-            point_ids = np.full(len(image.keypoints), -1, dtype=np.int64)
-            point_ids[pair.matches[is_near, 1]] = original.point_ids[pair.matches[is_near, 0]]
-            copy = replace(original, index=index, name=image.name, point_ids=point_ids)
-            duplicates.append(copy)
+    registered = {image.index: image for image in model.images}
+    duplicates = [
+        replace(registered[original], index=index, name=problem.images[index].name)
+        for index, original in problem.originals.items()
+        if original in registered and index not in registered
+    ]
     images = sorted([*model.images, *duplicates], key=lambda image: image.index)
     return replace(model, images=tuple(images))
 

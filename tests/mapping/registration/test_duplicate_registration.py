@@ -23,9 +23,6 @@ def add_copy(problem: MappingProblem, original: int = 1) -> MappingProblem:
     image = problem.images[original]
     copy = replace(image, name="copy", duplicate_of=image.name)
     rows = np.arange(len(image.keypoints))
-    keypoints = image.keypoints.copy()
-    keypoints[0] += 50.0  # a wrong match
-    copy = replace(copy, keypoints=keypoints)
     pair = VerifiedPair(
         original,
         len(problem.images),
@@ -45,8 +42,7 @@ def test_reconstruct_registers_a_copy_in_the_pose_of_its_original() -> None:
     assert not result.report.image_reasons
     original, copy = model.images[1], model.images[3]
     assert copy.name == "copy"
-    assert original.point_ids[0] >= 0 > copy.point_ids[0]
-    np.testing.assert_array_equal(copy.point_ids[1:], original.point_ids[1:])
+    np.testing.assert_array_equal(copy.point_ids, original.point_ids)
     for name, pose in reference.poses.items():
         np.testing.assert_allclose(model.poses[name][0], pose[0], atol=1e-6)
         np.testing.assert_allclose(model.poses[name][1], pose[1], atol=1e-6)
