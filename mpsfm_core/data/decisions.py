@@ -182,6 +182,7 @@ class DoubtReason(ReasonCode):
     """The relative std of the guessed focal length of ``num_images`` images is up to
     ``std_ratio``."""
     UNCERTAIN_POSES = ("uncertain-poses", "num_images", "error_deg")
+    CONTRADICTORY_DEPTH = ("contradictory-depth", "num_images", "num_stds", "error_deg")
     """Other focal lengths, principal points and distortions fit the matches as well or better. They
     change the relative poses of ``num_images`` images by up to ``error_deg`` degrees."""
     PARTIAL_COVERAGE = ("partial-coverage", "provider", "num_images", "width_ratio", "height_ratio")

@@ -321,6 +321,13 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "Zoomed or cropped photos cause such errors, and so does little parallax.",
         "Use photos as they come from the camera, or give the true camera with --intrinsics.",
     ),
+    DoubtReason.CONTRADICTORY_DEPTH: (
+        "contradictory depth",
+        "The depth of two frames differs by {num_stds:.2g} standard deviations at common points, "
+        "for example behind a door. Without depth, the poses of {num_images} photos have errors of "
+        "up to {error_deg:.2g} degrees.",
+        "Take a panorama in each door, so that neighboring panoramas share more points.",
+    ),
     DoubtReason.PARTIAL_COVERAGE: (
         "keypoints in a part of the photos only",
         "The features provider {provider} finds keypoints only in the upper left "

@@ -38,6 +38,9 @@ benchmarks.mixed_cameras, benchmarks.verdicts]."""
 MAX_POSE_ERROR_DEG = 2.0
 """Predicted relative pose error in degrees above which a pose is uncertain [largest error of a good
 model in benchmarks.verdicts]."""
+MAX_DEPTH_DISAGREEMENT = 2.0
+"""Difference of the depth of two frames of rigs at common points, in standard deviations, above
+which depth does not support relative poses [95 % of a normal distribution]."""
 MIN_EXPLAINED_RATIO = 0.2
 """Minimum share of the matches of an image that the model must explain [ours]."""
 
@@ -93,6 +96,7 @@ def find_doubts(summary: Mapping[str, Any]) -> Iterator[Doubt]:
     for reconstruction in summary["reconstructions"][:1]:
         yield from _weak_evidence(reconstruction["evidence"])
         yield from _uncertain_distances(reconstruction)
+        yield from _contradictory_depth(reconstruction["evidence"])
     place = summary.get("georeference") or {}
     if place.get("why_not", {}).get("code") == GpsReason.FEW_INLIERS.value:
         values = {name: place["why_not"][name] for name in GpsReason.FEW_INLIERS.fields}
@@ -238,6 +242,22 @@ def _uncertain_distances(reconstruction: Mapping[str, Any]) -> Iterator[Doubt]:
             scale_std_ratio=by_matches, depth_std_ratio=by_depth
         )
         yield Doubt(reason)
+
+
+def _contradictory_depth(evidence: Mapping[str, Any]) -> Iterator[Doubt]:
+    """Yield a doubt if depth contradicts itself where matches do not determine the poses."""
+    disagreement = evidence.get("depth_disagreement")
+    if disagreement is None or disagreement <= MAX_DEPTH_DISAGREEMENT:
+        return
+    errors = {
+        name: image.get("match_pose_error_deg") or 0.0 for name, image in evidence["images"].items()
+    }
+    uncertain = tuple(name for name, error in errors.items() if error > MAX_POSE_ERROR_DEG)
+    if uncertain:
+        reason = DoubtReason.CONTRADICTORY_DEPTH.because(
+            num_images=len(uncertain), num_stds=disagreement, error_deg=max(errors.values())
+        )
+        yield Doubt(reason, uncertain)
 
 
 def _photos(number: int) -> str:

@@ -19,7 +19,7 @@ from mpsfm_core.mapping.scene.reconstruction import (
     RegisteredImage,
     find_explained_matches,
 )
-from mpsfm_core.results.relative_scale import measure_relative_scale_std
+from mpsfm_core.results.frame_errors import FrameErrors, measure_frame_errors
 
 MIN_SHARED_POINTS = 3
 """Minimum number of common 3D points of connected images [minimal sample of PnP]."""
@@ -60,14 +60,16 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
 
     Returns:
         Plain data with the keys ``parts``, ``median_angle_deg``, ``relative_scale_std``,
-        ``images`` and ``frames``.
+        ``depth_disagreement``, ``images`` and ``frames``.
         ``parts`` are the image names of each connected part of the covisibility graph, largest part
         first. ``median_angle_deg`` is the median over the 3D points of the maximum triangulation
         angle. ``relative_scale_std`` is the largest relative standard deviation of a distance
-        between two frames of rigs without depth priors, or None. ``images`` are the number of 3D
-        points, the share of explained matches and the predicted relative pose error (None without a
-        prediction), by image name. ``frames`` are the image names of each frame with several
-        images.
+        between two frames of rigs without depth priors, or None. ``depth_disagreement`` is the
+        largest difference of the depth of two frames of rigs, in standard deviations, or None.
+        ``images`` are, by image name, the number of 3D points, the share of explained matches, and
+        the predicted relative pose errors: that of an uncertain camera, and that of matches alone
+        for frames of rigs (None without a prediction). ``frames`` are the image names of each frame
+        with several images.
     """
     frames = _group_by_frame(reconstruction, problem)
     frame_of = {image.name: number for number, frame in enumerate(frames) for image in frame}
@@ -91,19 +93,22 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
     ratios = num_explained / np.maximum(num_matched, 1)
     num_frames = _count_frames(frames, len(reconstruction.points))
     is_shared = num_frames >= (2 if len(frame_of) > len(frames) else 1)
+    errors = _measure_rig_errors(frames, reconstruction.points, problem)
+    scale_std = errors.relative_scale_std if errors else None
+    match_errors = errors.pose_deg.tolist() if errors else [None] * len(frames)
     return {
         "parts": _connected_parts(frames, len(reconstruction.points)),
         "median_angle_deg": _median_angle_deg(frames, reconstruction.points, is_shared),
-        "relative_scale_std": _relative_scale_std(frames, reconstruction.points, problem),
+        "relative_scale_std": _round(scale_std, 4),
+        "depth_disagreement": _round(errors.depth_disagreement, 2) if errors else None,
         "images": {
             image.name: {
                 "points": int(is_shared[_rows(frame)].sum()),
                 "explained_ratio": round(float(ratio), 4),
-                "pose_error_deg": None
-                if image.pose_error_deg is None
-                else round(image.pose_error_deg, 3),
+                "pose_error_deg": _round(image.pose_error_deg, 3),
+                "match_pose_error_deg": _round(match_error, 3),
             }
-            for frame, ratio in zip(frames, ratios, strict=True)
+            for frame, ratio, match_error in zip(frames, ratios, match_errors, strict=True)
             for image in frame
         },
         "frames": [[image.name for image in frame] for frame in frames if len(frame) > 1],
@@ -113,14 +118,17 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
 _Frame = list[RegisteredImage]
 
 
-def _relative_scale_std(
+def _measure_rig_errors(
     frames: list[_Frame], points: Float64, problem: MappingProblem
-) -> float | None:
-    """Return the relative std of distances between frames of rigs, None for single images."""
+) -> FrameErrors | None:
+    """Return the errors of frames of rigs that matches alone predict, None for single images."""
     if not any(len(frame) > 1 for frame in frames):
         return None
-    std = measure_relative_scale_std(frames, points, problem)
-    return None if std is None else round(std, 4)
+    return measure_frame_errors(frames, points, problem)
+
+
+def _round(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)
 
 
 def _group_by_frame(reconstruction: Reconstruction, problem: MappingProblem) -> list[_Frame]:

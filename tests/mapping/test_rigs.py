@@ -9,7 +9,13 @@ import pytest
 
 from mpsfm_core.data import Float64, MappingProblem, Rig
 from mpsfm_core.data.errors import DataError
-from mpsfm_core.geometry import camera_center, compose, invert, rotation_angle_deg
+from mpsfm_core.geometry import (
+    angle_between_deg,
+    camera_center,
+    compose,
+    invert,
+    rotation_angle_deg,
+)
 from mpsfm_core.geometry.similarity import umeyama
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.model_selection import compute_total_score
@@ -215,6 +221,57 @@ def test_distances_between_frames_are_uncertain_without_points_of_three_frames()
     two = make_problem("panorama", 2).problem
     (pair,) = reconstruct(two).reconstructions
     assert describe_evidence(pair, two)["relative_scale_std"] is None
+
+
+def test_pose_errors_by_matches_grow_if_common_points_fill_a_narrow_cone() -> None:
+    problem = make_problem("panorama", 2).problem
+    (model,) = reconstruct(problem).reconstructions
+    errors = []
+    first, second = (model.poses[frame[0]] for frame in problem.rigs[0].frames)
+    rays = model.points - camera_center(*first)
+    angles_deg = angle_between_deg(rays, camera_center(*second) - camera_center(*first))
+    for max_angle_deg in (180.0, 25.0, 10.0):
+        is_kept = np.append(angles_deg < max_angle_deg, False)
+        images = tuple(
+            replace(image, point_ids=np.where(is_kept[image.point_ids], image.point_ids, -1))
+            for image in model.images
+        )
+        evidence = describe_evidence(replace(model, images=images), problem)
+        errors.append([image["match_pose_error_deg"] for image in evidence["images"].values()])
+    assert np.all(np.diff(errors, axis=0) > 0)
+    assert np.max(errors[0]) < 0.1
+
+
+def test_pose_errors_by_matches_of_an_unconnected_frame_are_unbounded() -> None:
+    problem = make_problem("panorama", 3).problem
+    (model,) = reconstruct(problem).reconstructions
+    (rig,) = problem.rigs
+    images = tuple(
+        replace(image, point_ids=np.full_like(image.point_ids, -1))
+        if image.name in rig.frames[2]
+        else image
+        for image in model.images
+    )
+    evidence = describe_evidence(replace(model, images=images), problem)
+    assert evidence["relative_scale_std"] is None
+    assert {evidence["images"][name]["match_pose_error_deg"] for name in rig.frames[2]} == {180.0}
+
+
+def test_depth_disagreement_of_frames_counts_standard_deviations() -> None:
+    problem = make_problem("panorama", 2).problem
+    (model,) = reconstruct(problem).reconstructions
+    assert describe_evidence(model, problem)["depth_disagreement"] < 1
+    (rig,) = problem.rigs
+    images = tuple(
+        replace(image, scale=1.5 * image.scale) if image.name in rig.frames[1] else image
+        for image in model.images
+    )
+    stds = [
+        np.median(np.sqrt(image.depth.variance) / image.depth.depth) for image in problem.images
+    ]
+    evidence = describe_evidence(replace(model, images=images), problem)
+    expected = np.log(1.5) / (np.sqrt(2) * np.median(stds))
+    assert evidence["depth_disagreement"] == pytest.approx(expected, rel=0.5)
 
 
 def test_colmap_model_has_rigs_and_frames() -> None:

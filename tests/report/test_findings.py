@@ -305,6 +305,20 @@ def test_verdict_doubts_distances_that_neither_matches_nor_depth_determine(
     assert [note.title.endswith("come from depth") for note in notes] == [True] * has_note
 
 
+@pytest.mark.parametrize(
+    ("disagreement", "error_deg", "is_doubtful"),
+    [(2.5, 2.5, True), (1.5, 2.5, False), (2.5, 1.5, False), (None, None, False)],
+)
+def test_verdict_doubts_poses_that_depend_on_contradictory_depth(
+    disagreement: float | None, error_deg: float | None, is_doubtful: bool
+) -> None:
+    report = summary()
+    evidence = report["reconstructions"][0]["evidence"]
+    evidence["depth_disagreement"] = disagreement
+    evidence["images"]["a"]["match_pose_error_deg"] = error_deg
+    assert doubts(report) == ([DoubtReason.CONTRADICTORY_DEPTH] if is_doubtful else [])
+
+
 def test_verdict_doubts_a_model_that_gps_contradicts() -> None:
     report = summary()
     misfit = GpsReason.FEW_INLIERS.because(num_inliers=7, num_positions=24).to_json()
