@@ -8,7 +8,7 @@ then follows its documented recipe: it maps the images without rigs, derives the
 
 Usage::
 
-    python -m benchmarks.rigs [--frames 6] [--seeds 2] [--unknown]
+    python -m benchmarks.rigs [--kinds KIND ...] [--frames 6] [--seeds 2] [--unknown]
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from mpsfm_core.testing.synthetic.problems import SyntheticNoise
 from mpsfm_core.testing.synthetic.rigs import RigKind, RigProblem, make_rig_problem
 from mpsfm_core.testing.synthetic.scenes import look_at, room_scene
 
-KINDS: tuple[RigKind, ...] = ("stereo", "around", "panorama")
+KINDS: tuple[RigKind, ...] = ("stereo", "phones", "around", "panorama")
 NOISE = SyntheticNoise(keypoints_px=0.5, scale=0.1, depth=0.01)
 
 
@@ -102,6 +102,7 @@ def measure_errors(poses: Mapping[str, Pose], truth: RigProblem) -> tuple[float,
 def main() -> None:
     """Print a table of registered images, errors and time of both mappers."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--frames", type=int, default=6)
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--unknown", action="store_true", help="hide the relative poses")
@@ -109,7 +110,7 @@ def main() -> None:
     print("| rig | mapper | images | center error mm | rotation error deg | scale error | s |")
     print("| --- | --- | --- | --- | --- | --- | --- |")
     turn_deg = 20.0 if arguments.unknown else 0.0
-    for kind in KINDS:
+    for kind in arguments.kinds:
         for seed in range(arguments.seeds):
             frame_poses = make_frame_poses(arguments.frames, seed, turn_deg)
             truth = make_rig_problem(room_scene(), kind, frame_poses, noise=NOISE, seed=seed)

@@ -128,7 +128,9 @@ def hide_sensor_poses(problem: MappingProblem) -> MappingProblem:
     return replace(problem, rigs=(replace(rig, sensor_from_rig=(None,) * len(rig.sensor_poses)),))
 
 
-@pytest.mark.parametrize(("kind", "max_angle_deg"), [("stereo", 0.05), ("around", 0.1)])
+@pytest.mark.parametrize(
+    ("kind", "max_angle_deg"), [("stereo", 0.05), ("phones", 0.1), ("around", 0.1)]
+)
 def test_unknown_relative_poses_are_calibrated(kind: RigKind, max_angle_deg: float) -> None:
     rig_problem = make_problem(kind, 6, make_turning_poses(6))
     result = reconstruct(hide_sensor_poses(rig_problem.problem))

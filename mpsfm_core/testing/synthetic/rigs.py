@@ -1,4 +1,4 @@
-"""Synthetic mapping problems of rigs: stereo, four cameras around, and views of panoramas."""
+"""Synthetic mapping problems of rigs: stereo, two phones, cameras around, views of panoramas."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mpsfm_core.testing.synthetic.problems import (
 )
 from mpsfm_core.testing.synthetic.scenes import AnalyticScene, project
 
-RigKind = Literal["stereo", "around", "panorama"]
+RigKind = Literal["stereo", "phones", "around", "panorama"]
 
 _MIN_MATCHES = 15
 """Minimum number of matches of a verified pair."""
@@ -38,15 +38,30 @@ def make_rig_sensors(kind: RigKind) -> tuple[Pose, ...]:
     """Return ``sensor_from_rig`` of the sensors of a rig.
 
     Args:
-        kind: Two parallel cameras 0.2 m apart (``stereo``), four cameras with 0.1 m distance to the
-            center that look outward (``around``), or eight views of a panorama with one center, at
-            45 degrees to each other (``panorama``).
+        kind: Two parallel cameras 0.2 m apart (``stereo``), an upright phone and another phone with
+            wide images at 0.15 m and 10 degrees to it (``phones``), four cameras with 0.1 m
+            distance to the center that look outward (``around``), or eight views of a panorama
+            with one center, at 45 degrees to each other (``panorama``).
     """
     if kind == "stereo":
         return ((np.eye(3), np.zeros(3)), (np.eye(3), np.array([-0.2, 0.0, 0.0])))
+    if kind == "phones":
+        turn = make_view_rotations(36)[1]
+        return ((np.eye(3), np.zeros(3)), (turn, -turn @ [0.15, 0.02, 0.0]))
     count, distance = (4, 0.1) if kind == "around" else (8, 0.0)
     shift = np.array([0.0, 0.0, -distance])
     return tuple((rotation, shift) for rotation in make_view_rotations(count))
+
+
+def _make_cameras(kind: RigKind) -> tuple[PinholeCamera, ...]:
+    """Return the cameras of the sensors of a rig, or the one camera of all sensors."""
+    if kind == "phones":
+        return (
+            PinholeCamera(480, 640, 460.0, 460.0, 240.0, 320.0),
+            PinholeCamera(640, 480, 540.0, 540.0, 320.0, 240.0),
+        )
+    focal = 320.0 if kind == "panorama" else 400.0
+    return (PinholeCamera(640, 640, focal, focal, 320.0, 320.0),)
 
 
 def make_rig_problem(
@@ -75,16 +90,18 @@ def make_rig_problem(
     """
     noise = noise or SyntheticNoise()
     rng = np.random.default_rng(seed)
-    focal = 320.0 if kind == "panorama" else 400.0
-    camera = PinholeCamera(640, 640, focal, focal, 320.0, 320.0)
-    sensors = make_rig_sensors(kind)
+    sensors, cameras = make_rig_sensors(kind), _make_cameras(kind)
     poses = [
         np.column_stack(compose(sensor, (pose[:, :3], pose[:, 3])))
         for pose in frame_poses
         for sensor in sensors
     ]
     points = _sample_points(scene, frame_poses, num_points, rng)
-    seen = [_find_visible(scene, camera, pose, points) for pose in poses]
+    camera_of = [cameras[row % len(cameras)] for row in range(len(poses))]
+    seen = [
+        _find_visible(scene, camera, pose, points)
+        for camera, pose in zip(camera_of, poses, strict=True)
+    ]
     names = [
         tuple(f"camera{sensor}/{frame:04d}.png" for sensor in range(len(sensors)))
         for frame in range(len(frame_poses))
@@ -102,7 +119,9 @@ def make_rig_problem(
             noise,
             rng,
         )
-        for name, pose, (_, xy) in zip(np.ravel(names).tolist(), poses, seen, strict=True)
+        for name, camera, pose, (_, xy) in zip(
+            np.ravel(names).tolist(), camera_of, poses, seen, strict=True
+        )
     )
     pairs = []
     for a, b in combinations(range(len(poses)), 2):
