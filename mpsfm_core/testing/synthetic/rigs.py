@@ -1,4 +1,4 @@
-"""Synthetic mapping problems of rigs: stereo, two phones, cameras around, views of panoramas."""
+"""Synthetic mapping problems of rigs: stereo, two phones, cameras around, and panoramas."""
 
 from __future__ import annotations
 
