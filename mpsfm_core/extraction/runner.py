@@ -54,6 +54,7 @@ from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.matches import ImportedMatches
 from mpsfm_core.providers.provider_config import FROM_MULTIVIEW
 from mpsfm_core.providers.registry import Registry
+from mpsfm_core.support.memory import release_free_memory
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,12 +106,17 @@ def extract(
 
 @contextmanager
 def extraction_environment(context: ExtractionContext) -> Iterator[None]:
-    """Limit the threads of BLAS and use the configured executor inside a ``with`` block."""
+    """Limit the threads of BLAS and use the configured executor inside a ``with`` block.
+
+    The memory of cached views is freed at the end, because mapping needs no views.
+    """
     with (
         threadpool_limits(thread_count(context.config.runtime), user_api="blas"),
         use_executor(context),
     ):
         yield
+    context.images.release_views()
+    release_free_memory()
 
 
 def extend_matches(

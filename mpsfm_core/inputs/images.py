@@ -216,6 +216,10 @@ class ImageSet:
             return stored
         return _make_thumbnail(cv2.cvtColor(self.view(index).image, cv2.COLOR_RGB2GRAY))
 
+    def release_views(self) -> None:
+        """Free the memory of the cached views, which are decoded again on demand."""
+        self._views.clear()
+
     def with_focals(
         self, focals: Mapping[int, float], log_stds: Mapping[int, float] | None = None
     ) -> ImageSet:

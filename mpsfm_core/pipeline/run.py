@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -16,7 +16,7 @@ import pycolmap
 from mpsfm_core.config import Config
 from mpsfm_core.config.provider_arguments import Provider, configure
 from mpsfm_core.data import MappingProblem, Pose, Rig
-from mpsfm_core.data.decisions import DoubtReason, Reason
+from mpsfm_core.data.decisions import Reason
 from mpsfm_core.data.errors import ConfigError, ReconstructionError
 from mpsfm_core.data.events import EventCallback
 from mpsfm_core.data.result_layout import SUMMARY
@@ -33,7 +33,12 @@ from mpsfm_core.extraction.runner import (
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.models import Poses
-from mpsfm_core.mapping.camera_jumps import find_jumps, remove_matches_across
+from mpsfm_core.mapping.camera_jumps import (
+    Shot,
+    describe_jumps,
+    find_jumps,
+    remove_matches_across,
+)
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.rig_calibration import calibrate_rigs
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
@@ -294,7 +299,7 @@ class _Run:
         views = undistorted
         if self._config.has_second_pass:
             extraction, views, mapping = self._run_second_pass(undistorted, extraction, mapping)
-            extraction, mapping = self._map_without_jumps(extraction, mapping)
+        self._add_doubts(describe_jumps(mapping.reconstructions, self._shots))
         refined = undistort_images(views, extraction.problem, mapping.reconstructions)
         problem = undistort_problem(undistorted, refined, extraction.problem)
         if refined is not views:
@@ -379,14 +384,30 @@ class _Run:
             self._part_records = part_mapper.records
             return result
 
+    @property
+    def _shots(self) -> Sequence[Shot]:
+        """Shots of the videos, in which the camera may not jump, or none with known poses."""
+        return [] if self._inputs.known_poses else self._inputs.shots
+
     def _map_without_jumps(
-        self, extraction: Extraction, mapping: MappingResult
+        self,
+        extraction: Extraction,
+        mapping: MappingResult,
+        prepare: Callable[[MappingProblem], MappingProblem] = lambda problem: problem,
     ) -> tuple[Extraction, MappingResult]:
-        """Map again without matches between look-alike places, if the camera of a video jumps."""
-        shots = [] if self._inputs.known_poses else self._inputs.shots
-        jumps = find_jumps(mapping.reconstructions, shots)
+        """Map again without matches between look-alike places, if the camera of a video jumps.
+
+        Args:
+            extraction: Extraction with all verified pairs.
+            mapping: Result of the mapper with all verified pairs.
+            prepare: Function that prepares a problem of the extraction for the mapper.
+
+        Returns:
+            Extraction and result of the mapper without matches across jumps.
+        """
         for _ in range(_MAX_JUMP_RUNS):
-            problem = remove_matches_across(extraction.problem, jumps, shots)
+            jumps = find_jumps(mapping.reconstructions, self._shots)
+            problem = remove_matches_across(extraction.problem, jumps, self._shots)
             num_removed = len(extraction.problem.pairs) - len(problem.pairs)
             if not num_removed:
                 break
@@ -395,12 +416,7 @@ class _Run:
                 f"matches of {num_removed} pairs of distant frames across a jump are not used"
             )
             extraction = replace(extraction, problem=problem)
-            mapping = self._map(problem)
-            jumps = find_jumps(mapping.reconstructions, shots)
-        self._add_doubts(
-            DoubtReason.CAMERA_JUMP.because(image_a=before, image_b=after)
-            for before, after in jumps
-        )
+            mapping = self._map(prepare(problem))
         return extraction, mapping
 
     def _add_doubts(self, doubts: Iterable[Reason]) -> None:
@@ -475,11 +491,17 @@ class _Run:
             )
         refined = undistort_images(images, extraction.problem, mapping.reconstructions)
         seeds = [take_refined_camera(refined, seed) for seed in seeds]
-        problem = undistort_problem(images, refined, extraction.problem)
         changed = np.array([new is not old for new, old in zip(refined, images, strict=True)])
-        problem = estimate_relative_poses(problem, changed, config.runtime.seed)
-        problem = calibrate_rigs(problem, mapping.reconstructions) or problem
-        return extraction, refined, self._map_from_seeds(problem, seeds)
+        first_models = mapping.reconstructions
+
+        def prepare(problem: MappingProblem) -> MappingProblem:
+            problem = undistort_problem(images, refined, problem)
+            problem = estimate_relative_poses(problem, changed, config.runtime.seed)
+            return calibrate_rigs(problem, first_models) or problem
+
+        mapping = self._map_from_seeds(prepare(extraction.problem), seeds)
+        extraction, mapping = self._map_without_jumps(extraction, mapping, prepare)
+        return extraction, refined, mapping
 
     def _map_from_seeds(
         self, problem: MappingProblem, seeds: list[RegisteredImage]

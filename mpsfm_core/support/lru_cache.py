@@ -41,3 +41,9 @@ class LruCache(Generic[Key, Value]):
             while self._total > self._limit and len(self._values) > 1:
                 self._total -= self._size(self._values.popitem(last=False)[1])
         return value
+
+    def clear(self) -> None:
+        """Evict all values."""
+        with self._lock:
+            self._values.clear()
+            self._total = 0

@@ -25,6 +25,7 @@ from mpsfm_core.extraction.matching.keypoint_adjustment import (
     select_best_matches,
     smooth_gray_image,
     solve_shifts,
+    split_equations,
 )
 from mpsfm_core.extraction.options import AdjustmentOptions
 from mpsfm_core.extraction.runner import adjust_problem, extend_matches, extract
@@ -139,6 +140,27 @@ def test_solve_shifts_equals_dense_least_squares() -> None:
     expected = np.linalg.lstsq(np.vstack(rows), np.concatenate(right), rcond=None)[0]
     assert np.abs(found.ravel() - expected).max() < 1e-3
     assert np.abs(found - truth).max() < 0.05
+
+
+def test_split_equations_solve_for_the_same_shifts() -> None:
+    rng = np.random.default_rng(0)
+    tracks = np.split(rng.permutation(600), np.cumsum(rng.integers(2, 8, 100))[:-1])
+    tracks = [track for track in tracks if len(track) > 1]
+    links = np.concatenate([np.column_stack([track[:-1], track[1:]]) for track in tracks])
+    a, b = rng.permutation(np.sort(links, axis=1)).T
+    warp = np.eye(2) + rng.normal(0, 0.1, (len(a), 2, 2))
+    offset = rng.normal(0, 0.3, (len(a), 2))
+    information = np.tile(np.diag([900.0, 100.0]), (len(a), 1, 1))
+
+    def solve(rows: np.ndarray) -> np.ndarray:
+        return solve_shifts(np.ones(600), a[rows], b[rows], *(x[rows] for x in equations))
+
+    equations = warp, offset, information
+    systems = split_equations(a, b, 600, max_equations=50)
+    assert len(systems) > 5 and max(map(len, systems)) < 50 + max(map(len, tracks))
+    assert np.array_equal(np.sort(np.concatenate(systems)), np.arange(len(a)))
+    (whole,) = split_equations(a, b, 600, max_equations=len(a))
+    assert np.allclose(sum(map(solve, systems)), solve(whole), atol=1e-12)
 
 
 def test_adjust_keypoints_shares_offset_by_variance() -> None:

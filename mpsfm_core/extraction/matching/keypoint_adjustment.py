@@ -17,7 +17,8 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from scipy.sparse import csc_matrix
+from scipy.sparse import coo_array, csc_matrix
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8, VerifiedPair
@@ -53,6 +54,9 @@ _CAUCHY_SCALE = 0.3
 """Scale of the Cauchy loss on alignment residuals, in keypoint standard deviations."""
 _NUM_REWEIGHTINGS = 3
 """Number of IRLS iterations that solve for the keypoint shifts."""
+_MAX_EQUATIONS = 200_000
+"""Number of aligned patches up to which one system of equations solves for all shifts, with about
+350 MB of memory. [ours]"""
 _MIN_DETERMINANT = 0.05
 """Minimum determinant of an affine warp; warps that shrink area further are rejected."""
 
@@ -343,13 +347,42 @@ def adjust_keypoints(
         rows = np.concatenate(
             [start + pair.rows for start, pair in zip(starts, aligned, strict=False)]
         )
+        a, b = a[rows], b[rows]
         equations = [np.concatenate([getattr(p, name) for p in aligned]) for name in _EQUATION]
-        shifts = solve_shifts(std, a[rows], b[rows], *equations)
-        measured[a[rows]] = measured[b[rows]] = True
+        for part in split_equations(a, b, len(std)):
+            shifts += solve_shifts(std, a[part], b[part], *(values[part] for values in equations))
+        measured[a] = measured[b] = True
     measured &= np.linalg.norm(shifts, axis=1) <= max_shift_std * std
     moved = np.concatenate(keypoints) + np.where(measured[:, None], shifts, 0.0)
     ends = np.cumsum(counts)[:-1]
     return list(map(AdjustedKeypoints, np.split(moved, ends), np.split(measured, ends)))
+
+
+def split_equations(
+    a: Int64, b: Int64, num_keypoints: int, max_equations: int = _MAX_EQUATIONS
+) -> list[Int64]:
+    """Split the equations of keypoint shifts into independent systems of limited size.
+
+    Equations of different tracks share no keypoint. A track is never split.
+
+    Args:
+        a: (m,) keypoint index in view a of each aligned patch pair.
+        b: (m,) keypoint index in view b of each aligned patch pair.
+        num_keypoints: Number of keypoints of all images.
+        max_equations: Number of equations up to which they remain one system, and target size of
+            the systems.
+
+    Returns:
+        Ascending indices of the equations of each system.
+    """
+    if len(a) <= max_equations:
+        return [np.arange(len(a))]
+    edges = coo_array((np.ones(len(a), np.bool_), (a, b)), shape=(num_keypoints, num_keypoints))
+    track_of = connected_components(edges, directed=False)[1][a]
+    system_of_track = np.cumsum(np.bincount(track_of)) // max_equations
+    system_of = system_of_track[track_of]
+    order = np.argsort(system_of, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(system_of[order])) + 1)
 
 
 def solve_shifts(

@@ -115,8 +115,10 @@ def find_correspondences(
     in_references = scene.mask(scene.rigs.complete(references))[graph.image_of[target]]
     source, target, scores = source[in_references], target[in_references], scores[in_references]
     point = tracks.point_of[target]
-    angle_deg = np.append(scene.track_angles_deg(), 0.0)[point]
-    triangulated = (point >= 0) & (angle_deg >= options.min_point_angle_deg)
+    triangulated = point >= 0
+    distinct, rows = np.unique(point[triangulated], return_inverse=True)
+    angles_deg, _ = scene.angles_deg_of(distinct)
+    triangulated[triangulated] = angles_deg[rows] >= options.min_point_angle_deg
     depth, log_range, depth_known = _depth_ranges(scene, target, options)
     usable = triangulated | ((depth > 0) & options.lifting)
     source, target, scores, point = source[usable], target[usable], scores[usable], point[usable]
