@@ -22,6 +22,8 @@ from functools import cache
 
 import numpy as np
 from scipy.linalg import lapack
+from scipy.sparse import bsr_array
+from scipy.sparse.linalg import splu
 from threadpoolctl import ThreadpoolController
 
 from mpsfm_core.data import Float64
@@ -54,6 +56,12 @@ CG_TOLERANCE = 1e-2
 minimum earlier. [tuned: benchmarks.scale]"""
 MAX_CG_ITERATIONS = 500
 """Maximum number of conjugate-gradient iterations per Levenberg-Marquardt step. [ours]"""
+MAX_FACTORIZED_POSES = 1200
+"""Maximum number of variable poses for a sparse factorization of the reduced camera system, which
+takes at most 600 MB of memory. [ours]"""
+ENOUGH_CG_ITERATIONS = 100
+"""Number of conjugate-gradient iterations that take as long as a sparse factorization, after which
+the system is factorized. [tuned: benchmarks.walks]"""
 MAX_RIG_POSES = 500
 """Maximum number of variable poses for the standard deviation of the scale of a rig, which needs a
 dense factorization. [ours]"""
@@ -196,6 +204,7 @@ class SchurComplementSolver:
         self.p = p
         self.run = run
         self.dense = poses <= options.dense_poses
+        self._factorizes = False
         self.tolerance = options.function_tolerance
         self.rig, self.basis = p.rig, self._build_basis(p.rig, p.state)
         self._trial_rig = p.rig
@@ -290,11 +299,8 @@ class SchurComplementSolver:
         rows = kernels.NUM_IMAGE_PARAMS * len(self.p.bundle.layout.pair) + slots[variable]
         units = np.zeros((len(diagonal), len(rows)))
         units[rows, np.arange(len(rows))] = 1.0
-        if self.dense:
-            columns = self._expand(self._solve_dense(boost, units))
-        else:
-            solutions = [self._expand(self._solve_sparse(boost, unit)) for unit in units.T]
-            columns = np.stack(solutions, axis=1)
+        solve = self._solve_dense if self.dense else self._solve_sparse
+        columns = self._expand(solve(boost, units))
         variances = columns[rows, np.arange(len(rows))]
         determined = (diagonal[rows] > 0) & (variances > 0)
         stds[variable] = np.where(determined, np.sqrt(np.where(determined, variances, 1)), np.inf)
@@ -416,13 +422,89 @@ class SchurComplementSolver:
         return solution if info == 0 else np.full_like(boost, np.nan)
 
     def _solve_sparse(self, boost: Float64, rhs: Float64) -> Float64:
-        """Solve the reduced camera system by block-Jacobi preconditioned conjugate gradients."""
+        """Solve the reduced camera system by conjugate gradients or by sparse factorization.
+
+        Conjugate gradients converge slowly for long chains of images, as in a video. If conjugate
+        gradients do not converge soon, this system and all later systems are factorized.
+
+        Args:
+            boost: (d,) Levenberg-Marquardt damping, which is added to the diagonal.
+            rhs: (d,) or (d, k) right-hand sides.
+
+        Returns:
+            (e,) or (e, k) solutions, whose length is that of the parameters of the rig if any.
+        """
+        can_factorize = (
+            self.basis is None and len(self.p.bundle.layout.pair) <= MAX_FACTORIZED_POSES
+        )
+        max_iterations = ENOUGH_CG_ITERATIONS if can_factorize else MAX_CG_ITERATIONS
+        solutions = []
+        for column in () if self._factorizes else rhs.reshape(len(rhs), -1).T:
+            solution, converged = self._iterate(boost, column, max_iterations)
+            if can_factorize and not converged:
+                self._factorizes = True
+                break
+            solutions.append(solution)
+        if self._factorizes:
+            return self._solve_factorized(boost, rhs)
+        stacked: Float64 = np.stack(solutions, axis=1)
+        return stacked.reshape(-1, *rhs.shape[1:])
+
+    def _damped_diagonal(self, boost: Float64) -> Float64:
+        """Return the damped diagonal blocks (s, 7, 7) of the poses."""
         total = self.total
-        poses = total.border.shape[1]
-        diagonal = np.triu(total.blocks[self.p.pairs[:, 0] == self.p.pairs[:, 1]])
+        diagonal: Float64 = np.triu(total.blocks[self.p.pairs[:, 0] == self.p.pairs[:, 1]])
         diagonal += np.triu(diagonal, 1).transpose(0, 2, 1)
         size = diagonal.shape[-1]
-        diagonal[:, range(size), range(size)] += boost[:poses].reshape(-1, size)
+        damping = boost[: total.border.shape[1]].reshape(-1, size)
+        diagonal[:, range(size), range(size)] += damping
+        return diagonal
+
+    def _solve_factorized(self, boost: Float64, rhs: Float64) -> Float64:
+        """Solve the reduced camera system by a sparse factorization of the blocks of poses.
+
+        The fill-reducing order is minimum degree (SuperLU). The intrinsic parameters are eliminated
+        last, because they have dense rows.
+        """
+        total, pairs = self.total, self.p.pairs
+        num_poses, border = total.border.shape[1], total.border
+        is_diagonal = pairs[:, 0] == pairs[:, 1]
+        off_diagonal = total.blocks[~is_diagonal]
+        rows, columns = np.concatenate(
+            [pairs[is_diagonal], pairs[~is_diagonal], pairs[~is_diagonal, ::-1]]
+        ).T
+        blocks = np.concatenate(
+            [self._damped_diagonal(boost), off_diagonal, off_diagonal.transpose(0, 2, 1)]
+        )
+        order = np.lexsort((columns, rows))
+        starts = np.searchsorted(rows[order], np.arange(len(self.p.bundle.layout.pair) + 1))
+        matrix = bsr_array((blocks[order], columns[order], starts), shape=(num_poses, num_poses))
+        try:
+            factor = splu(
+                matrix.tocsc(),
+                permc_spec="MMD_AT_PLUS_A",
+                diag_pivot_thresh=0.0,
+                options={"SymmetricMode": True},
+            )
+        except RuntimeError:  # the matrix is singular
+            return np.full_like(rhs, np.nan)
+        by_border = factor.solve(np.ascontiguousarray(border.T))
+        corner = total.corner + np.diag(boost[num_poses:]) - border @ by_border
+        of_poses = factor.solve(rhs[:num_poses])
+        of_intrinsics = np.linalg.solve(corner, rhs[num_poses:] - border @ of_poses)
+        solution: Float64 = np.concatenate([of_poses - by_border @ of_intrinsics, of_intrinsics])
+        return solution
+
+    def _iterate(self, boost: Float64, rhs: Float64, max_iterations: int) -> tuple[Float64, bool]:
+        """Solve the reduced camera system by block-Jacobi preconditioned conjugate gradients.
+
+        Returns:
+            The solution (d,), and whether conjugate gradients converged.
+        """
+        total = self.total
+        poses = total.border.shape[1]
+        diagonal = self._damped_diagonal(boost)
+        size = diagonal.shape[-1]
         corner = np.diagonal(total.corner) + boost[poses:]
 
         def multiply(x: Float64) -> Float64:
@@ -439,6 +521,7 @@ class SchurComplementSolver:
                 lambda x: basis.matrix.T @ multiply(basis.matrix @ x),
                 basis.create_preconditioner(blocks, self.p.pairs, entries),
                 basis.matrix.T @ rhs,
+                max_iterations,
             )
         inverse = np.linalg.inv(diagonal)
 
@@ -446,20 +529,25 @@ class SchurComplementSolver:
             first = np.einsum("nab,nb->na", inverse, x[:poses].reshape(-1, size))
             return np.concatenate([first.ravel(), x[poses:] / corner])
 
-        return _conjugate_gradients(multiply, precondition, rhs)
+        return _conjugate_gradients(multiply, precondition, rhs, max_iterations)
 
 
 def _conjugate_gradients(
     multiply: Callable[[Float64], Float64],
     precondition: Callable[[Float64], Float64],
     rhs: Float64,
-) -> Float64:
-    """Solve a linear system by conjugate gradients to the relative residual ``CG_TOLERANCE``."""
+    max_iterations: int,
+) -> tuple[Float64, bool]:
+    """Solve a linear system by conjugate gradients to the relative residual ``CG_TOLERANCE``.
+
+    Returns:
+        The solution, and whether its residual is small enough.
+    """
     solution, residual = np.zeros_like(rhs), rhs.copy()
     direction = precondition(residual)
     energy = float(residual @ direction)
     enough = CG_TOLERANCE**2 * energy
-    for _ in range(MAX_CG_ITERATIONS):
+    for _ in range(max_iterations):
         if energy <= enough:
             break
         image = multiply(direction)
@@ -469,4 +557,4 @@ def _conjugate_gradients(
         corrected = precondition(residual)
         energy, last = float(residual @ corrected), energy
         direction = corrected + (energy / last) * direction
-    return solution
+    return solution, energy <= enough

@@ -340,6 +340,9 @@ def test_views_are_decoded_once_and_forgotten(
     for index in (0, 1, 0, 1, 2, 0):
         found.view(index)
     assert decoded == ["img2.jpg", "img10.png", "side/a.png", "img2.jpg"]
+    found.release_views()
+    found.view(0)
+    assert decoded[4:] == ["img2.jpg"]
 
 
 def test_photo_that_changes_its_size_raises(

@@ -387,6 +387,20 @@ def test_conjugate_gradients_reach_the_dense_optimum(plain: bool) -> None:
     np.testing.assert_allclose(sparse.translations, dense.translations, atol=1e-5)
 
 
+@pytest.mark.parametrize("plain", [False, True])
+def test_long_chain_reaches_the_dense_optimum(plain: bool) -> None:
+    """Conjugate gradients do not converge soon in a long chain, whose system is factorized."""
+    start = perturb(make_problem(120, 2400, 4), 0)
+    start = calibrated(start, CameraModel.SIMPLE_PINHOLE)
+    start = without_depth(start) if plain else start
+    dense = adjust_bundle(start, TIGHT)
+    sparse = adjust_bundle(start, TIGHT.model_copy(update={"dense_poses": 0}))
+    assert sparse.iterations == pytest.approx(dense.iterations, abs=3)
+    assert sparse.final_cost == pytest.approx(dense.final_cost, rel=1e-9)
+    np.testing.assert_allclose(sparse.translations, dense.translations, atol=1e-4)
+    np.testing.assert_allclose(sparse.std_intrinsics, dense.std_intrinsics, rtol=1e-4)
+
+
 def test_result_does_not_depend_on_threads() -> None:
     """Results are bitwise identical; the problem is large enough for several observation ranges."""
     start = perturb(make_problem(12, 6000, 4.5), 0)
