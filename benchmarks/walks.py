@@ -1,12 +1,12 @@
 """Reconstruct rendered walks through several rooms, and compare with COLMAP's mapper.
 
-    python -m benchmarks.walks [--walks 2] [--look-alike 1] [--fps 20] [--config sift]
-        [--max-frames 70] [--set dense.enabled=false] [--records DIR]
+    python -m benchmarks.walks [--walks 2] [--look-alike 1] [--fps 20] [--rounds 1.15]
+        [--config sift] [--max-frames 70] [--set dense.enabled=false] [--records DIR]
 
 A walk is a video of a loop through four furnished rooms with equal doors, which ends after 1.15
-rounds. A walk past look-alike rooms ends after three rooms, the first and third of which differ in
-their pictures only. The video has camera shake, noise, exposure changes and blurred frames, and its
-camera poses are known. Each video is
+rounds, or after more rounds of 20 s for a long video. A walk past look-alike rooms ends after three
+rooms, the first and third of which differ in their pictures only. The video has camera shake,
+noise, exposure changes and blurred frames, and its camera poses are known. Each video is
 reconstructed with an unknown focal length, and the poses of all frames are compared with the true
 poses. Frames are also localized between keyframes with true poses, and depth with smooth errors of
 1.4 %. COLMAP extracts and matches SIFT features of the same keyframes (sequential matching without
@@ -204,19 +204,24 @@ def render_frames(
 
 
 def make_walk(
-    seed: int, fps: float = FPS, *, look_alike: bool = False
+    seed: int, fps: float = FPS, rounds: float = ROUNDS, *, look_alike: bool = False
 ) -> tuple[tuple[Any, Any, Any], list[Pose], np.random.Generator]:
     """Return the rooms and the true poses of a walk, and the generator of the image noise."""
     rng = np.random.default_rng([seed, 51])
     world = build_rooms(rng, look_alike=look_alike)
-    return world, make_path(rng, OPEN_ROUNDS if look_alike else ROUNDS, fps), rng
+    return world, make_path(rng, OPEN_ROUNDS if look_alike else rounds, fps), rng
 
 
 def write_walk(
-    folder: Path, seed: int, fps: float = FPS, *, look_alike: bool = False
+    folder: Path,
+    seed: int,
+    fps: float = FPS,
+    rounds: float = ROUNDS,
+    *,
+    look_alike: bool = False,
 ) -> tuple[Path, list[Pose]]:
     """Write the video of a walk, unless the folder has the video; return video and true poses."""
-    world, poses, rng = make_walk(seed, fps, look_alike=look_alike)
+    world, poses, rng = make_walk(seed, fps, rounds, look_alike=look_alike)
     video = folder / f"{'look_alike' if look_alike else 'walk'}{seed}.mp4"
     if not video.is_file():
         folder.mkdir(parents=True, exist_ok=True)
@@ -258,13 +263,15 @@ def write_room(folder: Path) -> tuple[Path, dict[int, Pose]]:
     return video, rows
 
 
-def localize_between_true_keyframes(video: Path, seed: int, fps: float = FPS) -> Record:
+def localize_between_true_keyframes(
+    video: Path, seed: int, fps: float = FPS, rounds: float = ROUNDS
+) -> Record:
     """Localize the frames of a walk between keyframes with true poses; return quantiles of errors.
 
     The quantiles are 0.5 and 0.9 of the position error in meters, of the rotation error in degrees,
     and of the position error in predicted standard deviations (root mean square of three axes).
     """
-    world, poses, _ = make_walk(seed, fps)
+    world, poses, _ = make_walk(seed, fps, rounds)
     folder, rng = video.with_suffix("") / "frames", np.random.default_rng(seed)
     selection = read_selection(folder)
     camera = PinholeCamera(*SIZE, FOCAL_PX, FOCAL_PX, SIZE[0] / 2, SIZE[1] / 2)
@@ -312,7 +319,7 @@ def run_walk(
     config: str,
     settings: Sequence[str],
     *,
-    is_loop: bool = False,
+    rounds: float | None = None,
 ) -> Record:
     """Reconstruct a video with MP-SfM, and its keyframes with COLMAP; return the errors.
 
@@ -322,7 +329,7 @@ def run_walk(
         fps: Frame rate.
         config: Name of the configuration of MP-SfM.
         settings: Settings that change the configuration.
-        is_loop: True for a walk of :data:`ROUNDS` rounds, whose loop error is measured.
+        rounds: Number of rounds of a walk whose loop error is measured, or None.
     """
     truth = Trajectory(np.array(sorted(poses)) / fps, tuple(poses[n] for n in sorted(poses)))
     output = video.with_suffix("")
@@ -346,7 +353,7 @@ def run_walk(
         record["mpsfm"] = evaluate_trajectory(
             found, truth, count_frames_outside_largest(output / "trajectory.txt")
         )
-        record["keyframes"] = _evaluate_model(output / "sparse", poses, is_loop)
+        record["keyframes"] = _evaluate_model(output / "sparse", poses, rounds)
     start = time.process_time()
     database, mapped = output / "colmap.db", output / "colmap"
     database.unlink(missing_ok=True)
@@ -362,11 +369,11 @@ def run_walk(
     record["colmap_cpu_seconds"] = time.process_time() - start
     if models:
         best = max(models, key=lambda number: models[number].num_reg_images())
-        record["colmap"] = _evaluate_model(mapped / str(best), poses, is_loop)
+        record["colmap"] = _evaluate_model(mapped / str(best), poses, rounds)
     return record
 
 
-def _evaluate_model(folder: Path, poses: Mapping[int, Pose], is_loop: bool) -> Record:
+def _evaluate_model(folder: Path, poses: Mapping[int, Pose], rounds: float | None) -> Record:
     """Return the number of registered keyframes of a COLMAP model, and its errors in meters."""
     found = reconstruction_poses(pycolmap.Reconstruction(str(folder)))
     numbered = {str(int(Path(name).stem[-6:])): pose for name, pose in found.items()}
@@ -376,12 +383,14 @@ def _evaluate_model(folder: Path, poses: Mapping[int, Pose], is_loop: bool) -> R
         "registered": len(found),
         "ate": None if errors is None else errors.ate_rmse,
         "max": None if errors is None else float(errors.centers.max()),
-        "loop": measure_loop_error(numbered, truth) if is_loop else None,
+        "loop": None if rounds is None else measure_loop_error(numbered, truth, rounds),
     }
 
 
-def measure_loop_error(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> float | None:
-    """Measure how far the camera positions of the second round are off, in meters (median).
+def measure_loop_error(
+    found: Mapping[str, Pose], truth: Mapping[str, Pose], num_rounds: float = ROUNDS
+) -> float | None:
+    """Measure how far the camera positions after the first round are off, in meters (median).
 
     The model is aligned with the true poses of the keyframes at the start of the first round, so
     the error is the drift of one round if the loop is not closed.
@@ -389,11 +398,12 @@ def measure_loop_error(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> 
     Args:
         found: Estimated poses ``cam_from_world`` by frame number.
         truth: True poses of all frames of the walk by frame number.
+        num_rounds: Number of rounds of the walk.
 
     Returns:
         The error, or None if too few keyframes at the start and at the end have a pose.
     """
-    start, end = (rounds / ROUNDS * len(truth) for rounds in (START_ROUNDS, 1.0))
+    start, end = (rounds / num_rounds * len(truth) for rounds in (START_ROUNDS, 1.0))
     first = [name for name in found if name in truth and int(name) < start]
     last = [name for name in found if name in truth and int(name) >= end]
     if len(first) < 3 or not last:
@@ -453,13 +463,14 @@ def main() -> None:
     parser.add_argument("--walks", type=int, default=2)
     parser.add_argument("--look-alike", type=int, default=0, help="walks past look-alike rooms")
     parser.add_argument("--fps", type=float, default=FPS)
+    parser.add_argument("--rounds", type=float, default=ROUNDS, help="rounds of the other walks")
     parser.add_argument("--config", default="sift")
     parser.add_argument("--max-frames", type=int, default=70)
     parser.add_argument("--set", dest="settings", action="append", default=[])
     parser.add_argument("--records", type=Path)
     arguments = parser.parse_args()
     settings = [f"inputs.video.max_frames={arguments.max_frames}", *arguments.settings]
-    config, fps = arguments.config, arguments.fps
+    config, fps, rounds = arguments.config, arguments.fps, arguments.rounds
     walks = [(seed, False) for seed in range(arguments.walks)]
     walks += [(seed, True) for seed in range(arguments.look_alike)]
     with tempfile.TemporaryDirectory() as temporary:
@@ -467,11 +478,14 @@ def main() -> None:
         for seed, look_alike in walks:
             path = folder / f"{'look_alike' if look_alike else 'walk'}{seed}-{config}.json"
             if not path.is_file():
-                video, walk = write_walk(folder, seed, fps, look_alike=look_alike)
+                video, walk = write_walk(folder, seed, fps, rounds, look_alike=look_alike)
                 poses = dict(enumerate(walk))
-                record = run_walk(video, poses, fps, config, settings, is_loop=not look_alike)
+                of_loop = None if look_alike else rounds
+                record = run_walk(video, poses, fps, config, settings, rounds=of_loop)
                 if not look_alike:
-                    record["true_keyframes"] = localize_between_true_keyframes(video, seed, fps)
+                    record["true_keyframes"] = localize_between_true_keyframes(
+                        video, seed, fps, rounds
+                    )
                 path.write_text(json.dumps(record))
             records.append(json.loads(path.read_text()))
         path = folder / f"hololens_room-{config}.json"
