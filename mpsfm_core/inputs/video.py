@@ -56,7 +56,8 @@ _MAX_CANDIDATES = 300
 """Maximum number of candidate frames in memory, ten seconds of most videos."""
 _NUM_KEYFRAMES, _MAX_KEYFRAMES = 300, 1000
 """Number of keyframes from which keyframes are dropped if ``max_frames`` is null, and the maximum
-number if neighbors need more to overlap, which takes about 12 GB of memory. [ours]"""
+number if neighbors need more to overlap. Extraction and bundle adjustment of 760 keyframes of
+480 x 360 pixels take 2.4 GB of memory, of which 0.9 GB are mapped files. [ours]"""
 _MAX_MOTION = 0.32
 """Maximum motion between neighbors after keyframes are dropped, relative to the image diagonal.
 [tuned: benchmarks.walks]"""
