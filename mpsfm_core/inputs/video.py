@@ -57,7 +57,7 @@ _MAX_CANDIDATES = 300
 _NUM_KEYFRAMES, _MAX_KEYFRAMES = 300, 1000
 """Number of keyframes from which keyframes are dropped if ``max_frames`` is null, and the maximum
 number if neighbors need more to overlap. Extraction and bundle adjustment of 760 keyframes of
-480 x 360 pixels take 2.4 GB of memory, of which 0.9 GB are mapped files. [ours]"""
+480 x 360 pixels take 2.7 GB of memory, of which 0.9 GB are mapped files. [ours]"""
 _MAX_MOTION = 0.32
 """Maximum motion between neighbors after keyframes are dropped, relative to the image diagonal.
 [tuned: benchmarks.walks]"""
