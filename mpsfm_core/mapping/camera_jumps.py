@@ -19,7 +19,6 @@ from itertools import pairwise
 import numpy as np
 
 from mpsfm_core.data import MappingProblem
-from mpsfm_core.data.decisions import DoubtReason, Reason
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
@@ -48,16 +47,6 @@ def find_jumps(reconstructions: Sequence[Reconstruction], shots: Sequence[Shot])
         shots: Keyframes of all shots.
     """
     return [jump for part in reconstructions for jump in _find_jumps_of_part(part, shots)]
-
-
-def describe_jumps(
-    reconstructions: Sequence[Reconstruction], shots: Sequence[Shot]
-) -> list[Reason]:
-    """Return a reason to doubt a model for each jump of the camera in the model."""
-    return [
-        DoubtReason.CAMERA_JUMP.because(image_a=before, image_b=after)
-        for before, after in find_jumps(reconstructions, shots)
-    ]
 
 
 def remove_matches_across(

@@ -18,7 +18,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Lock
-from typing import Any, cast
+from typing import Any, Protocol, TypeVar, cast
 
 import numpy as np
 
@@ -55,6 +55,40 @@ _NUMERICS = (
     "mapping",
     "dense",
 )
+
+
+class StageCheckpoints(Protocol):
+    """Checkpoints of one stage."""
+
+    def forget(self) -> None:
+        """Delete the checkpoints."""
+
+
+C = TypeVar("C", bound=StageCheckpoints)
+
+
+class RunCheckpoints:
+    """All checkpoints of one run.
+
+    Args:
+        fresh: If true, checkpoints of an interrupted run are deleted before they are used.
+    """
+
+    def __init__(self, *, fresh: bool) -> None:
+        self.fresh = fresh
+        self._stages: list[StageCheckpoints] = []
+
+    def add(self, checkpoints: C) -> C:
+        """Add the checkpoints of a stage, and delete them first if the run starts again."""
+        if self.fresh:
+            checkpoints.forget()
+        self._stages.append(checkpoints)
+        return checkpoints
+
+    def delete(self) -> None:
+        """Delete all checkpoints of a completed run."""
+        for checkpoints in self._stages:
+            checkpoints.forget()
 
 
 class MappingCheckpoints:

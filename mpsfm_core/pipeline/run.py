@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -15,8 +15,8 @@ import pycolmap
 
 from mpsfm_core.config import Config
 from mpsfm_core.config.provider_arguments import Provider, configure
-from mpsfm_core.data import MappingProblem, Pose, Rig
-from mpsfm_core.data.decisions import Reason
+from mpsfm_core.data import Pose, Rig
+from mpsfm_core.data.decisions import DoubtReason, Reason
 from mpsfm_core.data.errors import ConfigError, ReconstructionError
 from mpsfm_core.data.events import EventCallback
 from mpsfm_core.data.result_layout import SUMMARY
@@ -26,52 +26,32 @@ from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
 from mpsfm_core.extraction.runner import (
     Extraction,
-    extend_matches,
     extract,
-    predict_priors_again,
 )
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.models import Poses
-from mpsfm_core.mapping.camera_jumps import (
-    Shot,
-    describe_jumps,
-    find_jumps,
-    remove_matches_across,
-)
-from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
-from mpsfm_core.mapping.initialization.rig_calibration import calibrate_rigs
-from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
-from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.parts import part_mapping
 from mpsfm_core.mapping.scene.reconstruction import (
     MappingResult,
     Reconstruction,
-    RegisteredImage,
     compute_depth_maps,
     hold_out,
 )
 from mpsfm_core.pipeline import precompile, resources
-from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, MappingCheckpoints
+from mpsfm_core.pipeline.checkpoints import DenseCheckpoints, RunCheckpoints
 from mpsfm_core.pipeline.input_reader import InputReader, Source
-from mpsfm_core.pipeline.parts import PartMapper, PartRecord, choose_part_size
+from mpsfm_core.pipeline.mapping_passes import MappingPasses
+from mpsfm_core.pipeline.parts import PartRecord
 from mpsfm_core.pipeline.provider_resolution import ProviderResolution, resolve_providers
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.pipeline.trajectory import localize_frames
-from mpsfm_core.providers.provider_config import FROM_MATCHER, FROM_MULTIVIEW
+from mpsfm_core.providers.provider_config import FROM_MATCHER
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.report.page import write_report
 from mpsfm_core.report.reasons import explain
 from mpsfm_core.results.georeference import georeference
 from mpsfm_core.results.original_images import OriginalImages
-from mpsfm_core.results.refined_views import (
-    measure_distortion,
-    refine_reconstructions,
-    take_refined_camera,
-    undistort_images,
-    undistort_problem,
-)
 from mpsfm_core.results.summary import FORMAT as SUMMARY_FORMAT
 from mpsfm_core.results.summary import (
     RunSummary,
@@ -91,11 +71,6 @@ from mpsfm_core.support.threads import limit_threads, thread_limit
 PathLike = str | Path
 
 _log = logging.getLogger(__name__)
-_MIN_DISTORTION = 0.1
-"""Relative displacement of the image corners by lens distortion from which depth is predicted again
-in undistorted images. [tuned: benchmarks.distortion]"""
-_MAX_JUMP_RUNS = 3
-"""Maximum number of mapper runs without matches of look-alike places in a video. [ours]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,7 +226,6 @@ class _Run:
     ) -> None:
         self._registry = registry
         self._output = output
-        self._fresh = fresh
         self._stages = Stages(registry, on_event)
         self._resolution = ProviderResolution(config, ())
         self._inputs = InputReader(source, output, config.inputs, self._stages)
@@ -261,9 +235,9 @@ class _Run:
         self._trajectories: dict[str, list[TrajectoryFrame]] = {}
         self._estimate = resources.ResourceEstimate(0, 0, 0)
         self._children = ChildMemoryMonitor()
-        self._checkpoints: list[MappingCheckpoints | DenseCheckpoints | PartMapper] = []
-        self._compilation: precompile.Compilation | None = None
+        self._checkpoints = RunCheckpoints(fresh=fresh)
         self._part_records: list[PartRecord] = []
+        self._compilation: precompile.Compilation | None = None
 
     @property
     def _config(self) -> Config:
@@ -293,18 +267,15 @@ class _Run:
             self._check_resources(images)
         images, extraction = self._extract(images)
         self._finish_compilation()
-        mapping = self._map(extraction.problem.with_poses(self._inputs.known_poses))
-        extraction, mapping = self._map_without_jumps(extraction, mapping)
-        undistorted, extraction, mapping = self._map_undistorted(images, extraction, mapping)
-        views = undistorted
-        if self._config.has_second_pass:
-            extraction, views, mapping = self._run_second_pass(undistorted, extraction, mapping)
-        self._add_doubts(describe_jumps(mapping.reconstructions, self._shots))
-        refined = undistort_images(views, extraction.problem, mapping.reconstructions)
-        problem = undistort_problem(undistorted, refined, extraction.problem)
-        if refined is not views:
-            mapping = self._refine_depth_maps(refined, problem, mapping)
-        originals = OriginalImages(refined, problem)
+        passes = MappingPasses(
+            self._config, self._registry, self._stages, self._inputs, self._checkpoints
+        )
+        extraction, mapping, originals = passes.run(images, extraction)
+        self._part_records = passes.part_records
+        self._add_doubts(
+            DoubtReason.CAMERA_JUMP.because(image_a=before, image_b=after)
+            for before, after in passes.jumps
+        )
         if not mapping.reconstructions:
             self._fail(images, extraction, mapping, originals)
         self._warn_of_uncalibrated_rigs(mapping.reconstructions[0])
@@ -315,7 +286,7 @@ class _Run:
         mapping = self._densify(hold_out(mapping, self._config.dense.hold_out_every), originals)
         self._localize_frames(mapping, originals)
         result = self._write_results(images, extraction, mapping, originals)
-        self._delete_checkpoints()
+        self._checkpoints.delete()
         self._write_report()
         self._complete_summary(result.summary)
         return result
@@ -371,158 +342,12 @@ class _Run:
         if self._compilation is not None:
             self._compilation.stop()
 
-    def _map(self, problem: MappingProblem, options: MapperOptions | None = None) -> MappingResult:
-        """Run the mapper, by default with the mapper options of the configuration."""
-        options = options or self._config.mapper_options()
-        options = choose_part_size(options, self._config.runtime, len(problem.images))
-        with self._stages.stage("mapping"):
-            checkpoints = self._mapping_checkpoints(problem, options)
-            part_mapper = self._part_mapper()
-            result = part_mapping.reconstruct(
-                problem, options, self._stages, checkpoints, part_mapper
-            )
-            self._part_records = part_mapper.records
-            return result
-
-    @property
-    def _shots(self) -> Sequence[Shot]:
-        """Shots of the videos, in which the camera may not jump, or none with known poses."""
-        return [] if self._inputs.known_poses else self._inputs.shots
-
-    def _map_without_jumps(
-        self,
-        extraction: Extraction,
-        mapping: MappingResult,
-        prepare: Callable[[MappingProblem], MappingProblem] = lambda problem: problem,
-    ) -> tuple[Extraction, MappingResult]:
-        """Map again without matches between look-alike places, if the camera of a video jumps.
-
-        Args:
-            extraction: Extraction with all verified pairs.
-            mapping: Result of the mapper with all verified pairs.
-            prepare: Function that prepares a problem of the extraction for the mapper.
-
-        Returns:
-            Extraction and result of the mapper without matches across jumps.
-        """
-        for _ in range(_MAX_JUMP_RUNS):
-            jumps = find_jumps(mapping.reconstructions, self._shots)
-            problem = remove_matches_across(extraction.problem, jumps, self._shots)
-            num_removed = len(extraction.problem.pairs) - len(problem.pairs)
-            if not num_removed:
-                break
-            self._stages.notice(
-                f"the camera jumps between the frames {jumps[0][0]} and {jumps[0][1]}, so the "
-                f"matches of {num_removed} pairs of distant frames across a jump are not used"
-            )
-            extraction = replace(extraction, problem=problem)
-            mapping = self._map(prepare(problem))
-        return extraction, mapping
-
     def _add_doubts(self, doubts: Iterable[Reason]) -> None:
         """Warn of reasons to doubt the result, and store them for the summary."""
         for doubt in doubts:
             self._doubts += (doubt,)
             explanation = explain(doubt)
             self._stages.warn(f"{explanation.text} {explanation.remedy}")
-
-    def _map_undistorted(
-        self, images: ImageSet, extraction: Extraction, mapping: MappingResult
-    ) -> tuple[ImageSet, Extraction, MappingResult]:
-        """Predict depth and map again in undistorted views, if the mapper found strong distortion.
-
-        Depth networks are trained on images without distortion.
-
-        Returns:
-            Images with refined cameras, extraction on their views, and result of the mapper.
-        """
-        config = self._config
-        refined = undistort_images(images, extraction.problem, mapping.reconstructions)
-        pairs = list(zip(refined, images, strict=True))
-        changed = np.array([new is not old for new, old in pairs])
-        shifts = [measure_distortion(new) for new, old in pairs if new is not old]
-        distortion = max(shifts, default=0.0)
-        if distortion < _MIN_DISTORTION or not self._predicts_from_one_view():
-            return images, extraction, mapping
-        self._stages.notice(
-            f"the lens moves the image corners by {distortion:.0%}, so {config.depth.use} predicts "
-            "depth again, from undistorted images"
-        )
-        with self._stages.stage("extraction"):
-            problem = undistort_problem(images, refined, extraction.problem)
-            problem = predict_priors_again(refined, config, self._registry, problem, self._stages)
-            problem = estimate_relative_poses(problem, changed, config.runtime.seed)
-            problem = calibrate_rigs(problem, mapping.reconstructions) or problem
-        mapping = self._map(problem.with_poses(self._inputs.known_poses))
-        return refined, replace(extraction, problem=problem), mapping
-
-    def _predicts_from_one_view(self) -> bool:
-        """Return whether depth and normals are predicted from single views, and not from files."""
-        depth, normals = self._config.depth.use, self._config.normals.use
-        if depth in (FROM_MATCHER, FROM_MULTIVIEW):
-            return False
-        specs = self._registry.spec("depth", depth), self._registry.spec("normals", normals)
-        return not any("uncached" in spec.capabilities for spec in specs)
-
-    def _run_second_pass(
-        self, images: ImageSet, extraction: Extraction, mapping: MappingResult
-    ) -> tuple[Extraction, ImageSet, MappingResult]:
-        """Match images with too few points after the fast pass, and map again from seed poses.
-
-        Returns:
-            Extraction with all matches, images with refined cameras, and result of the second
-            mapper run.
-        """
-        config = self._config
-        assert config.fast_pass is not None
-        seeds = select_seed_images(mapping)
-        unconstrained = frozenset(range(len(images))) - {image.index for image in seeds}
-        if not unconstrained:
-            return extraction, images, mapping
-        matchers = (config.matcher, config.dense_matcher)
-        names = " and ".join(matcher.use for matcher in matchers if matcher is not None)
-        self._stages.notice(
-            f"{len(unconstrained)} of {len(images)} images have too few points after the fast "
-            f"pass: {names} matches these images again"
-        )
-        with self._stages.stage("extraction"):
-            extraction = extend_matches(
-                images, config, self._registry, extraction, unconstrained, self._stages
-            )
-        refined = undistort_images(images, extraction.problem, mapping.reconstructions)
-        seeds = [take_refined_camera(refined, seed) for seed in seeds]
-        changed = np.array([new is not old for new, old in zip(refined, images, strict=True)])
-        first_models = mapping.reconstructions
-
-        def prepare(problem: MappingProblem) -> MappingProblem:
-            problem = undistort_problem(images, refined, problem)
-            problem = estimate_relative_poses(problem, changed, config.runtime.seed)
-            return calibrate_rigs(problem, first_models) or problem
-
-        mapping = self._map_from_seeds(prepare(extraction.problem), seeds)
-        extraction, mapping = self._map_without_jumps(extraction, mapping, prepare)
-        return extraction, refined, mapping
-
-    def _map_from_seeds(
-        self, problem: MappingProblem, seeds: list[RegisteredImage]
-    ) -> MappingResult:
-        """Map again from the poses of the fast pass, or poses that the user fixed."""
-        problem = problem.with_poses(self._inputs.known_poses)
-        options = self._config.mapper_options()
-        if not self._inputs.known_poses:
-            options = options.model_copy(update={"known_poses": "guess"})
-        if options.known_poses != "fixed":
-            problem = apply_seed_poses(problem, seeds)
-        return self._map(problem, options)
-
-    def _refine_depth_maps(
-        self, refined: ImageSet, problem: MappingProblem, mapping: MappingResult
-    ) -> MappingResult:
-        """Refine depth maps again in views that are undistorted with the refined cameras."""
-        options = self._config.mapper_options()
-        with self._stages.stage("mapping"):
-            parts = refine_reconstructions(refined, problem, mapping.reconstructions, options)
-            return replace(mapping, reconstructions=parts)
 
     def _warn_of_uncalibrated_rigs(self, largest: Reconstruction) -> None:
         """Warn of rigs whose relative poses could not be estimated from the largest component."""
@@ -653,7 +478,7 @@ class _Run:
         originals: OriginalImages,
     ) -> None:
         """Write a summary with the reasons of the failure, and raise ReconstructionError."""
-        self._delete_checkpoints()
+        self._checkpoints.delete()
         summary = self._summarize("failed", images, extraction, mapping, (), originals)
         hint = ""
         if self._output is not None:
@@ -779,27 +604,6 @@ class _Run:
         if workers < configured:
             self._stages.notice(f"uses {workers} of {configured} workers, because memory is short")
 
-    def _mapping_checkpoints(
-        self, problem: MappingProblem, options: MapperOptions
-    ) -> MappingCheckpoints | None:
-        runtime = self._config.runtime
-        if runtime.checkpoint_s is None:
-            return None
-        checkpoints = MappingCheckpoints(
-            runtime.cache_dir, problem, options, self._stages, runtime.checkpoint_s
-        )
-        if self._fresh:
-            checkpoints.forget()
-        self._checkpoints.append(checkpoints)
-        return checkpoints
-
-    def _part_mapper(self) -> PartMapper:
-        part_mapper = PartMapper(
-            self._config.runtime, self._registry, self._stages, fresh=self._fresh
-        )
-        self._checkpoints.append(part_mapper)
-        return part_mapper
-
     def _dense_checkpoints(
         self, part: Reconstruction, originals: OriginalImages
     ) -> DenseCheckpoints | None:
@@ -808,14 +612,7 @@ class _Run:
             return None
         keys = [originals.key(image) for image in part.images]
         checkpoints = DenseCheckpoints(config.runtime.cache_dir, part, keys, config.dense)
-        if self._fresh:
-            checkpoints.forget()
-        self._checkpoints.append(checkpoints)
-        return checkpoints
-
-    def _delete_checkpoints(self) -> None:
-        for checkpoints in self._checkpoints:
-            checkpoints.forget()
+        return self._checkpoints.add(checkpoints)
 
 
 def _without_matching(config: Config) -> Config:
