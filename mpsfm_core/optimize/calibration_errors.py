@@ -20,8 +20,8 @@ With the Gauss-Newton matrix ``H`` and gradient ``g`` of the reprojection errors
 q)``, where ``q`` are the deviations of the parameters from their prior means, and ``C = (H / v + D
 + P)^-1`` is the covariance. The variance factor ``v`` is estimated from the residuals (Foerstner
 and Wrobel, "Photogrammetric Computer Vision", 2016, 4.2.3), because the declared keypoint noise
-need not be true. The factors ``v`` and ``c`` account for the curvature of the robust loss (Huber,
-"Robust Statistics", 1981, 7.6).
+need not be true, and an image with larger residuals has a larger factor. The factors ``v`` and
+``c`` account for the curvature of the robust loss (Huber, "Robust Statistics", 1981, 7.6).
 
 A depth map has a smooth error that many pixels share, such as a tilt, whereas bundle adjustment
 takes depth errors as independent. Smooth errors with the Jacobian ``S`` of the gradient by their
@@ -545,8 +545,10 @@ def _linearize_reprojection(
     weight, curvature = _evaluate_loss(
         options.reprojection_loss, options.reprojection_scale, squared
     )
-    num_parameters = 3 * len(np.unique(seen.point)) + 6 * (len(problem.rotations) - 1)
-    variance_factor, newton_factor = _estimate_factors(weight, curvature, squared, num_parameters)
+    lengths = np.bincount(seen.point)[seen.point]
+    variance_factors, newton_factor = _estimate_factors(
+        weight, curvature, squared, lengths, seen.image
+    )
     image = seen.image[:, None]
     by_slopes = scale[:, :, None] * derivative
     by_point = (
@@ -564,7 +566,7 @@ def _linearize_reprojection(
         )
         blocks.append(by_intrinsics)
         indices.append(intrinsics_indices)
-    root = np.sqrt(weight / variance_factor)[:, None]
+    root = np.sqrt(weight / variance_factors[seen.image])[:, None]
     jacobian = np.concatenate(blocks, axis=2) * root[:, :, None]
     matrix = _to_sparse(jacobian, np.concatenate(indices, axis=2), columns.end)
     return matrix, (newton_factor * residuals * root).ravel()
@@ -697,19 +699,42 @@ def _evaluate_loss(loss: Loss, scale: float, squared: Float64) -> tuple[Float64,
 
 
 def _estimate_factors(
-    weight: Float64, curvature: Float64, squared: Float64, num_parameters: int
-) -> tuple[float, float]:
-    """Estimate the variance factor and the Newton factor of robust residuals.
+    weight: Float64, curvature: Float64, squared: Float64, lengths: Int64, image: Int64
+) -> tuple[Float64, float]:
+    """Estimate the variance factor of each image and the Newton factor of robust residuals.
 
     An M-estimator has the covariance ``E[psi^2] / E[psi']^2 (J^T J)^-1``, whereas the inverse of
     the IRLS matrix is ``(E[w] J^T J)^-1``. A Newton step is longer than an IRLS step by ``E[w] /
-    E[psi']``.
+    E[psi']``. A track of ``l`` observations constrains the cameras in ``2 l - 3`` directions. One
+    of them is the direction of the residuals, in which the loss has the smallest curvature.
+
+    The variance of an image with few matches may be larger than that of all images (variance
+    component estimation; Foerstner and Wrobel, 4.2.4). The larger of both is used.
+
+    Args:
+        weight: (m,) IRLS weights.
+        curvature: (m,) curvatures, see :func:`_evaluate_loss`.
+        squared: (m,) squared residuals.
+        lengths: (m,) track lengths.
+        image: (m,) index of the observing image.
+
+    Returns:
+        Variance factors (n,) of the images, and the Newton factor of all observations.
     """
-    redundancy = max(2 * len(squared) - num_parameters, 1)
-    mean_weight, mean_curvature = float(weight.mean()), max(float(curvature.mean()), 1e-3)
-    influence = float((weight**2 * squared).sum()) / redundancy
-    variance = max(influence * mean_weight / mean_curvature**2, MIN_VARIANCE_FACTOR)
-    return variance, mean_weight / mean_curvature
+    num_directions = np.maximum(2 * lengths - 3, 1)
+    along_residual = 2 * curvature - weight
+    curvature = curvature + (along_residual - curvature) / num_directions
+    redundancy = np.maximum(2 * lengths - 3, 0) / lengths
+    terms = redundancy, redundancy * weight, redundancy * curvature, weight**2 * squared
+    sums = np.array([np.bincount(image, values) for values in terms])
+    sums = np.concatenate([sums, sums.sum(axis=1, keepdims=True)], axis=1)
+    num_poses = np.append(np.ones(sums.shape[1] - 1), sums.shape[1] - 2)
+    total = np.maximum(sums[0], 1e-9)
+    mean_weight, mean_curvature = sums[1] / total, np.maximum(sums[2] / total, 1e-3)
+    influence = sums[3] / np.maximum(sums[0] - 6 * num_poses, 1)
+    variance = np.maximum(influence * mean_weight / mean_curvature**2, MIN_VARIANCE_FACTOR)
+    newton_factor = float(mean_weight[-1] / mean_curvature[-1])
+    return np.maximum(variance[:-1], variance[-1]), newton_factor
 
 
 def _to_sparse(values: Float64, indices: Int64, num_columns: int) -> csr_array:

@@ -184,6 +184,24 @@ def test_predict_calibration_errors_of_a_known_camera_come_from_noise_only() -> 
     assert errors.pose_deg.max() < 0.5
 
 
+def test_predict_calibration_errors_of_an_image_with_noisy_keypoints_match_its_pose_error() -> None:
+    true_deg, predicted_deg = [], []
+    for seed in range(8):
+        scene = make_scene(seed)
+        noise = 3.0 * np.random.default_rng(seed).normal(size=scene.obs_xy.shape)
+        noise[np.asarray(scene.obs_image) != 2] = 0.0
+        known = replace(scene, variable_intrinsics=None, obs_xy=scene.obs_xy + noise)
+        solved = start_at(known, adjust_bundle(known, OPTIONS))
+        errors = predict_calibration_errors(solved, OPTIONS, KNOWN, SIZES)
+        assert errors is not None
+        true_deg.append(measure_pose_errors_deg(solved, scene))
+        predicted_deg.append(errors.pose_deg)
+    true, predicted = np.array(true_deg), np.array(predicted_deg)
+    assert np.sqrt((true[:, 2] ** 2).mean()) > 2 * np.sqrt((true[:, [0, 1, 4]] ** 2).mean())
+    ratio = np.sqrt((true[:, 2] ** 2).mean()) / predicted[:, 2].mean()
+    assert 0.6 < ratio < 3.0
+
+
 def test_predict_calibration_errors_of_a_pure_rotation_are_large() -> None:
     scene = make_scene(0)
     point = camera_center(scene.rotations[0], scene.translations[0])
