@@ -25,6 +25,7 @@ from mpsfm_core.dense.densify import densify
 from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.mesh import mesh_depth_maps
 from mpsfm_core.dense.options import DenseOptions, MeshOptions
+from mpsfm_core.dense.stereo import StereoDepth
 from mpsfm_core.dense.texture import build_texture
 from mpsfm_core.evaluation.rendering import Geometry, render
 from mpsfm_core.geometry import camera_center
@@ -35,7 +36,7 @@ from mpsfm_core.testing.synthetic.scenes import look_at
 ROOT = Path(__file__).resolve().parents[1]
 SAMPLE_SCENE = ROOT / "examples" / "sample_scene"
 ROOM, STREET = "room", "street_"
-SCENES = [ROOM, *(f"{STREET}{seed}" for seed in range(4))]
+SCENES = [ROOM, *(f"{STREET}{seed}" for seed in range(5))]
 """The sample scene, and generated streets with their seeds."""
 WIDTH = 366
 """Width of one rendering in pixels; a picture has three renderings."""
@@ -51,6 +52,19 @@ class Scene(NamedTuple):
     view_of: Callable[[str], View]
     up: Float64 | None
     """(3,) direction of the zenith, or None if it is upwards in the middle photo."""
+
+
+class _StereoMemory:
+    """Stereo depth of all images, which does not depend on the option ``check_validity``."""
+
+    def __init__(self) -> None:
+        self._depths: dict[str, StereoDepth] = {}
+
+    def load(self, name: str) -> StereoDepth | None:
+        return self._depths.get(name)
+
+    def save(self, name: str, depth: StereoDepth) -> None:
+        self._depths[name] = depth
 
 
 def main() -> None:
@@ -86,10 +100,10 @@ def _reconstruct_sample_scene() -> Scene:
 def draw_scene(scene: Scene) -> UInt8:
     """Render the cloud with all points, the cloud without doubtful points, and the mesh."""
     camera, pose = _place_camera(scene)
-    renderings = []
+    renderings, stereo = [], _StereoMemory()
     for check_validity in (False, True):
         dense_options = DenseOptions(check_validity=check_validity)
-        dense, _ = densify(scene.reconstruction, scene.view_of, dense_options)
+        dense, _ = densify(scene.reconstruction, scene.view_of, dense_options, checkpoints=stereo)
         cloud = fuse_depth_maps(dense, scene.view_of)
         none = np.zeros((0, 3), np.int64)
         renderings.append(render(Geometry(cloud.points, cloud.colors, none), camera, pose))
