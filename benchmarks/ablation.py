@@ -23,7 +23,7 @@ from mpsfm_core.support.yaml_text import write_yaml
 
 VARIANTS: Mapping[str, Mapping[str, object]] = {
     "default": {},
-    "initialization from one pair": {"initialization": {"global_initialization": False}},
+    "initialization from one pair": {"global_initialization": False},
     "reprojection loss not estimated": {"refinement": {"measure_keypoint_noise": False}},
     "no lifting": {"registration": {"lifting": False}},
     "bundle adjustment with refined depth": {"refinement": {"bundle_depth": "refined"}},

@@ -33,7 +33,7 @@ from mpsfm_core.testing.synthetic.halls import QUALITIES, HallProblem, make_hall
 PEER = "colmap"
 VARIANTS: Mapping[str, Mapping[str, object]] = {
     "default": {},
-    "initialization from one pair": {"initialization": {"global_initialization": False}},
+    "initialization from one pair": {"global_initialization": False},
     "reprojection loss not estimated": {"refinement": {"measure_keypoint_noise": False}},
     "evidence not weighted": {"consistency": {"weigh_evidence": False}},
     "no depth check": {"consistency": {"enabled": False}},

@@ -126,14 +126,14 @@ class IncrementalRegistration:
         The selected images are the local bundle of the best match, or the best matching images if
         ``wide``.
         """
-        scores, options = self._scores, self._options.registration
+        scores = self._scores
         if wide:
             score = scores[[image]].toarray()[0]
             matching = np.flatnonzero(self._scene.registered & (score > 0))
             order = np.argsort(-score[matching], kind="stable")
             references = matching[order[:NUM_WIDE_REFERENCES]].tolist()
         else:
-            references = find_local_bundle(self._scene, best_match, options.num_neighbors, scores)
+            references = find_local_bundle(self._scene, best_match, scores)
         excluded = self._history.excluded_references.get(image, ())
         return [k for k in references if k not in excluded]
 
@@ -240,8 +240,7 @@ class IncrementalRegistration:
             members = scene.rigs.images_of(image)
             for member in members:
                 triangulate_image(scene, member, options.triangulation)
-            num_neighbors = options.refinement.local_images - 1
-            _, *neighbors = find_local_bundle(scene, image, num_neighbors, self._scores)
+            _, *neighbors = find_local_bundle(scene, image, self._scores)
             neighbors = [neighbor for neighbor in neighbors if neighbor not in members[1:]]
             for member in members:
                 self._refiner.estimate_scale(member, neighbors)

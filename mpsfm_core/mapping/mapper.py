@@ -352,8 +352,9 @@ class Mapper:
         return candidates
 
     def _initialize_globally(self) -> bool:
-        is_enabled = self.options.initialization.global_initialization
-        return is_enabled and self.component.initialize_globally(self.unregistered)
+        return self.options.global_initialization and self.component.initialize_globally(
+            self.unregistered
+        )
 
     def _initialize_from_known_poses(self) -> bool:
         if self._uses_known_poses and not self.component.initialize_from_known_poses(

@@ -28,6 +28,10 @@ MAX_ROTATION_DEG = 3.0
 """Rotation of a camera in one global refinement above which depth consistency decides whether the
 refinement is kept. [ours]"""
 
+GLOBAL_GROWTH = 0.3
+"""Relative growth of the number of images or points after which all images are refined.
+[reference]"""
+
 
 class ModelState(NamedTuple):
     """Copy of the state of a model, for a rollback."""
@@ -119,9 +123,9 @@ class ModelMaintenance:
         self._last_size = (0, 0)
 
     def refine_if_grown(self) -> None:
-        """Refine all images if images or points grew by the option ``global_growth``."""
+        """Refine all images if the number of images or points grew by ``GLOBAL_GROWTH``."""
         num_images, num_points = self.size, len(self.scene.tracks)
-        growth = 1 + self.options.refinement.global_growth
+        growth = 1 + GLOBAL_GROWTH
         if num_images > growth * self._last_size[0] or num_points > growth * self._last_size[1]:
             self.refine_globally()
 

@@ -16,24 +16,6 @@ from mpsfm_core.data.options import Options, expert
 from mpsfm_core.optimize.options import BundleOptions, IntegrationOptions
 
 
-class InitializationOptions(Options):
-    """Options of the initialization of a component."""
-
-    global_initialization: bool = expert(True)
-    """Initialize from averaged poses of all well connected images, or from an image pair if these
-    poses fail verification. Without global initialization, an image pair initializes every
-    component. [tuned: benchmarks.ablation]"""
-    max_pairs: int = expert(50, ge=1)
-    """Maximum number of initial image pairs to try; raising the number takes longer and may
-    initialize more components. [ours]"""
-    num_compared: int = expert(5, ge=1)
-    """Number of image pairs with most matches whose relative poses are compared; the pair with the
-    best supported pose is tried first. [tuned: benchmarks.accuracy]"""
-    high_parallax_deg: float = expert(1.5, gt=0)
-    """Smallest triangulation angle of a point that supports an initial image pair if ``lifting`` is
-    off. [COLMAP init_min_tri_angle]"""
-
-
 class RegistrationOptions(Options):
     """Options of the registration of the next image."""
 
@@ -50,29 +32,15 @@ class RegistrationOptions(Options):
     max_error_px: float = expert(12.0, gt=0)
     """Largest reprojection error of an inlier of PnP; raising it accepts less accurate points.
     [COLMAP abs_pose_max_error]"""
-    max_support_error_px: float = expert(4.0, gt=0)
-    """Largest distance between an inlier keypoint and the projection of the depth interval of its
-    matched keypoint. [COLMAP two-view max_error]"""
     max_depth_deviation: float = expert(2.0, ge=0)
     """Half length of the depth interval of a matched keypoint, in standard deviations of log depth;
     raising it lowers the influence of depth. [ours]"""
-    confident_inlier_ratio: float = expert(0.85, ge=0, le=1)
-    """Inlier ratio of the best pose above which no pose hypotheses from resampled matches are
-    generated. [ours]"""
-    num_resamples: int = expert(8, ge=0)
-    """Number of random halves of the matches that generate pose hypotheses in each registration
-    attempt. [ours]"""
     max_resampled_attempts: int = expert(3, ge=0)
     """Number of registration attempts of an image that draw new random halves of the matches.
     [ours]"""
     num_locally_optimized: int = expert(8, ge=0)
     """Number of distinct pose hypotheses whose support is maximized; 0 keeps the poses of RANSAC.
     [tuned: benchmarks.ablation]"""
-    num_bundle_adjusted: int = expert(3, ge=1)
-    """Number of distinct pose hypotheses that bundle adjustment refines before the best hypothesis
-    is selected. [ours]"""
-    max_bundle_iterations: int = expert(10, ge=1)
-    """Maximum number of iterations of the bundle adjustment of a pose hypothesis. [ours]"""
     min_inlier_ratio: float = expert(0.25, gt=0, le=1)
     """Assumed inlier ratio from which RANSAC computes its number of trials; raising the ratio makes
     RANSAC faster, but RANSAC may miss poses. [COLMAP abs_pose_min_inlier_ratio]"""
@@ -82,12 +50,6 @@ class RegistrationOptions(Options):
     ``refinement.refine_focal``. [ours]"""
     lifting: bool = expert(True)
     """Use 3D points that are lifted from the depth map of a single image. [paper 3.2]"""
-    min_point_angle_deg: float = expert(1.0, ge=0)
-    """Triangulation angle below which a point lifted from depth replaces a triangulated point.
-    [reference robust_triangles]"""
-    num_neighbors: int = expert(4, ge=0)
-    """Number of neighbors of the best matching image whose points also determine the new pose.
-    [reference: bundle of 5]"""
     max_relaxations: int = expert(6, ge=0)
     """Number of times that ``min_inliers`` and ``min_pose_inlier_ratio`` are divided by 1.2 if no
     image registers; raising it registers more, but less reliable images. [reference]"""
@@ -130,15 +92,9 @@ class RefinementOptions(Options):
     """Estimate the scales of depth priors in bundle adjustment. If ``free_scales`` is False, scale
     estimation and bundle adjustment alternate, which converges slowly because poses and points
     compensate scale errors. [tuned: benchmarks.ablation]"""
-    local_images: int = expert(5, ge=2)
-    """Number of images of a local bundle, including the new image. [reference]
-    [COLMAP ba_local_num_images]"""
     first_reprojection_scale: float = expert(5.0, ge=1)
     """Factor on the scale of the reprojection loss in the first bundle adjustment of a new image,
     whose reprojection errors may be several pixels. [tuned: benchmarks.ablation]"""
-    global_growth: float = expert(0.3, gt=0)
-    """Relative growth of the number of images or points after which all images are refined; raising
-    it is faster and less accurate. [reference]"""
     refine_focal: bool = Field(True)
     """Refine guessed focal lengths that the images determine; known focal lengths stay fixed."""
     refine_distortion: bool = Field(True)
@@ -176,17 +132,9 @@ class ConsistencyOptions(Options):
     max_violations: float = expert(0.05, gt=0)
     """Share of pixels that contradict the depth of another image above which an image is rejected;
     raising it registers more images, also wrong ones. [paper beta] [tuned: benchmarks.symmetry]"""
-    max_violations_pair: float = expert(0.01, gt=0)
-    """Share of pixels with contradicting depth above which the relative pose of an image pair is
-    inconsistent, before any image is registered. [tuned: benchmarks.accuracy]"""
     max_deviation: float = expert(2.7, gt=0)
     """Smallest depth error of a pixel that counts as a violation of depth consistency, in standard
     deviations of both depth priors. [paper gamma] [reference: 0.6 * 15 / 3.33]"""
-    min_gap: float = expert(0.05, ge=0)
-    """Smallest relative depth error of a pixel that counts as a violation of depth consistency.
-    [tuned: benchmarks.symmetry]"""
-    num_views: int = expert(16, ge=1)
-    """Number of most overlapping images whose depth is compared with that of a new image. [ours]"""
     map_width: int = expert(160, ge=16)
     """Width in pixels to which depth maps are subsampled for the depth consistency check. [ours]"""
 
@@ -209,6 +157,10 @@ class MappingOptions(Options):
     weigh_by_score: bool = expert(True)
     """Weight matches by their scores in pose support and in bundle adjustment.
     [tuned: benchmarks.ablation]"""
+    global_initialization: bool = expert(True)
+    """Initialize from averaged poses of all well connected images, or from an image pair if these
+    poses fail verification. Without global initialization, an image pair initializes every
+    component. [tuned: benchmarks.ablation]"""
     max_components: int = expert(10, ge=1)
     """Maximum number of disconnected components. [COLMAP max_num_models]"""
     max_runs: int = expert(3, ge=1)
@@ -223,8 +175,6 @@ class MappingOptions(Options):
     predict_errors: bool = expert(True)
     """Predict the errors of poses and intrinsics for the report. Parts of a reconstruction are
     mapped without predictions, because the last refinement predicts the errors of all images."""
-    initialization: InitializationOptions = InitializationOptions()
-    """Options of the initialization."""
     registration: RegistrationOptions = RegistrationOptions()
     """Options of the registration of images."""
     triangulation: TriangulationOptions = TriangulationOptions()

@@ -25,7 +25,7 @@ from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.geometry.patch_alignment import align_patches
 from mpsfm_core.mapping import mapper
-from mpsfm_core.mapping.options import InitializationOptions, MapperOptions
+from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.optimize.bundle_kernels import update_points
 from mpsfm_core.optimize.depth_integration import DepthIntegrator
@@ -103,8 +103,8 @@ def compile_kernels(first: str) -> None:
         DepthIntegrator(depth, normals, _CAMERA.resized(width, height)).refine()
         _compile_dense(_known_reconstruction(problem, poses), views)
     for is_global in (True, False):
-        initialization = InitializationOptions(global_initialization=is_global)
-        mapping = mapper.reconstruct(problem, MapperOptions(initialization=initialization))
+        options = MapperOptions(global_initialization=is_global)
+        mapping = mapper.reconstruct(problem, options)
     _compile_dense(mapping.reconstructions[0], views)
 
 

@@ -52,11 +52,7 @@ def in_units(
 
 @pytest.mark.parametrize("global_initialization", [True, False])
 def test_images_of_depth_group_share_scale(global_initialization: bool) -> None:
-    options = MapperOptions()
-    initialization = options.initialization.model_copy(
-        update={"global_initialization": global_initialization}
-    )
-    options = options.model_copy(update={"initialization": initialization})
+    options = MapperOptions(global_initialization=global_initialization)
     mapper = Mapper(in_units([0, 0, 1, 1]), options, NullMappingEvents())
     mapper.reconstruct_component()
     scene = mapper.component.scene

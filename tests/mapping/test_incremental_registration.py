@@ -197,7 +197,7 @@ def test_larger_component_takes_images_of_smaller_one(is_connected: bool, sizes:
     if not is_connected:
         pairs = tuple(p for p in problem.pairs if (p.image_a < 4) == (p.image_b < 4))
         problem = replace(problem, pairs=pairs)
-    options = MapperOptions.model_validate({"initialization": {"global_initialization": False}})
+    options = MapperOptions(global_initialization=False)
     mapper = Mapper(problem, options, NullMappingEvents())
     mapper.unregistered[4:] = False
     mapper.reconstruct_component()

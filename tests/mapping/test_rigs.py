@@ -63,9 +63,7 @@ def make_problem(kind: RigKind, count: int, frame_poses: list[Float64] | None = 
 
 def incremental() -> MapperOptions:
     """Return options of the mapper without global initialization."""
-    options = MapperOptions()
-    initialization = options.initialization.model_copy(update={"global_initialization": False})
-    return options.model_copy(update={"initialization": initialization})
+    return MapperOptions(global_initialization=False)
 
 
 def assert_rigid_frames(reconstruction: Reconstruction) -> None:

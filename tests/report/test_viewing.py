@@ -36,7 +36,7 @@ def test_viewer_of_a_run_gets_growing_scenes() -> None:
     registry.register(Watcher())
     camera = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
     problem = make_mapping_problem(room_scene(), camera, arc_poses(4, 12.0), map_width=80)
-    one_by_one = MapperOptions.model_validate({"initialization": {"global_initialization": False}})
+    one_by_one = MapperOptions(global_initialization=False)
     result = mapper.reconstruct(problem, one_by_one, Stages(registry))
     sizes = [len(scene.images) for scene in seen]
     assert sizes[0] < sizes[-1] == len(result.reconstructions[0].images)

@@ -71,6 +71,11 @@ OVERLAP_GRID = 16
 """Columns and rows of the pixel grid that measures the overlap of two images. [ours]"""
 POINT_GROUP = 16
 """Number of points with a common bounding sphere in the count of visible points. [ours]"""
+NUM_COMPARED = 16
+"""Number of most overlapping images whose depth is compared with that of an image. [ours]"""
+MIN_GAP = 0.05
+"""Smallest relative depth error of a pixel that counts as a violation of depth consistency.
+[tuned: benchmarks.symmetry]"""
 MIN_OVERLAP_RATIO = 0.05
 """Minimum share of grid pixels that project into another image for a comparison of both images.
 [ours]"""
@@ -122,7 +127,7 @@ class DepthConsistencyCheck:
         """
         violations = [
             DepthViolation(self.measure_violation_ratio(image, other, std_factor, limit), other)
-            for other in find_overlapping_images(self._scene, image, self._options.num_views)
+            for other in find_overlapping_images(self._scene, image)
             if other not in excluded
         ]
         return max(violations, default=DepthViolation(0.0, -1))
@@ -147,7 +152,7 @@ class DepthConsistencyCheck:
         Returns:
             Images to deregister, each with its largest violation ratio.
         """
-        scene, num_views = self._scene, self._options.num_views
+        scene = self._scene
         candidates = _select_images_with_depth(scene)
         self._angles_deg = scene.track_angles_deg()
         measured: dict[tuple[int, int], float] = {}
@@ -155,7 +160,7 @@ class DepthConsistencyCheck:
         for members, is_member in zip(compared, in_set, strict=True):
             is_member[members] = True
         for image in map(int, images):
-            for other in find_overlapping_images(scene, image, num_views, candidates):
+            for other in find_overlapping_images(scene, image, candidates):
                 pair = min(image, other), max(image, other)
                 if pair not in measured and not (in_set[:, image] & in_set[:, other]).any():
                     measured[pair] = self.measure_violation_ratio(
@@ -203,7 +208,7 @@ class DepthConsistencyCheck:
         scene, options = self._scene, self._options
         rotation = scene.rotations[b] @ scene.rotations[a].T
         translation = scene.translations[b] - rotation @ scene.translations[a]
-        criteria = ViolationCriteria(options.max_deviation, options.min_gap, by_target_area)
+        criteria = ViolationCriteria(options.max_deviation, MIN_GAP, by_target_area)
         is_refined = any(scene.maps[image].refinement is not None for image in (a, b))
 
         def measure(*, refined: bool) -> float:
@@ -287,15 +292,12 @@ class DepthConsistencyCheck:
         return _DepthGrid(depth, np.maximum(std, np.float32(1e-6)), valid, nearest, intrinsics)
 
 
-def find_overlapping_images(
-    scene: Scene, image: int, max_images: int, candidates: Int64 | None = None
-) -> list[int]:
-    """Return the registered images into which most pixels of a depth map project, best first.
+def find_overlapping_images(scene: Scene, image: int, candidates: Int64 | None = None) -> list[int]:
+    """Return the ``NUM_COMPARED`` images into which most pixels of a depth map project.
 
     Args:
         scene: The scene.
         image: Registered image with the depth map.
-        max_images: Maximum number of returned images.
         candidates: Registered images with depth to choose from, by default all.
     """
     others = _select_images_with_depth(scene) if candidates is None else candidates
@@ -316,7 +318,7 @@ def find_overlapping_images(
         scene.image_sizes[others],
     )
     overlap = counts / OVERLAP_GRID**2
-    order = np.argsort(-overlap, kind="stable")[:max_images]
+    order = np.argsort(-overlap, kind="stable")[:NUM_COMPARED]
     return [int(others[k]) for k in order if overlap[k] >= MIN_OVERLAP_RATIO]
 
 

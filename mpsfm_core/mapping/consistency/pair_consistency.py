@@ -48,6 +48,10 @@ MAX_ROTATION_ERROR_DEG = 30.0
 depth-consistent pairs imply, with a margin for errors of some degrees along a chain of pairs.
 [ours]"""
 
+MAX_VIOLATIONS = 0.01
+"""Share of pixels with contradicting depth above which the relative pose of an image pair is
+inconsistent, before any image is registered. [tuned: benchmarks.accuracy]"""
+
 
 class PairConsistency(NamedTuple):
     """Result of the depth consistency check of one image pair."""
@@ -108,7 +112,7 @@ class PairConsistencyCheck:
 
     def check_pair(self, pair: VerifiedPair) -> PairConsistency:
         """Check the depth consistency of the relative pose of an image pair."""
-        verified = scale_verified_pair(self._scene, pair, self._options.initialization)
+        verified = scale_verified_pair(self._scene, pair)
         if verified is not None and self._is_consistent(verified):
             return PairConsistency(pair.rotation, 1.0)
         pose_estimator, options = self._pose_estimator, self._options.registration
@@ -136,7 +140,7 @@ class PairConsistencyCheck:
 
     def _is_consistent(self, initial: InitialPair) -> bool:
         """Return True if a relative pose passes the depth consistency check."""
-        scene, limit = self._scene, self._options.consistency.max_violations_pair
+        scene, limit = self._scene, MAX_VIOLATIONS
         empty = scene.snapshot()
         register_first_image(scene, initial.reference)
         scale = self._estimate_scale(initial)

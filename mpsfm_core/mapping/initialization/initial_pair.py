@@ -15,7 +15,7 @@ import numpy as np
 from mpsfm_core.data import Bool, VerifiedPair
 from mpsfm_core.data.decisions import ImageReason, Reason, reason_from_json
 from mpsfm_core.geometry import triangulation_angle_deg
-from mpsfm_core.mapping.options import InitializationOptions, MapperOptions, RegistrationOptions
+from mpsfm_core.mapping.options import MapperOptions, RegistrationOptions
 from mpsfm_core.mapping.registration.correspondences import (
     PoseCorrespondences,
     find_correspondences,
@@ -26,6 +26,15 @@ from mpsfm_core.mapping.registration.rig_scale import estimate_rig_scale, set_fr
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.mapping.triangulation import triangulate_midpoints
+
+MAX_PAIRS = 50
+"""Maximum number of initial image pairs to try. [ours]"""
+NUM_COMPARED = 5
+"""Number of image pairs with most matches whose relative poses are compared; the pair with the best
+supported pose is tried first. [tuned: benchmarks.accuracy]"""
+MIN_ANGLE_DEG = 1.5
+"""Smallest triangulation angle of a point that determines the baseline length of a verified pair.
+[COLMAP init_min_tri_angle]"""
 
 
 class InitialPair(NamedTuple):
@@ -55,20 +64,19 @@ class InitialPairSelector:
     ) -> list[VerifiedPair]:
         """Rank the image pairs for initialization (COLMAP's ``FindInitialImagePair``).
 
-        Image pairs are ranked by their number of matches. The ``num_compared`` image pairs with
+        Image pairs are ranked by their number of matches. The ``NUM_COMPARED`` image pairs with
         most matches are ranked again by the support of their relative poses.
 
         Args:
             pose_estimator: Pose estimator on a scene without registered images.
             candidates: (n,) bool mask of the images that may be part of the initial pair.
         """
-        options = self._options.initialization
         pairs = [
             pair
             for pair in rank_initial_pairs(pose_estimator.scene)
             if candidates[pair.image_a] and candidates[pair.image_b]
         ]
-        first_pairs = pairs[: options.num_compared]
+        first_pairs = pairs[:NUM_COMPARED]
         results = {pair: self.estimate_pair(pose_estimator, pair) for pair in first_pairs}
         support = {
             pair: result.pose.support
@@ -76,7 +84,7 @@ class InitialPairSelector:
             if isinstance(result, InitialPair)
         }
         first_pairs.sort(key=lambda pair: -support.get(pair, 0.0))
-        return first_pairs + pairs[options.num_compared : options.max_pairs]
+        return first_pairs + pairs[NUM_COMPARED:MAX_PAIRS]
 
     def estimate_pair(
         self, pose_estimator: AbsolutePoseEstimator, pair: VerifiedPair
@@ -88,7 +96,7 @@ class InitialPairSelector:
                 candidates = estimate_initial_pairs(pose_estimator, pair, options.registration)
                 best = max(candidates, key=lambda c: c.pose.support, default=None)
             elif pair.calibrated:
-                best = scale_verified_pair(scene, pair, options.initialization)
+                best = scale_verified_pair(scene, pair)
             else:
                 best = None
             self._results[pair] = best or ImageReason.NO_POSE.because()
@@ -192,13 +200,11 @@ def _register_each_reference(
         scene.restore(empty)
 
 
-def scale_verified_pair(
-    scene: Scene, pair: VerifiedPair, options: InitializationOptions
-) -> InitialPair | None:
+def scale_verified_pair(scene: Scene, pair: VerifiedPair) -> InitialPair | None:
     """Scale the pose of a verified pair so that triangulated depth agrees with the prior.
 
     The scale is the median ratio of prior and triangulated depth over the points whose
-    triangulation angle is at least ``high_parallax_deg``.
+    triangulation angle is at least ``MIN_ANGLE_DEG``.
 
     Returns:
         The scaled pose, or None without a translation or a well triangulated point of known depth.
@@ -216,7 +222,7 @@ def scale_verified_pair(
     with np.errstate(invalid="ignore"):
         angles_deg = triangulation_angle_deg(center_a, center_b, points)
         supporting = (points[:, 2] > 0) & (depth_b > 0)
-        supporting &= angles_deg >= options.high_parallax_deg
+        supporting &= angles_deg >= MIN_ANGLE_DEG
     depth_map = scene.maps[pair.image_a]
     rows = pair.matches[:, 0]
     known = supporting & depth_map.keypoint_valid[rows]

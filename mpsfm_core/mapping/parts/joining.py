@@ -257,7 +257,7 @@ def _count_depth_conflicts(
     std_factor = max(1.0, measure_depth_noise(scene).multiplier)
     num_overlapping = num_conflicting = 0
     for image in in_b:
-        others = find_overlapping_images(scene, image, consistency.num_views, in_a)
+        others = find_overlapping_images(scene, image, in_a)
         ratios = [
             check.measure_violation_ratio(
                 image, other, std_factor, consistency.max_violations, by_target_area=True

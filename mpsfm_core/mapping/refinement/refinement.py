@@ -514,11 +514,10 @@ class Refiner:
 
         The depth map of the image is only refined again in global refinement.
         """
-        options = self.options
-        bundle = find_local_bundle(self.scene, image, options.local_images - 1, self.scores)
+        bundle = find_local_bundle(self.scene, image, self.scores)
         complete_and_merge_tracks(self.scene, self.triangulation, images=bundle)
         for _ in range(MAX_LOCAL_REFINEMENTS):
-            bundle = find_local_bundle(self.scene, image, options.local_images - 1, self.scores)
+            bundle = find_local_bundle(self.scene, image, self.scores)
             if self._alternates:
                 self.integrate([image])
             self.adjust(bundle, local=True)

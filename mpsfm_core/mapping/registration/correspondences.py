@@ -22,6 +22,9 @@ from mpsfm_core.mapping.scene.scene import Scene
 MIN_DEPTH_RATIO = 1e-3
 """Lower bound of the depth of the nearest possible point, relative to the depth of the most likely
 point."""
+MIN_POINT_ANGLE_DEG = 1.0
+"""Triangulation angle below which a point lifted from depth replaces a triangulated point.
+[reference robust_triangles]"""
 RAY_MATCH_WEIGHT = 0.5
 """Weight of a match of unknown depth, because the match only constrains one of two image
 coordinates. [tuned: benchmarks.accuracy on hololens_room, where sensor depth covers half of the
@@ -103,8 +106,7 @@ def find_correspondences(
         image: The image to register.
         references: Registered images whose matches, and those of the other images of their frames,
             are used.
-        options: Registration options ``lifting``, ``min_point_angle_deg`` and
-            ``max_depth_deviation``.
+        options: Registration options ``lifting`` and ``max_depth_deviation``.
     """
     graph, tracks = scene.graph, scene.tracks
     edges = [graph.edges_of(member) for member in scene.rigs.images_of(image)]
@@ -118,7 +120,7 @@ def find_correspondences(
     triangulated = point >= 0
     distinct, rows = np.unique(point[triangulated], return_inverse=True)
     angles_deg, _ = scene.angles_deg_of(distinct)
-    triangulated[triangulated] = angles_deg[rows] >= options.min_point_angle_deg
+    triangulated[triangulated] = angles_deg[rows] >= MIN_POINT_ANGLE_DEG
     depth, log_range, depth_known = _depth_ranges(scene, target, options)
     usable = triangulated | ((depth > 0) & options.lifting)
     source, target, scores, point = source[usable], target[usable], scores[usable], point[usable]

@@ -23,7 +23,12 @@ from mpsfm_core.mapping.registration.pose_hypotheses import (
     PoseHypothesis,
     PoseHypothesisGenerator,
 )
-from mpsfm_core.mapping.registration.pose_support import ScoredPose, maximize_support, score_pose
+from mpsfm_core.mapping.registration.pose_support import (
+    CONFIDENT_INLIER_RATIO,
+    ScoredPose,
+    maximize_support,
+    score_pose,
+)
 from mpsfm_core.mapping.registration.reverse_correspondences import (
     find_reverse_reference,
     reverse_registration,
@@ -32,6 +37,11 @@ from mpsfm_core.mapping.scene.scene import Scene, Snapshot
 from mpsfm_core.mapping.triangulation import triangulate_image
 from mpsfm_core.support.threads import thread_limit
 
+NUM_BUNDLE_ADJUSTED = 3
+"""Number of distinct pose hypotheses that bundle adjustment refines before the best hypothesis is
+selected. [ours]"""
+MAX_BUNDLE_ITERATIONS = 10
+"""Maximum number of iterations of the bundle adjustment of a pose hypothesis. [ours]"""
 MIN_POSE_DISTANCE_DEG = 3.0
 """Smallest angle between the rotations of distinct poses; closer poses converge to the same pose.
 [ours]"""
@@ -61,9 +71,8 @@ class AbsolutePoseEstimator:
             attempt: Number of earlier registration attempts of the image (see
                 :func:`estimate_candidate_poses`).
         """
-        options = self._options.registration
         poses = self.estimate_unrefined_poses(correspondences, attempt=attempt)
-        if len(poses) == 1 and poses[0].inlier_ratio >= options.confident_inlier_ratio:
+        if len(poses) == 1 and poses[0].inlier_ratio >= CONFIDENT_INLIER_RATIO:
             return poses
         return self.refine_poses(poses, correspondences)
 
@@ -83,7 +92,7 @@ class AbsolutePoseEstimator:
         with reverse_registration(self.scene, image, reference, options) as reverse:
             reverse_poses = estimate(self.scene, reverse)
         poses += [self._from_reverse(pose, reference) for pose in reverse_poses]
-        return select_distinct_poses(poses, options.num_bundle_adjusted)
+        return select_distinct_poses(poses, NUM_BUNDLE_ADJUSTED)
 
     def score_pose(
         self, correspondences: PoseCorrespondences, hypothesis: PoseHypothesis
@@ -127,9 +136,7 @@ class AbsolutePoseEstimator:
         scene.register(image, pose.rotation, pose.translation, pose.focal_px)
         for member in scene.rigs.images_of(image):
             triangulate_image(scene, member, options.triangulation)
-        self._refiner.adjust(
-            [image], local=True, max_iterations=options.registration.max_bundle_iterations
-        )
+        self._refiner.adjust([image], local=True, max_iterations=MAX_BUNDLE_ITERATIONS)
         rotation, translation = scene.rotations[image].copy(), scene.translations[image].copy()
         scene.restore(snapshot)
         adjusted = PoseHypothesis(rotation, translation, pose.source, pose.focal_px)
@@ -173,10 +180,10 @@ def estimate_candidate_poses(
 
         add_poses(generator.generate_from_all())
         best = max(poses, key=lambda pose: pose.support, default=None)
-        is_confident = best is not None and best.inlier_ratio >= options.confident_inlier_ratio
+        is_confident = best is not None and best.inlier_ratio >= CONFIDENT_INLIER_RATIO
         if options.lifting and not is_confident and attempt < options.max_resampled_attempts:
             add_poses(replace(generator, seed=seed + attempt).generate_from_halves())
-    return select_distinct_poses(poses, options.num_bundle_adjusted)
+    return select_distinct_poses(poses, NUM_BUNDLE_ADJUSTED)
 
 
 def _discard_needless_focals(poses: Sequence[ScoredPose]) -> list[ScoredPose]:

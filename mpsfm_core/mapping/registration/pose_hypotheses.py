@@ -46,6 +46,12 @@ PNP_TRIALS = (100, 10_000)
 ESSENTIAL_TRIALS = (50, 500)
 """Minimum and maximum number of RANSAC trials for the essential matrix, few trials because other
 subsets of the matches are also tried. [ours]"""
+MAX_SUPPORT_ERROR_PX = 4.0
+"""Largest distance between an inlier keypoint and the projection of the depth interval of its
+matched keypoint. [COLMAP two-view max_error]"""
+NUM_RESAMPLES = 8
+"""Number of random halves of the matches that generate pose hypotheses in each registration
+attempt. [ours]"""
 FOCAL_RANGE = (0.4, 10.0)
 """Smallest and largest focal length to try, relative to the longer side of the image. [ours]"""
 MAX_FOCAL_DEVIATION = 3.0
@@ -230,7 +236,7 @@ def _make_relative_pose_options(options: RegistrationOptions, seed: int) -> pyco
     """Return the options of RANSAC for relative poses."""
     min_trials, max_trials = ESSENTIAL_TRIALS
     return pycolmap.RANSACOptions(
-        max_error=0.5 * options.max_support_error_px,
+        max_error=0.5 * MAX_SUPPORT_ERROR_PX,
         min_inlier_ratio=options.min_inlier_ratio,
         min_num_trials=min_trials,
         max_num_trials=max_trials,
@@ -308,7 +314,7 @@ class PoseHypothesisGenerator:
         is_generalized = self._is_generalized(frame)
         num_sampled = min(max(len(rows) // 2, MIN_CORRESPONDENCES), len(rows))
         probabilities = correspondences.weights[rows] / correspondences.weights[rows].sum()
-        for _ in range(self.options.num_resamples):
+        for _ in range(NUM_RESAMPLES):
             sampled = np.sort(rng.choice(rows, num_sampled, replace=False, p=probabilities))
             half = replace(self, correspondences=correspondences.select(sampled))
             yield half._estimate_pnp

@@ -16,7 +16,10 @@ import numpy as np
 from mpsfm_core.data import Bool, Float64
 from mpsfm_core.mapping.options import RegistrationOptions
 from mpsfm_core.mapping.registration.correspondences import PoseCorrespondences
-from mpsfm_core.mapping.registration.pose_hypotheses import PoseHypothesis
+from mpsfm_core.mapping.registration.pose_hypotheses import (
+    MAX_SUPPORT_ERROR_PX,
+    PoseHypothesis,
+)
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.optimize.resection import (
     FrameImage,
@@ -25,6 +28,9 @@ from mpsfm_core.optimize.resection import (
     refine_pose,
 )
 
+CONFIDENT_INLIER_RATIO = 0.85
+"""Inlier ratio of a pose above which no further pose hypotheses are generated, and with which an
+image may be registered before the depth check of a global refinement. [ours]"""
 REFINEMENT_SCALES = np.maximum(5.0 * 0.8 ** np.arange(12), 1.0)
 """Factors of the inlier threshold in successive Gauss-Newton steps. The factors start large because
 a RANSAC pose from lifted points can have reprojection errors of many pixels. [ours]"""
@@ -68,8 +74,7 @@ def score_pose(
         scene: The scene with the registered images.
         correspondences: 2D-3D correspondences of the image and of the images of its frame.
         hypothesis: The pose of the image.
-        options: Options with the inlier thresholds ``max_support_error_px`` and
-            ``max_depth_deviation``.
+        options: Registration options, of which ``max_depth_deviation`` limits the inliers.
     """
     residuals = _compute_residuals(scene, correspondences, hypothesis, options)
     inlier = residuals < 1
@@ -139,7 +144,7 @@ def _make_segments(
         near=correspondences.near_points,
         far=correspondences.far_points,
         xy=scene.keypoints[correspondences.keypoints],
-        limit=options.max_support_error_px * std_px,
+        limit=MAX_SUPPORT_ERROR_PX * std_px,
         weight=correspondences.weights,
     )
 

@@ -144,7 +144,7 @@ class _TentativeRegistration:
     def _estimate_pose(self, image: int, best_match: int) -> ScoredPose | None:
         """Estimate the pose of an image, or reuse the last pose from the same reference images."""
         scene, options = self.scene, self._options
-        references = find_local_bundle(scene, best_match, options.num_neighbors, self._scores)
+        references = find_local_bundle(scene, best_match, self._scores)
         if image not in self._poses or self._poses[image][0] != references:
             correspondences = find_correspondences(scene, image, references, options)
             poses = []

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.registration.pose_support import ScoredPose
+from mpsfm_core.mapping.registration.pose_support import CONFIDENT_INLIER_RATIO, ScoredPose
 from mpsfm_core.mapping.state import StateDict
 
 RELAXATION_FACTOR = 1.2
@@ -42,10 +42,10 @@ class ThresholdSchedule:
 
         Args:
             pose: The pose with its number of inliers and its inlier ratio.
-            confident: Also require the inlier ratio of the option ``confident_inlier_ratio``.
+            confident: Also require the inlier ratio ``CONFIDENT_INLIER_RATIO``.
         """
         min_inliers = self.min_inliers
-        min_ratio = self._options.confident_inlier_ratio if confident else self.min_inlier_ratio
+        min_ratio = CONFIDENT_INLIER_RATIO if confident else self.min_inlier_ratio
         if pose.num_inliers < min_inliers:
             return ImageReason.TOO_FEW_INLIERS.because(
                 num_inliers=pose.num_inliers, min_inliers=min_inliers

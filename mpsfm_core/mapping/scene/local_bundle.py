@@ -7,11 +7,15 @@ from scipy.sparse import csr_array
 
 from mpsfm_core.mapping.scene.scene import Scene
 
+NUM_NEIGHBORS = 4
+"""Number of registered images in the local bundle of an image, in addition to the image.
+[reference] [COLMAP ba_local_num_images]"""
 
-def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: csr_array) -> list[int]:
+
+def find_local_bundle(scene: Scene, image: int, scores: csr_array) -> list[int]:
     """Return an image and the registered images that share most 3D points with the image.
 
-    If fewer than ``num_neighbors`` images share points, the images with the most matches are added.
+    If fewer than ``NUM_NEIGHBORS`` images share points, the images with the most matches are added.
     COLMAP's ``FindLocalBundle`` also ranks images by the number of shared points.
     """
     tracks, graph = scene.tracks, scene.graph
@@ -27,4 +31,4 @@ def find_local_bundle(scene: Scene, image: int, num_neighbors: int, scores: csr_
     usable = scene.registered & ((counts > 0) | (score > 0))
     usable[image] = False
     neighbors = [int(k) for k in order if usable[k]]
-    return [image, *neighbors[:num_neighbors]]
+    return [image, *neighbors[:NUM_NEIGHBORS]]

@@ -210,7 +210,7 @@ def test_misplaced_image_with_own_tracks_is_violation() -> None:
 def test_images_facing_away_do_not_overlap() -> None:
     back = np.column_stack([np.diag([-1.0, 1.0, -1.0]), np.zeros(3)])
     scene = posed_scene([wall(3.0)] * 3, [HERE, back, HERE], SMALL)
-    assert find_overlapping_images(scene, 0, 5) == [2]
+    assert find_overlapping_images(scene, 0) == [2]
     assert DepthConsistencyCheck(scene, OPTIONS).check_image(1).other_image == -1
 
 

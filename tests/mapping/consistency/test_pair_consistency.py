@@ -118,7 +118,7 @@ def test_globally_initialized_images_need_no_pair_check() -> None:
     assert len(result.reconstructions[0].images) == 4
     assert "pair consistency check" not in result.report.counts
     pair_alone = MapperOptions.model_validate(
-        {"initialization": {"global_initialization": False}, "consistency": {"check_pairs": False}}
+        {"global_initialization": False, "consistency": {"check_pairs": False}}
     )
     result = reconstruct(problem, pair_alone)
     assert result.reconstructions and "pair consistency check" not in result.report.counts

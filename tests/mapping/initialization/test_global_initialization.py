@@ -155,9 +155,7 @@ def test_average_rotations_with_outliers_recovers_rotations() -> None:
 def test_global_initialization_is_as_accurate_as_initial_pair(hall: HallProblem) -> None:
     errors = {}
     for global_first in (True, False):
-        options = MapperOptions.model_validate(
-            {"initialization": {"global_initialization": global_first}}
-        )
+        options = MapperOptions.model_validate({"global_initialization": global_first})
         result = reconstruct(hall.problem, options)
         poses = result.reconstructions[0].poses
         assert len(poses) == VIEWS

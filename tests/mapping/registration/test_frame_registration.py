@@ -190,10 +190,7 @@ def test_frames_with_few_matches_of_each_pair_are_reconstructed() -> None:
     frame_poses = [*FRAME_POSES, look_at([-0.1, 0.8, 1.3], [2.0, -0.4, 1])]
     rig_problem = make_problem("panorama", frame_poses)
     problem = keep_matches(rig_problem.problem, 12)
-    options = MapperOptions()
-    initialization = options.initialization.model_copy(update={"global_initialization": False})
-    options = options.model_copy(update={"initialization": initialization})
-    (model,) = reconstruct(problem, options).reconstructions
+    (model,) = reconstruct(problem, MapperOptions(global_initialization=False)).reconstructions
     assert len(model.images) == len(rig_problem.poses)
     poses = [(image.rotation, image.translation) for image in model.images]
     for a, b in ((0, 8), (8, 16)):
