@@ -26,7 +26,6 @@ VARIANTS: Mapping[str, Mapping[str, object]] = {
     "initialization from one pair": {"global_initialization": False},
     "reprojection loss not estimated": {"refinement": {"measure_keypoint_noise": False}},
     "no lifting": {"registration": {"lifting": False}},
-    "bundle adjustment with refined depth": {"refinement": {"bundle_depth": "refined"}},
     "no depth refinement": {"refinement": {"integrate": False}},
     "no depth regularization": {"refinement": {"depth_regularization": False}},
     "no refinement, no regularization": {
@@ -35,12 +34,8 @@ VARIANTS: Mapping[str, Mapping[str, object]] = {
     "no depth check": {"consistency": {"enabled": False}},
     "evidence not weighted": {"consistency": {"weigh_evidence": False}},
     "no final depth check": {"consistency": {"check_at_end": False}},
-    "final robust pass": {"refinement": {"final_robust": True}},
-    "next view by inlier matches": {"registration": {"next_view": "inlier-matches"}},
-    "next view by visible points": {"registration": {"next_view": "visible-points"}},
     "RANSAC poses not refined": {"registration": {"num_locally_optimized": 0}},
     "declared depth noise": {"refinement": {"measure_depth_noise": False}},
-    "scales fixed after initialization": {"refinement": {"free_scales": False}},
     "matches weighted equally": {"weigh_by_score": False},
     "new images with the final loss": {"refinement": {"first_reprojection_scale": 1.0}},
     "reprojection loss of the reference": {

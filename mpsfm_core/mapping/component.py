@@ -389,12 +389,10 @@ class Component:
         return within
 
     def finalize(self) -> None:
-        """Refine all images, repeat the depth check, and refine with a sharper depth loss."""
+        """Refine all images, and repeat the depth check."""
         if self.maintenance.is_checked:
             return
         self.maintenance.refine_globally()
         consistency = self._options.consistency
         if consistency.enabled and consistency.check_at_end:
             self.maintenance.check_all_images(MAX_FINAL_VIOLATIONS, "final-check")
-        if self._options.refinement.final_robust:
-            self.maintenance.refine_globally(final=True)

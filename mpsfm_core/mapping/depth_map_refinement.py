@@ -29,7 +29,7 @@ def refine_depth_maps(
     """
     scene = Scene(problem, weigh_by_score=options.weigh_by_score)
     scene.resume(reconstruction)
-    scores = compute_pair_scores(scene, options.registration.next_view)
+    scores = compute_pair_scores(scene)
     refiner = Refiner(scene, options, scores)
     refiner.refine_depth([image.index for image in reconstruction.confirmed_images])
     is_metric = reconstruction.metric is not None and reconstruction.metric.trusted

@@ -53,10 +53,9 @@ class IncrementalRegistration:
         Returns:
             False if no image can be registered at the most relaxed thresholds.
         """
-        options = self._options.registration
         while True:
             scores = self._history.select_scores(self._scores, excluded=False)
-            ranked = rank_next_images(self._scene, scores, candidates, options)
+            ranked = rank_next_images(self._scene, scores, candidates)
             if self._register_first_possible(ranked, wide=False):
                 return True
             if self.deregister_contradicted_image():
@@ -109,8 +108,7 @@ class IncrementalRegistration:
         """
         self._thresholds.reset()
         scores = self._history.select_scores(self._scores, excluded=True)
-        options = self._options.registration
-        for image, best_match in rank_next_images(self._scene, scores, candidates, options):
+        for image, best_match in rank_next_images(self._scene, scores, candidates):
             for member in self._scene.rigs.images_of(image):
                 self._history.excluded_references.pop(member, None)
             references = self._select_references(image, best_match)

@@ -61,7 +61,7 @@ class ModelMaintenance:
     ) -> None:
         self.problem, self.options, self.event_log = problem, options, event_log
         self.scene = Scene(problem, weigh_by_score=options.weigh_by_score)
-        self.scores = compute_pair_scores(self.scene, options.registration.next_view)
+        self.scores = compute_pair_scores(self.scene)
         self.refiner = Refiner(self.scene, options, self.scores)
         self.history = RegistrationHistory(options.registration)
         self.thresholds = ThresholdSchedule(options.registration)
@@ -129,16 +129,15 @@ class ModelMaintenance:
         if num_images > growth * self._last_size[0] or num_points > growth * self._last_size[1]:
             self.refine_globally()
 
-    def refine_globally(self, *, final: bool = False, depth_maps: bool = True) -> None:
+    def refine_globally(self, *, depth_maps: bool = True) -> None:
         """Refine all images and points, then deregister images with few or unconnected points.
 
         Args:
-            final: Sharpen the depth loss as in the paper's final robust reconstruction.
             depth_maps: False keeps the depth maps, and only adapts their scales.
         """
         before = self.scene.snapshot()
         with self.event_log.timed("global refinement"):
-            self.refiner.refine_globally(final=final, depth_maps=depth_maps)
+            self.refiner.refine_globally(depth_maps=depth_maps)
             self.scene.tracks.compact()
             release_free_memory()
         self._undo_jump(before)

@@ -19,9 +19,6 @@ from mpsfm_core.optimize.options import BundleOptions, IntegrationOptions
 class RegistrationOptions(Options):
     """Options of the registration of the next image."""
 
-    next_view: Literal["match-scores", "inlier-matches", "visible-points"] = expert("match-scores")
-    """Ranking of the next image, by summed match scores or number of matches with the best matching
-    registered image, or by number of visible 3D points. [paper, next view selection]"""
     min_inliers: int = expert(30, ge=3)
     """Smallest number of inliers of an image pose; raising it registers fewer, more reliable
     images. [COLMAP abs_pose_min_num_inliers]"""
@@ -77,9 +74,6 @@ class RefinementOptions(Options):
     map_width: int = expert(200, ge=16)
     """Width in pixels to which depth maps are subsampled for refinement. Wider depth maps are
     slower to refine and show finer details. [tuned: benchmarks.ablation]"""
-    bundle_depth: Literal["prior", "refined"] = expert("prior")
-    """Depth maps that regularize bundle adjustment, either the scaled priors, or the refined maps
-    in alternation with depth integration as in the paper. [tuned: benchmarks.ablation]"""
     depth_regularization: bool = expert(True)
     """Use the depth regularization ``C_reg`` in bundle adjustment. [paper 3.3]"""
     measure_depth_noise: bool = expert(True)
@@ -88,10 +82,6 @@ class RefinementOptions(Options):
     measure_keypoint_noise: bool = expert(True)
     """Widen the robust reprojection loss if the keypoint errors are normally distributed
     (:mod:`mpsfm_core.mapping.refinement.keypoint_noise`). [tuned: benchmarks.ablation]"""
-    free_scales: bool = expert(True)
-    """Estimate the scales of depth priors in bundle adjustment. If ``free_scales`` is False, scale
-    estimation and bundle adjustment alternate, which converges slowly because poses and points
-    compensate scale errors. [tuned: benchmarks.ablation]"""
     first_reprojection_scale: float = expert(5.0, ge=1)
     """Factor on the scale of the reprojection loss in the first bundle adjustment of a new image,
     whose reprojection errors may be several pixels. [tuned: benchmarks.ablation]"""
@@ -103,9 +93,6 @@ class RefinementOptions(Options):
     refine_principal_point: bool = False
     """Estimate the principal point of cameras whose focal length is refined. [COLMAP
     Mapper.ba_refine_principal_point]"""
-    final_robust: bool = expert(False)
-    """End with a global refinement with a sharper depth loss.
-    [paper, robust reconstruction] [tuned: benchmarks.ablation]"""
     bundle: BundleOptions = BundleOptions()
     """Options of bundle adjustment."""
     integration: IntegrationOptions = IntegrationOptions()

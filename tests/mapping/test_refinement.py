@@ -89,16 +89,12 @@ def test_deviating_scale_does_not_change_the_world_unit() -> None:
     assert [depth_map.scale for depth_map in maps] == pytest.approx(before, rel=0.01)
 
 
-@pytest.mark.parametrize(("bundle_depth", "bends"), [("prior", False), ("refined", True)])
-def test_refined_depth_changes_poses_only_if_bundle_depth_selects_it(
-    bundle_depth: str, bends: bool
-) -> None:
+def test_refined_depth_does_not_change_poses() -> None:
     group = mapped(0.01)
     scene, refiner = group.scene, group.refiner
     refinement = scene.maps[1].refinement
     assert refinement is not None
     refined = refinement.result
-    refiner.options = refiner.options.model_copy(update={"bundle_depth": bundle_depth})
     before = scene.snapshot()
     refiner.adjust([0, 1, 2])
     straight = scene.translations.copy()
@@ -107,7 +103,7 @@ def test_refined_depth_changes_poses_only_if_bundle_depth_selects_it(
     tilted = replace(refined, log_depth=refined.log_depth + tilt)
     scene.maps[1].set_refinement(DepthRefinement.from_result(tilted))
     refiner.adjust([0, 1, 2])
-    assert np.array_equal(scene.translations, straight) != bends
+    assert np.array_equal(scene.translations, straight)
 
 
 def test_loss_factor_depends_on_independent_errors() -> None:

@@ -2,8 +2,7 @@
 
 The paper alternates bundle adjustment and depth integration. A depth map that was refined with
 points agrees with these points, and keeps the points from moving in the next bundle adjustment.
-Therefore bundle adjustment uses the scaled depth priors, unless the option ``bundle_depth`` is
-``refined``.
+Therefore bundle adjustment uses the scaled depth priors.
 """
 
 from __future__ import annotations
@@ -70,9 +69,6 @@ MAX_GLOBAL_REFINEMENTS = 5
 MAX_GLOBAL_CHANGE = 0.0005
 """Share of changed observations below which global refinement stops.
 [COLMAP ba_global_max_refinement_change]"""
-FINAL_DEPTH_SCALE = 0.125
-"""Factor on the scale of the depth loss in the final robust refinement.
-[reference final_robustification]"""
 MAX_DEPTH_RATIO = 1.5
 """Largest ratio between the depth of a point and the depth map for which bundle adjustment uses the
 depth. [reference scale_filter]"""
@@ -175,11 +171,6 @@ class Refiner:
         self._integrators = _create_cache()
 
     @property
-    def _alternates(self) -> bool:
-        """True if depth integration and bundle adjustment alternate, as in the paper."""
-        return self.options.bundle_depth == "refined"
-
-    @property
     def std_factor(self) -> float:
         """Factor on the declared standard deviation of depth in the depth consistency check.
 
@@ -279,7 +270,6 @@ class Refiner:
         local: bool = False,
         focal: bool = False,
         reprojection_scale: float = 1.0,
-        depth_scale: float = 1.0,
         max_iterations: int | None = None,
     ) -> None:
         """Adjust poses and depth scales of images, and the points that the images observe.
@@ -292,18 +282,15 @@ class Refiner:
             focal: Refine guessed intrinsics that the observations determine, in addition to poses
                 and points.
             reprojection_scale: Factor on the scale of the reprojection loss.
-            depth_scale: Factor on the scale of the depth loss.
             max_iterations: Maximum number of bundle adjustment iterations, or None to use the
                 option.
         """
         scene = self.scene
         variable = scene.rigs.complete(variable)
-        bundle = self._collect_bundle(
-            variable, local=local, refined_depth=self._alternates and not focal
-        )
+        bundle = self._collect_bundle(variable, local=local)
         if bundle is None:
             return
-        options = self._scale_losses(reprojection_scale, depth_scale)
+        options = self._scale_losses(reprojection_scale)
         if max_iterations:
             options = options.model_copy(update={"max_iterations": max_iterations})
         if focal:
@@ -437,27 +424,22 @@ class Refiner:
             shifts[of_image, :, row] = std * (problem.points[of_image] - scene.centers()[image])
         return shifts
 
-    def _scale_losses(
-        self, reprojection_scale: float = 1.0, depth_scale: float = 1.0
-    ) -> BundleOptions:
-        """Return the options of bundle adjustment with losses scaled by factors and noise."""
+    def _scale_losses(self, reprojection_scale: float = 1.0) -> BundleOptions:
+        """Return the options of bundle adjustment with losses scaled by a factor and by noise."""
         options = self.options.bundle
         return options.model_copy(
             update={
                 "reprojection_scale": self.loss_scale * reprojection_scale,
-                "depth_scale": depth_scale * (options.depth_scale * self.noise.loss_factor),
+                "depth_scale": options.depth_scale * self.noise.loss_factor,
             }
         )
 
-    def _collect_bundle(
-        self, variable: list[int], *, local: bool = False, refined_depth: bool = False
-    ) -> _Bundle | None:
+    def _collect_bundle(self, variable: list[int], *, local: bool = False) -> _Bundle | None:
         """Return the bundle adjustment problem of images, or None if they observe no points.
 
         Args:
             variable: Images with variable pose.
             local: Keep points with long tracks fixed.
-            refined_depth: Use refined depth instead of the scaled depth priors.
         """
         scene, tracks = self.scene, self.scene.tracks
         observations = tracks.observations()
@@ -475,7 +457,7 @@ class Refiner:
         refines_all = not local and len(variable) == np.count_nonzero(scene.registered)
         rig = scene.rigs.constrain(images, moving, refine_rigs=refines_all)
         long_track = np.bincount(point_rows) >= MAX_LOCAL_TRACK_LENGTH
-        log_depth, log_std = self._depth_observations(observations, refined_depth)
+        log_depth, log_std = self._depth_observations(observations)
         regularized = self.options.depth_regularization and bool(np.isfinite(log_depth).any())
         num_constant = len(np.unique(scene.rigs.frame_of[images[~moving]]))
         free_scale = not regularized and moving.any() and num_constant == 1
@@ -518,19 +500,16 @@ class Refiner:
         complete_and_merge_tracks(self.scene, self.triangulation, images=bundle)
         for _ in range(MAX_LOCAL_REFINEMENTS):
             bundle = find_local_bundle(self.scene, image, self.scores)
-            if self._alternates:
-                self.integrate([image])
             self.adjust(bundle, local=True)
             changed = filter_points(self.scene, self.triangulation, bundle)
             changed += complete_and_merge_tracks(self.scene, self.triangulation, images=bundle)
             if changed < MAX_LOCAL_CHANGE * max(self._num_observations(), 1):
                 break
 
-    def refine_globally(self, *, final: bool = False, depth_maps: bool = True) -> None:
+    def refine_globally(self, *, depth_maps: bool = True) -> None:
         """Adjust all images and update tracks until few tracks change, then refine depth maps.
 
         Args:
-            final: Sharpen the depth loss by the factor ``FINAL_DEPTH_SCALE``.
             depth_maps: False keeps the depth maps, and only adapts their scales.
         """
         images = [int(i) for i in self.scene.registered_images()]
@@ -543,13 +522,7 @@ class Refiner:
             self.estimate_shared_scales()
             self._measure_keypoint_noise()
             self._measure_noise()
-            if self._alternates:
-                self.integrate(images)
-            self.adjust(
-                images,
-                focal=refines_focals and not self._alternates,
-                depth_scale=FINAL_DEPTH_SCALE if final else 1.0,
-            )
+            self.adjust(images, focal=refines_focals)
             changed = filter_points(self.scene, self.triangulation)
             changed += complete_and_merge_tracks(self.scene, self.triangulation)
             if changed < MAX_GLOBAL_CHANGE * max(self._num_observations(), 1):
@@ -658,15 +631,12 @@ class Refiner:
         z = points @ scene.rotations[image][2] + scene.translations[image, 2]
         return keypoints, z
 
-    def _depth_observations(self, observations: Int64, refined: bool) -> tuple[Float64, Float64]:
-        """Return log depth at observations, NaN if unusable, and the std of log depth."""
+    def _depth_observations(self, observations: Int64) -> tuple[Float64, Float64]:
+        """Return the log prior depth at observations, NaN if unusable, and its std."""
         scene, tracks = self.scene, self.scene.tracks
         _, z = scene.project(observations, tracks.xyz[tracks.point_of[observations]])
-        if refined:
-            depth, _ = scene.depth_at(observations)
-        else:
-            scales = scene.scales()[scene.graph.image_of[observations]]
-            depth = scene.keypoint_prior[observations] * scales
+        scales = scene.scales()[scene.graph.image_of[observations]]
+        depth = scene.keypoint_prior[observations] * scales
         usable = scene.keypoint_valid[observations] & (depth > 0) & (z > 0)
         usable[usable] &= self._near(z[usable] / depth[usable])
         log_depth, log_std = np.full(len(z), np.nan), np.ones(len(z))
@@ -676,8 +646,6 @@ class Refiner:
 
     def _has_free_scale(self, variable: list[int]) -> Bool:
         """Return a bool mask (n,) of images whose depth scale bundle adjustment estimates."""
-        if not self.options.free_scales:
-            return np.zeros(self.scene.num_images, dtype=np.bool_)
         return self.scene.mask(variable) & ~self._shares_scale
 
     def _expected_log_scales(self, images: Int64) -> tuple[Float64, Float64]:

@@ -75,7 +75,7 @@ class _TentativeRegistration:
     ) -> None:
         self.scene = Scene(problem, weigh_by_score=options.weigh_by_score)
         self._options = options.registration
-        self._scores = compute_pair_scores(self.scene, options.registration.next_view)
+        self._scores = compute_pair_scores(self.scene)
         self._triangulation = options.triangulation
         self._refiner = Refiner(self.scene, options, self._scores)
         self._pose_estimator = AbsolutePoseEstimator(self.scene, self._refiner, options)
@@ -133,9 +133,7 @@ class _TentativeRegistration:
         """Return the unregistered image with the best supported pose."""
         candidates = ~self.scene.registered
         best: tuple[int, ScoredPose] | None = None
-        for image, best_match in rank_next_images(
-            self.scene, self._scores, candidates, self._options
-        ):
+        for image, best_match in rank_next_images(self.scene, self._scores, candidates):
             pose = self._estimate_pose(image, best_match)
             if pose and (best is None or pose.support > best[1].support):
                 best = image, pose

@@ -33,7 +33,7 @@ Check = TypeVar("Check", bound=PairConsistencyCheck)
 
 def checker(problem: MappingProblem, kind: type[Check]) -> Check:
     options, scene = MapperOptions(), Scene(problem)
-    refiner = Refiner(scene, options, compute_pair_scores(scene, "match-scores"))
+    refiner = Refiner(scene, options, compute_pair_scores(scene))
     return kind(AbsolutePoseEstimator(scene, refiner, options), options)
 
 

@@ -98,7 +98,7 @@ def test_rank_pairs_orders_largest_pairs_by_support() -> None:
     wrong_pair = pairs[largest]
     options, selector = MapperOptions(), InitialPairSelector(MapperOptions())
     scene = Scene(replace(problem, pairs=tuple(pairs)))
-    refiner = Refiner(scene, options, compute_pair_scores(scene, "match-scores"))
+    refiner = Refiner(scene, options, compute_pair_scores(scene))
     pose_estimator = AbsolutePoseEstimator(scene, refiner, options)
     assert rank_initial_pairs(scene)[0] is wrong_pair
     assert selector.rank_pairs(pose_estimator, np.ones(3, dtype=np.bool_))[-1] is wrong_pair

@@ -62,7 +62,7 @@ def register_first_frame(rig_problem: RigProblem, problem: MappingProblem) -> Sc
 def make_pose_estimator(scene: Scene) -> AbsolutePoseEstimator:
     """Return a pose estimator of a scene."""
     options = MapperOptions()
-    refiner = Refiner(scene, options, compute_pair_scores(scene, "match-scores"))
+    refiner = Refiner(scene, options, compute_pair_scores(scene))
     return AbsolutePoseEstimator(scene, refiner, options)
 
 
@@ -166,8 +166,8 @@ def test_rank_next_images_returns_one_image_of_each_frame() -> None:
     frame_poses = [*FRAME_POSES, look_at([1.5, 0.8, 1.3], [2.0, -1.0, 1])]
     rig_problem = make_problem("around", frame_poses)
     scene = register_first_frame(rig_problem, rig_problem.problem)
-    scores = compute_pair_scores(scene, "match-scores")
-    ranked = rank_next_images(scene, scores, ~scene.registered, OPTIONS)
+    scores = compute_pair_scores(scene)
+    ranked = rank_next_images(scene, scores, ~scene.registered)
     frames = scene.rigs.frame_of[[image for image, _ in ranked]].tolist()
     assert sorted(frames) == [4, 8]
     dense = scores.toarray()
