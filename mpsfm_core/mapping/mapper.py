@@ -320,8 +320,8 @@ class Mapper:
     def _initialize(self) -> bool:
         """Initialize the component from globally averaged poses, or else from an image pair.
 
-        If the first global initialization fails, a second global initialization uses match scores
-        reweighted by depth checks of image pairs.
+        If the first global initialization fails, depth checks of image pairs reweight the match
+        scores. A second global initialization follows if the scores of a pair changed.
         """
         if self._initialize_globally():
             return True
@@ -330,7 +330,7 @@ class Mapper:
                 weights = self.component.compute_pair_weights(self.unregistered)
             self._set_pair_weights(weights)
             self.component = self._create_component()
-            if self._initialize_globally():
+            if (weights != 1.0).any() and self._initialize_globally():
                 return True
         return self.component.initialize_from_pair(self.unregistered)
 
