@@ -104,8 +104,7 @@ def reconstruct(
         options: Options of the mapper.
         events: Receiver of progress events.
         checkpoints: Storage of checkpoints.
-        parts: Joined reconstructions of parts, from which the first components start. With parts,
-            there is one mapper run.
+        parts: Joined reconstructions of parts, from which the first components of one run start.
 
     Returns:
         Connected components, sorted by decreasing number of images, and the report.
@@ -118,13 +117,7 @@ def reconstruct(
     is_complete = bool(runs) and interrupted is None
     pair_weights = None
     distinct = remove_duplicates(problem, options)
-    if parts.models:
-        initial_problem = calibrate_rigs(distinct, parts.models) or distinct
-    else:
-        initial_problem = _calibrate_view_graph(distinct, options)
-    for count in range(1, len(runs) + 1):  # completed mapper runs, oldest first
-        next_problem = _improve_problem(initial_problem, runs[:count], options)
-        initial_problem = next_problem or initial_problem
+    initial_problem = _calibrate(distinct, runs, options, parts)
     for number in range(len(runs), 0 if is_complete else options.max_runs):
         run_options = options.model_copy(update={"seed": options.seed + number})
         mapper = Mapper(initial_problem, run_options, events, pair_weights, parts)
@@ -143,13 +136,46 @@ def reconstruct(
         is_refuted = has_refuted_rigs(initial_problem, runs)
         if next_problem is not None:
             initial_problem, pair_weights = next_problem, None
-        if is_settled(runs[:-1] if is_refuted else runs, options.enough_explained) and (
-            next_problem is None or is_refuted
-        ):
+        is_last = is_refuted or next_problem is None
+        if is_last and is_settled(runs[:-1] if is_refuted else runs, options.enough_explained):
             break
     if not is_complete:
         checkpointer.save_completed(runs)
-    selected = select_run(runs, distinct)
+    return _complete_result(select_run(runs, distinct), runs, problem, distinct, options)
+
+
+def _calibrate(
+    problem: MappingProblem, runs: Sequence[MapperRun], options: MapperOptions, parts: JoinedParts
+) -> MappingProblem:
+    """Return the problem with cameras and rigs from image pairs, parts and completed runs."""
+    refinement, calibrated = options.refinement, problem
+    if parts.models:
+        calibrated = calibrate_rigs(problem, parts.models) or problem
+    elif refinement.refine_focal:
+        calibrated = calibrate_view_graph(
+            problem, options.seed, refine_distortion=refinement.refine_distortion
+        )
+    for count in range(1, len(runs) + 1):  # completed mapper runs, oldest first
+        calibrated = _improve_problem(calibrated, runs[:count], options) or calibrated
+    return calibrated
+
+
+def _complete_result(
+    selected: MapperRun,
+    runs: Sequence[MapperRun],
+    problem: MappingProblem,
+    distinct: MappingProblem,
+    options: MapperOptions,
+) -> MappingResult:
+    """Register duplicates and unverified images in the models of the selected run.
+
+    Args:
+        selected: The selected mapper run.
+        runs: All mapper runs.
+        problem: The mapping problem.
+        distinct: The mapping problem without duplicates.
+        options: Options of the mapper.
+    """
     models = list(selected.models)
     distinct = calibrate_rigs(distinct, models) or distinct
     if models and options.register_tentatively:
@@ -159,16 +185,6 @@ def reconstruct(
         models = [register_duplicates(model, problem) for model in models]
         report = replace(report, image_reasons=report_duplicates(report, models, problem))
     return MappingResult(tuple(models), report)
-
-
-def _calibrate_view_graph(problem: MappingProblem, options: MapperOptions) -> MappingProblem:
-    """Return the problem with guessed cameras that are estimated from image pairs."""
-    refinement = options.refinement
-    if not refinement.refine_focal:
-        return problem
-    return calibrate_view_graph(
-        problem, options.seed, refine_distortion=refinement.refine_distortion
-    )
 
 
 def _improve_problem(
