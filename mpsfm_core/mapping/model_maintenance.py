@@ -10,7 +10,6 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Int64, MappingProblem
 from mpsfm_core.data.decisions import ImageReason, Reason
-from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.consistency.depth_consistency import DepthConsistencyCheck
 from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.options import MapperOptions
@@ -23,10 +22,6 @@ from mpsfm_core.mapping.registration.threshold_schedule import ThresholdSchedule
 from mpsfm_core.mapping.scene.scene import Scene, Snapshot
 from mpsfm_core.mapping.state import StateDict, Stateful
 from mpsfm_core.support.memory import release_free_memory
-
-MAX_ROTATION_DEG = 3.0
-"""Rotation of a camera in one global refinement above which depth consistency decides whether the
-refinement is kept. [ours]"""
 
 GLOBAL_GROWTH = 0.3
 """Relative growth of the number of images or points after which all images are refined.
@@ -135,12 +130,10 @@ class ModelMaintenance:
         Args:
             depth_maps: False keeps the depth maps, and only adapts their scales.
         """
-        before = self.scene.snapshot()
         with self.event_log.timed("global refinement"):
             self.refiner.refine_globally(depth_maps=depth_maps)
             self.scene.tracks.compact()
             release_free_memory()
-        self._undo_jump(before)
         self.history.clear()
         self._last_size = self.size, len(self.scene.tracks)
         reason = ImageReason.LOST_POINTS.because(step="global-refinement")
@@ -252,22 +245,6 @@ class ModelMaintenance:
             self.scene.deregister(image)
             self.history.clear_pose_rejections()
             self.event_log.rejected(image, reason)
-
-    def _undo_jump(self, before: Snapshot) -> None:
-        """Undo a refinement that rotated a camera far and increased the depth contradictions.
-
-        The robust reprojection loss has several minima, so refinement may move an image with few
-        matches to a wrong pose.
-        """
-        images = self.scene.registered_images()
-        turns = self.scene.rotations[images] @ before.rotations[images].transpose(0, 2, 1)
-        if not len(images) or rotation_angle_deg(turns).max() < MAX_ROTATION_DEG:
-            return
-        limit = self.options.consistency.max_violations
-        after, num_conflicts = self.scene.snapshot(), len(self._find_conflicts(images, limit))
-        self.scene.restore(before)
-        if not num_conflicts > len(self._find_conflicts(images, limit)):
-            self.scene.restore(after)
 
     def _find_conflicts(
         self, images: Int64, limit: float, compared: Sequence[Int64] = ()

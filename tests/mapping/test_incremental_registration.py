@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.decisions import ImageReason
-from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.component import Component
 from mpsfm_core.mapping.events import NullMappingEvents
 from mpsfm_core.mapping.mapper import Mapper
@@ -34,13 +33,6 @@ def component() -> Component:
     mapper.reconstruct_component()
     assert mapper.component.scene.registered.all()
     return mapper.component
-
-
-def rotate_camera(component: Component, image: int, degrees: float) -> None:
-    """Rotate a camera about its center."""
-    turn = Rotation.from_euler("y", degrees, degrees=True).as_matrix()
-    component.scene.rotations[image] = turn @ component.scene.rotations[image]
-    component.scene.translations[image] = turn @ component.scene.translations[image]
 
 
 def deregister(component: Component, *images: int) -> None:
@@ -124,30 +116,13 @@ def test_pose_close_to_last_pose_is_tried_once(
     assert len(tried) == 1
 
 
-def test_jump_that_contradicts_depth_is_undone(component: Component) -> None:
-    before = component.scene.snapshot()
-    rotate_camera(component, 2, 25.0)
-    component.maintenance._undo_jump(before)
-    assert np.array_equal(component.scene.rotations, before.rotations)
-
-
-def test_jump_to_consistent_poses_stays(component: Component) -> None:
-    right = component.scene.rotations.copy()
-    rotate_camera(component, 2, 25.0)
-    before = component.scene.snapshot()
-    rotate_camera(component, 2, -25.0)
-    component.maintenance._undo_jump(before)
-    assert rotation_angle_deg(component.scene.rotations @ right.transpose(0, 2, 1)).max() < 1e-6
-
-
-def test_undone_jump_restores_focal_lengths(component: Component) -> None:
-    before = component.scene.snapshot()
+def test_rollback_restores_focal_length_and_refined_depth(component: Component) -> None:
+    before = component.maintenance.state()
     component.refiner.integrate([2])
     refined = component.scene.maps[2].depth.copy()
-    rotate_camera(component, 2, 25.0)
     component.scene.set_intrinsics(2, np.array([300.0, 300.0, 160.0, 120.0]), np.zeros(4))
     component.refiner.integrate([2])
-    component.maintenance._undo_jump(before)
+    component.maintenance.restore(before)
     assert component.scene.intrinsics[2].tolist() == [260.0, 260.0, 160.0, 120.0]
     assert component.scene.maps[2].camera == CAMERA.resized(*component.scene.maps[2].camera.size)
     component.refiner.integrate([2])
