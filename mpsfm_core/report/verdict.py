@@ -73,12 +73,13 @@ def judge(summary: Mapping[str, Any]) -> Verdict:
     Returns:
         The verdict of the run. The level is ``failed`` without a model, ``doubtful`` if the
         evidence is weak or contradicts the model, ``partial`` if images are not registered, and
-        otherwise ``good``.
+        otherwise ``good``. A failed run has the doubts about its providers, which may be the cause.
     """
     images = summary["images"]
     num_registered, total = len(images["registered"]), images["total"]
     if summary["status"] != "success":
-        return Verdict("failed", f"No model could be reconstructed from {_photos(total)}.")
+        text = f"No model could be reconstructed from {_photos(total)}."
+        return Verdict("failed", text, tuple(_recorded_doubts(summary)))
     doubts = tuple(find_doubts(summary))
     registered = f"{num_registered} of {_photos(total)} registered"
     if doubts:
@@ -90,8 +91,7 @@ def judge(summary: Mapping[str, Any]) -> Verdict:
 
 def find_doubts(summary: Mapping[str, Any]) -> Iterator[Doubt]:
     """Yield the reasons to doubt the providers and the first model of a run."""
-    for stored in summary.get("doubts", ()):
-        yield Doubt(reason_from_json(DoubtReason, stored))
+    yield from _recorded_doubts(summary)
     yield from _unexplained_pairs(_sum_over_frames(summary))
     for reconstruction in summary["reconstructions"][:1]:
         yield from _weak_evidence(reconstruction["evidence"])
@@ -110,6 +110,12 @@ def find_doubts(summary: Mapping[str, Any]) -> Iterator[Doubt]:
             num_images=len(guessed), std_ratio=round(max(guessed.values()), 3)
         )
         yield Doubt(reason, tuple(guessed))
+
+
+def _recorded_doubts(summary: Mapping[str, Any]) -> Iterator[Doubt]:
+    """Yield the doubts that a run recorded, such as those about its providers."""
+    for stored in summary.get("doubts", ()):
+        yield Doubt(reason_from_json(DoubtReason, stored))
 
 
 def _focal_std_ratio(image: Mapping[str, Any]) -> float:

@@ -93,11 +93,14 @@ def check_items(executor: Executor, folder: Path) -> None:
         folder: Folder that the check creates and that the workers can access.
     """
     folder.mkdir()
-    assert sum(1 for _ in executor.run(_WriteMarker(folder), range(40))) == 40
+    num_finished = sum(1 for _ in executor.run(_WriteMarker(folder), range(40)))
+    assert num_finished == 40, f"{num_finished} of 40 work items are reported as finished"
     done = [path.name.split("-") for path in folder.iterdir()]
-    assert sorted(int(item) for item, _ in done) == list(range(40))
+    finished = sorted(int(item) for item, _ in done)
+    assert finished == list(range(40)), "a work item is lost or runs twice"
     processes = {process for _, process in done}
-    assert len(processes) > 1 and str(os.getpid()) not in processes
+    assert str(os.getpid()) not in processes, "work items run in the process of the caller"
+    assert len(processes) > 1, "all work items run in one process"
 
 
 def check_lost_worker(executor: Executor, folder: Path) -> None:

@@ -6,6 +6,7 @@ import contextlib
 import socket
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -133,6 +134,29 @@ class KeepsViews(Changed):
         return depth
 
 
+class DriftsSlowly(PaintedDepth):
+    """Fault: a running mean changes the output after several calls."""
+
+    calls = 0
+
+    def predict(self, view: View) -> DepthPrior:
+        self.calls += 1
+        prior = super().predict(view)
+        if self.calls <= 8:
+            return prior
+        return replace(prior, depth=np.float32(1.001) * prior.depth)
+
+
+class CropsToMask(PaintedDepth):
+    """Fault: the map of the unmasked part of a view is returned as the map of the view."""
+
+    def predict(self, view: View) -> DepthPrior:
+        depth = read_depth(view.image)
+        if view.mask is not None and view.mask.any():
+            depth = depth[:, view.mask.any(axis=0)]
+        return depth_prior(depth)
+
+
 class LandscapeOnly(Changed):
     def change(self, depth: np.ndarray, view: View) -> np.ndarray:
         if view.camera.height > view.camera.width:
@@ -196,6 +220,7 @@ class TripsOverMasks(Changed):
         (LocalPrior, "pickles", "the answer cannot be pickled"),
         (TriesTheNetwork, "offline", "opens a network connection: localhost"),
         (KeepsViews, "memory-released", "retains 3.. kB per view"),
+        (DriftsSlowly, "memory-released", "the output after .* calls differs"),
         (LandscapeOnly, "portrait", "mat1 and mat2"),
         (LeavesPadding, "odd-size", "shifted by .* px at the border|relative error"),
         (DividesBySpread, "flat", "division by zero"),
@@ -204,6 +229,7 @@ class TripsOverMasks(Changed):
         (NeedsTwoRows, "one-pixel", "Shape of array too small"),
         (NeedsWidth, "thin-view", "kernel size"),
         (TripsOverMasks, "masked", "broadcast"),
+        (CropsToMask, "masked", "changes the output at pixels where the mask is True"),
     ],
 )
 def test_caught(caught: Callable[..., None], factory: type, check: str, message: str) -> None:

@@ -249,9 +249,18 @@ class StdOfNetwork(Detector):
         return replace(features, keypoints=inside, std_px=0.25)
 
 
+class Triplicates(Detector):
+    """Fault: returns each feature once per pyramid level."""
+
+    def extract(self, view: View) -> Features:
+        features = super().extract(view)
+        return features.select(np.repeat(np.arange(len(features)), 3))
+
+
 @pytest.mark.parametrize(
     ("factory", "check", "message"),
     [
+        (Triplicates, "features-descriptors", "only 33% of the features are different"),
         (FirstRows, "features-coverage", "keypoints cover . of 9 parts"),
         (FirstTile, "features-large-view", "and 0% of the keypoints"),
         (LowIsStrong, "features-scores", "without contrast have higher scores"),
@@ -348,6 +357,16 @@ class InventsMatches(DenseSift):
         return PairMatches(dense=DenseMatches(grid, grid, np.ones(50, np.float32)))
 
 
+class OverlappingWindows(DenseSift):
+    """Fault: returns each match once per window that contains it."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        matches = super().match(a, b).dense
+        assert matches is not None
+        parts = (matches.points_a, matches.points_b, matches.scores)
+        return PairMatches(dense=DenseMatches(*(np.repeat(part, 5, axis=0) for part in parts)))
+
+
 class CropsToStride(DenseSift):
     """Fault: crops both images to multiples of 32 and does not add the offset of the crop."""
 
@@ -365,6 +384,7 @@ class CropsToStride(DenseSift):
     ("factory", "check", "message"),
     [
         (InventsMatches, "matcher-scores", "50 matches with a view without texture score 1.00"),
+        (OverlappingWindows, "matcher-coverage", "only .*% of the matches are different"),
         (CropsToStride, "matcher-pixel-convention", r"3/4 of the size are shifted by \(\+10"),
     ],
 )

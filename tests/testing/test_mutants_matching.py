@@ -214,12 +214,22 @@ class DepthOfRays(ToldMatcher):
         return replace(depth, depth_a=replace(depth.depth_a, depth=depth.depth_a.depth * rays))
 
 
+class PairConfidence(ToldMatcher):
+    """Fault: returns the confidence of depth as its variance."""
+
+    def depths(self, a: Example, b: Example) -> PairDepth:
+        depth = super().depths(a, b)
+        confidence = 1 + np.exp(-depth.depth_a.depth / 4)
+        return replace(depth, depth_a=replace(depth.depth_a, variance=confidence))
+
+
 @pytest.mark.parametrize(
     ("factory", "check", "message"),
     [
         (SidesSwapped, "matcher-sides", "the two sides are exchanged"),
         (DenseIntegerCentres, "matcher-pixel-convention", r"shifted by \(\+0.50, \+0.50\) px"),
         (DepthSwapped, "matcher-pair-depth", "depth_a and depth_b are swapped"),
+        (PairConfidence, "matcher-pair-depth", "times the std that the test network reports"),
         (DepthOfRays, "matcher-pair-depth", r"depth is proportional to z \* \(ray length / z\)"),
     ],
 )

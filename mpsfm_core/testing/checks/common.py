@@ -25,6 +25,7 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import (
+    DepthPrior,
     Features,
     MultiViewPrior,
     NormalPrior,
@@ -34,10 +35,16 @@ from mpsfm_core.data import (
 )
 from mpsfm_core.providers import ENTRY_POINT_GROUP
 from mpsfm_core.providers.discovery import find_spec_fault
-from mpsfm_core.testing.accuracy import compare_with_truth, require_correct_matches
+from mpsfm_core.testing.accuracy import (
+    DEPTH_TOLERANCE,
+    NORMALS_TOLERANCE_DEG,
+    compare_with_truth,
+    require_correct_matches,
+)
 from mpsfm_core.testing.checks.process import PROCESS_CHECKS
 from mpsfm_core.testing.contract_case import ContractCase, describe_difference
 from mpsfm_core.testing.examples import Example
+from mpsfm_core.testing.map_errors import error_quantile
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 from mpsfm_core.testing.second_process import measure_import
 
@@ -410,7 +417,8 @@ def check_masked(case: ContractCase) -> None:
     """Require valid output for a view whose mask is partly or completely False.
 
     A depth, normal or mask map must keep at least half of its valid pixels where the mask is True,
-    and a detector half of its keypoints. Matches must remain correct.
+    and a detector half of its keypoints. Matches must remain correct. Depth and normals must not
+    move: a provider that crops the view to the mask has to return a map of the whole view.
     """
     whole = case.run(case.example)
     for num_visible_columns in (case.example.camera.width // 2, 0):
@@ -421,6 +429,8 @@ def check_masked(case: ContractCase) -> None:
             require_correct_matches(case, answer)
         if isinstance(answer, Features):
             _require_visible_keypoints(answer, whole, num_visible_columns)
+        if isinstance(answer, (DepthPrior, NormalPrior)) and case.truth_source != "none":
+            _require_equal_columns(case.example, answer, whole, num_visible_columns)
         valid, valid_before = (getattr(output, "valid", output) for output in (answer, whole))
         if not isinstance(valid, np.ndarray) or valid.dtype != np.bool_:
             continue
@@ -430,6 +440,25 @@ def check_masked(case: ContractCase) -> None:
         kept, before = valid[:, :columns].sum(), valid_before[:, :columns].sum()
         if kept < before / 2:
             raise CheckFailed("most values are invalid at pixels where the mask is True")
+
+
+def _require_equal_columns(example: Example, masked: Any, whole: Any, num_columns: int) -> None:
+    """Require similar depth or normals in the first columns of a masked and of a whole view."""
+    a, b = (_sample_map(prior, *example.camera.size) for prior in (masked, whole))
+    where = a.valid & b.valid
+    where[:, num_columns:] = False
+    if not where.any():
+        return
+    if isinstance(whole, DepthPrior):
+        ratios = np.log(a.depth[where].astype(np.float64) / b.depth[where])
+        differences = np.abs(ratios if whole.metric else ratios - np.median(ratios))
+        limit = DEPTH_TOLERANCE
+    else:
+        cosines = (a.normals[where].astype(np.float64) * b.normals[where]).sum(axis=1)
+        differences = np.rad2deg(np.arccos(np.clip(cosines, -1, 1)))
+        limit = NORMALS_TOLERANCE_DEG
+    if error_quantile(differences) > limit:
+        raise CheckFailed("a mask changes the output at pixels where the mask is True")
 
 
 STANDALONE = (check_specification, check_construction, check_light_import)
@@ -516,8 +545,12 @@ def _reduce_map(answer: Any, example: Example) -> Any:
         answer = answer.depth[0]
     width, height = example.camera.size
     rows, columns = answer.shape
-    if rows <= height and columns <= width:
-        return answer
+    return answer if rows <= height and columns <= width else _sample_map(answer, width, height)
+
+
+def _sample_map(answer: Any, width: int, height: int) -> Any:
+    """Sample a depth, normal or mask map at the pixel centers of another size."""
+    rows, columns = answer.shape
     row = ((np.arange(height) + 0.5) * rows / height).astype(int)[:, None]
     column = ((np.arange(width) + 0.5) * columns / width).astype(int)
     if isinstance(answer, np.ndarray):

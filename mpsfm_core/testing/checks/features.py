@@ -28,9 +28,14 @@ Networks with random weights have fewer."""
 _MAX_PART_SHIFT_PX = 2.0
 """Largest accepted shift in pixels, or in median absolute deviations, between the keypoints of two
 equal parts of a view. The shift is at most 0.5 pixels for tested detectors."""
-_MAX_ROUNDING_PX = 0.5
-"""Largest accepted smallest distance between the positions of keypoints on one axis, unless the
-keypoints in another part of the view are as coarse."""
+_ROUNDING_STEPS_PX = np.array([1.0, 2.0, 4.0, 8.0])
+"""Steps in pixels to which positions at the end of a large view must not be rounded. Half precision
+has steps of 2 pixels above 2048."""
+_ROUNDING_TOLERANCE = 0.01
+"""Largest distance from a multiple of a step, relative to the step."""
+_MAX_FAILING_UNIQUE_RATIO = 0.5
+"""Largest ratio of different features or matches that fails. If every feature is returned twice,
+the ratio is 0.5."""
 _BLOB_STD_PX = 4.0
 """Std in pixels of the Gaussian blob of a view with one or few keypoints."""
 _SAME_KEYPOINT_PX = 2.5
@@ -287,9 +292,12 @@ def check_features_large_view(case: ContractCase) -> str:
 def check_features_descriptors(case: ContractCase) -> str:
     """Require that descriptors belong to their keypoints.
 
-    Mutual nearest neighbors between two views of a scene have to be the same surface points.
+    Mutual nearest neighbors between two views of a scene have to be the same surface points. Most
+    keypoints must not have the position and descriptor of another one, which no ratio test accepts.
     """
     case.require_truth("image", "prepared")
+    features: Features = case.run(case.example)
+    require_unique(np.hstack([features.keypoints, features.descriptors]), "features")
     width, height = case.example.camera.size
     portrait = case.example.partner.crop(width // 5, 0, 3 * width // 5, height)
     texts = [_require_same_points(case, b) for b in (case.example.partner, portrait)]
@@ -481,17 +489,19 @@ def _require_equal_parts(first: Features, second: Features) -> None:
                 f"{shift[1]:+.1f}) px"
             )
     for axis, name in enumerate("xy"):
-        steps = [_smallest_step(part.keypoints[:, axis]) for part in (first, second)]
-        if steps[1] > max(_MAX_ROUNDING_PX, 4 * steps[0]):
+        steps = [_rounding_step(part.keypoints[:, axis]) for part in (first, second)]
+        if steps[1] > steps[0]:
             raise CheckFailed(
                 f"{name} of the keypoints at the end of a large view is rounded to {steps[1]:.2g} "
                 f"px, at the start to {steps[0]:.2g} px"
             )
 
 
-def _smallest_step(values: Float64) -> float:
-    """Return the smallest distance between different values, up to rounding errors."""
-    return float(np.diff(np.unique(values.round(2))).min(initial=np.inf))
+def _rounding_step(values: Float64) -> float:
+    """Return the largest step in pixels of which all differences are multiples, or 0."""
+    ratios = (values - values[0])[:, None] / _ROUNDING_STEPS_PX
+    is_rounded = (np.abs(ratios - ratios.round()) < _ROUNDING_TOLERANCE).all(axis=0)
+    return float(np.max(_ROUNDING_STEPS_PX, where=is_rounded, initial=0.0))
 
 
 def _simple_images(size: tuple[int, int]) -> list[UInt8]:
@@ -531,17 +541,17 @@ def _find_shift(found: Float64, expected: Float64, radius: float) -> Float64 | N
         radius: Largest distance of shifts that count as equal.
     """
     found = found[:: -(-len(found) // _NUM_VOTING) or 1]
-    offsets = (found[:, None] - expected[None]).reshape(-1, 2)
-    offsets = offsets[np.abs(offsets).max(axis=1) < _MAX_SHIFT_PX]
+    x, y = found.T[:, :, None] - expected.T[:, None]
+    near = (np.abs(x) < _MAX_SHIFT_PX) & (np.abs(y) < _MAX_SHIFT_PX)
+    offsets = np.stack([x[near], y[near]], axis=1)
     if not len(offsets):
         return None
     # Each offset votes for its cell and the eight cells around it.
     cells = np.floor((offsets + _MAX_SHIFT_PX) / radius).astype(int)
     num_cells = int(2 * _MAX_SHIFT_PX / radius) + 3
-    votes = np.zeros((num_cells, num_cells), int)
-    for x in (0, 1, 2):
-        for y in (0, 1, 2):
-            np.add.at(votes, (cells[:, 0] + x, cells[:, 1] + y), 1)
+    indices = np.ravel_multi_index((cells[:, 0], cells[:, 1]), (num_cells, num_cells))
+    counts = np.bincount(indices, minlength=num_cells**2).reshape(num_cells, num_cells)
+    votes = _sum_of_three(_sum_of_three(counts).T).T
     best = np.unravel_index(int(votes.argmax()), votes.shape)
     chance = 9 * len(offsets) / (2 * _MAX_SHIFT_PX / radius) ** 2
     # Six standard deviations of the number of random votes, of which the largest is taken.
@@ -553,6 +563,14 @@ def _find_shift(found: Float64, expected: Float64, radius: float) -> Float64 | N
     near = np.abs(offsets - center).max(axis=1) <= 1.5 * radius
     shift: Float64 = np.median(offsets[near], axis=0)
     return shift
+
+
+def _sum_of_three(counts: Int64) -> Int64:
+    """Add to each row the two rows before it."""
+    total = counts.copy()
+    total[1:] += counts[:-1]
+    total[2:] += counts[:-2]
+    return total
 
 
 def _pair_nearest(found: Float64, rows: Int64, expected: Float64) -> Int64:
@@ -651,6 +669,13 @@ def _require_in_part(
             f"view{reason}"
         )
     return found
+
+
+def require_unique(rows: Float64, name: str) -> None:
+    """Require that more than half of the rows differ from each other."""
+    ratio = len(np.unique(rows, axis=0)) / max(len(rows), 1)
+    if len(rows) and ratio <= _MAX_FAILING_UNIQUE_RATIO:
+        raise CheckFailed(f"only {ratio:.0%} of the {name} are different")
 
 
 def order_probability(high: Float32, low: Float32) -> float:

@@ -28,10 +28,11 @@ from mpsfm_core.testing.accuracy import (
     point_matches,
 )
 from mpsfm_core.testing.checks.depth import RAY_TOLERANCE
-from mpsfm_core.testing.checks.features import order_probability
+from mpsfm_core.testing.checks.features import order_probability, require_unique
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.examples import Example, outdoor_example
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped, CheckUndecided, CheckUnmeasured
+from mpsfm_core.testing.std_errors import require_depth_std
 
 NUM_MANY_FEATURES = (4096, 600)
 """Numbers of features in two views that every sparse matcher has to accept. Networks limit the
@@ -160,13 +161,15 @@ def check_matcher_mixed_sizes(case: ContractCase) -> str:
 def check_matcher_coverage(case: ContractCase) -> str:
     """Require matches in all parts of two views that overlap by 90 %.
 
-    The outer quarter of each side of both views has to contain matches.
+    The outer quarter of each side of both views has to contain matches. Overlapping windows must
+    not return most matches several times.
     """
     case.require_truth("image", "prepared")
     a, b = case.example, case.example.partner
     matches = match_points(case, a, b, case.run(a))
     if len(matches) < MIN_COVERING:
         raise CheckSkipped(f"{len(matches)} matches are too few to cover a view")
+    require_unique(np.hstack([matches.points_a, matches.points_b]), "matches")
     cells = (matches.points_a / a.camera.size * 3).astype(int).clip(0, 2)
     covered = len(np.unique(cells, axis=0))
     if covered < _MIN_COVERED_CELLS:
@@ -437,7 +440,8 @@ def check_matcher_scores(case: ContractCase) -> str:
 def check_matcher_pair_depth(case: ContractCase) -> str:
     """Require z-depth of the first view in ``depth_a`` and of the second in ``depth_b``.
 
-    In further pairs, the first or the second view has twice the size of the other view.
+    In further pairs, the first or the second view has twice the size of the other view. A variance
+    has to be the square of the std that the test network reports.
     """
     if not case.declares("pair-depth"):
         raise CheckSkipped("the matcher does not declare 'pair-depth'")
@@ -529,6 +533,8 @@ def _require_own_depth(case: ContractCase, a: Example, b: Example) -> float:
             raise CheckFailed(f"depth is proportional to z * (ray length / z) ** {power:.2f}")
     if error > DEPTH_TOLERANCE:
         raise CheckFailed(f"the depth of the image pair has a relative error of {error:.2g}")
+    for prior, example in ((depth.depth_a, a), (depth.depth_b, b)):
+        require_depth_std(prior, example)
     return error
 
 

@@ -12,6 +12,7 @@ import time
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 from mpsfm_core.testing.contract_case import ContractCase, describe_difference
 from mpsfm_core.testing.examples import Example
@@ -94,6 +95,7 @@ def check_memory_released(case: ContractCase) -> str:
     """Require that memory, open files and threads do not grow with the number of views.
 
     The check ``memory-released`` makes up to 28 calls of the provider, fewer if a call takes long.
+    The last call has to give the output of the first one.
     The measured memory is that of Python and numpy. Growth of the memory of the whole process is
     reported above 40 MB only.
     """
@@ -103,8 +105,8 @@ def check_memory_released(case: ContractCase) -> str:
     auxiliary = case.make_auxiliary_input(case.example.view, case.example)
     provider = case.observed.provider
 
-    def run(example: Example) -> None:
-        case.run_on_view(example.view, case.example, provider, auxiliary)
+    def run(example: Example) -> Any:
+        return case.run_on_view(example.view, case.example, provider, auxiliary)
 
     gc.freeze()  # Collecting the objects of all imported libraries takes long.
     tracemalloc.start()
@@ -132,6 +134,10 @@ def check_memory_released(case: ContractCase) -> str:
     if after.memory_mb - before.memory_mb > _MAX_NATIVE_MB:
         growth = after.memory_mb - before.memory_mb
         raise CheckFailed(f"{count} calls let the memory of the process grow by {growth:.0f} MB")
+    if not case.declares("uncached"):
+        difference = describe_difference(case.run(case.example), run(examples[0]))
+        if difference:
+            raise CheckFailed(f"the output after {count} calls differs: {difference}")
     return f"retains {max(retained, 0) / 1000:.1f} kB per view in {count} calls"
 
 
@@ -164,7 +170,7 @@ PROCESS_CHECKS = (
 """Contract checks of side effects, in the order to run them."""
 
 
-def _measure_retained(run: Callable[[Example], None], examples: list[Example]) -> tuple[int, float]:
+def _measure_retained(run: Callable[[Example], Any], examples: list[Example]) -> tuple[int, float]:
     """Run a provider on several views; return the number of calls and retained bytes per call."""
     traced, started, count = tracemalloc.get_traced_memory()[0], time.process_time(), 0
     for example in examples:
