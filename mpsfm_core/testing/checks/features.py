@@ -567,7 +567,7 @@ def _find_shift(found: Float64, expected: Float64, radius: float) -> Float64 | N
 
 def _sum_of_three(counts: Int64) -> Int64:
     """Add to each row the two rows before it."""
-    total = counts.copy()
+    total: Int64 = counts.copy()
     total[1:] += counts[:-1]
     total[2:] += counts[:-2]
     return total
