@@ -182,9 +182,12 @@ class DoubtReason(ReasonCode):
     """The relative std of the guessed focal length of ``num_images`` images is up to
     ``std_ratio``."""
     UNCERTAIN_POSES = ("uncertain-poses", "num_images", "error_deg")
-    CONTRADICTORY_DEPTH = ("contradictory-depth", "num_images", "num_stds", "error_deg")
     """Other focal lengths, principal points and distortions fit the matches as well or better. They
     change the relative poses of ``num_images`` images by up to ``error_deg`` degrees."""
+    CONTRADICTORY_DEPTH = ("contradictory-depth", "num_images", "num_stds", "error_deg")
+    """The depth of two frames of rigs differs by ``num_stds`` standard deviations at common points.
+    Matches alone leave errors of up to ``error_deg`` degrees in the poses of ``num_images``
+    images."""
     PARTIAL_COVERAGE = ("partial-coverage", "provider", "num_images", "width_ratio", "height_ratio")
     """The keypoints of a features provider cover only the upper left part of all images, up to the
     ratios ``width_ratio`` and ``height_ratio`` of the image size."""
