@@ -229,7 +229,7 @@ def test_runtime_seed_is_passed_to_mapper(
         seeds.append(options.seed)
         return MappingResult((), MappingReport())
 
-    monkeypatch.setattr("mpsfm_core.pipeline.run.part_mapping.reconstruct", observed)
+    monkeypatch.setattr("mpsfm_core.mapping.parts.part_mapping.reconstruct", observed)
     with pytest.raises(ReconstructionError):
         mpsfm_core.reconstruct(
             photo_scene.images, config=photo_scene.config, overrides=["runtime.seed=11"]
