@@ -326,7 +326,7 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "The depth of two frames differs by {num_stds:.2g} standard deviations at common points, "
         "for example behind a door. Without depth, the poses of {num_images} photos have errors of "
         "up to {error_deg:.2g} degrees.",
-        "Take a panorama in each door, so that neighboring panoramas share more points.",
+        "Take more photos or panoramas in between, so that neighboring frames share more points.",
     ),
     DoubtReason.PARTIAL_COVERAGE: (
         "keypoints in a part of the photos only",
