@@ -38,6 +38,8 @@ class GroundTruthOptions(Options):
     pixels of a mirrored view."""
     reduction: int = 1
     """Factor by which the returned depth or normal map is smaller than the view."""
+    fails: bool = False
+    """True if each call raises an error."""
 
 
 class GroundTruth:
@@ -72,6 +74,8 @@ class GroundTruth:
         self, view: View, options: GroundTruthOptions
     ) -> tuple[Float64, Float64, Bool, Float64]:
         """Return depth (h, w), normals (h, w, 3), validity and relative std (h, w) of a view."""
+        if options.fails:
+            raise RuntimeError("the wrapped provider fails")
         recognized = self._recognize(view)
         if recognized is not None:
             example, turns = recognized

@@ -434,6 +434,16 @@ class DoublesIntrinsics(Wrapper):
         return prior if view.camera.width < 300 else depth_prior(2 * prior.depth)
 
 
+class HidesErrors(Wrapper):
+    """Fault: returns a constant depth if the wrapped provider fails."""
+
+    def predict(self, view: View, depth: DepthPrior | None = None) -> Any:
+        try:
+            return super().predict(view, depth)
+        except Exception:
+            return depth_prior(np.full(view.image.shape[:2], 3.0))
+
+
 @pytest.mark.parametrize(
     ("factory", "check", "message", "wraps"),
     [
@@ -446,6 +456,7 @@ class DoublesIntrinsics(Wrapper):
         (MirrorNotUndone, "depth-scale", "not proportional to z", "depth"),
         (MirroredNormals, "normals-frame", "x is negated", "normals"),
         (FillsHoles, "normals-validity", "without any surface are valid", "normals"),
+        (HidesErrors, "wrapper-errors", "although the wrapped provider raises", "depth"),
         (DoublesIntrinsics, "depth-same-in-larger-view", "grows 2 times", "depth"),
     ],
 )

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mpsfm_core.data.errors import ProviderRunError
 from mpsfm_core.testing.accuracy import compare_with_truth, require_local_depth
 from mpsfm_core.testing.contract_case import ContractCase
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
@@ -174,6 +175,19 @@ def check_wrapper_inputs(case: ContractCase) -> None:
             raise CheckFailed(f"the wrapped provider receives a wrong input: {wrong[0]}")
 
 
+def check_wrapper_errors(case: ContractCase) -> None:
+    """Require an error of the wrapper if the wrapped provider raises an error.
+
+    The run reports errors of single images. A map in place of an error looks like a prediction.
+    """
+    provider = case.create_provider(fails=True)
+    try:
+        case.run(case.example, provider)
+    except ProviderRunError:
+        return
+    raise CheckFailed("the wrapper returns a map although the wrapped provider raises an error")
+
+
 CHECKS = (
     check_wrapper_keeps_variance,
     check_wrapper_without_variance,
@@ -184,6 +198,7 @@ CHECKS = (
     check_wrapper_low_resolution,
     check_wrapper_validity,
     check_wrapper_inputs,
+    check_wrapper_errors,
     check_wrapper_stacked,
 )
 
