@@ -376,27 +376,27 @@ def test_scale_anchor_keeps_one_coordinate_without_cost() -> None:
     assert anchored.final_cost == pytest.approx(free.final_cost, rel=1e-9)
 
 
-@pytest.mark.parametrize("plain", [False, True])
-def test_conjugate_gradients_reach_the_dense_optimum(plain: bool) -> None:
-    start = perturb(make_problem(30, 800, 5), 0)
-    start = calibrated(start, CameraModel.SIMPLE_PINHOLE)
+def adjust_dense_and_sparse(problem, plain: bool):
+    """Adjust a perturbed problem with a dense and with a sparse solver, which must agree."""
+    start = calibrated(perturb(problem, 0), CameraModel.SIMPLE_PINHOLE)
     start = without_depth(start) if plain else start
     dense = adjust_bundle(start, TIGHT)
     sparse = adjust_bundle(start, TIGHT.model_copy(update={"dense_poses": 0}))
     assert sparse.final_cost == pytest.approx(dense.final_cost, rel=1e-9)
+    return dense, sparse
+
+
+@pytest.mark.parametrize("plain", [False, True])
+def test_conjugate_gradients_reach_the_dense_optimum(plain: bool) -> None:
+    dense, sparse = adjust_dense_and_sparse(make_problem(30, 800, 5), plain)
     np.testing.assert_allclose(sparse.translations, dense.translations, atol=1e-5)
 
 
 @pytest.mark.parametrize("plain", [False, True])
 def test_long_chain_reaches_the_dense_optimum(plain: bool) -> None:
     """Conjugate gradients do not converge soon in a long chain, whose system is factorized."""
-    start = perturb(make_problem(120, 2400, 4), 0)
-    start = calibrated(start, CameraModel.SIMPLE_PINHOLE)
-    start = without_depth(start) if plain else start
-    dense = adjust_bundle(start, TIGHT)
-    sparse = adjust_bundle(start, TIGHT.model_copy(update={"dense_poses": 0}))
+    dense, sparse = adjust_dense_and_sparse(make_problem(120, 2400, 4), plain)
     assert sparse.iterations == pytest.approx(dense.iterations, abs=3)
-    assert sparse.final_cost == pytest.approx(dense.final_cost, rel=1e-9)
     np.testing.assert_allclose(sparse.translations, dense.translations, atol=1e-4)
     np.testing.assert_allclose(sparse.std_intrinsics, dense.std_intrinsics, rtol=1e-4)
 
