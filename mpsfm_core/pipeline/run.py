@@ -24,10 +24,7 @@ from mpsfm_core.dense.densify import densify
 from mpsfm_core.extraction.active_provider import thread_count, worker_count
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
-from mpsfm_core.extraction.runner import (
-    Extraction,
-    extract,
-)
+from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.models import Poses

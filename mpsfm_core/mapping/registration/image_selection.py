@@ -20,11 +20,7 @@ def compute_pair_scores(scene: Scene) -> csr_array:
     return scores
 
 
-def rank_next_images(
-    scene: Scene,
-    scores: csr_array,
-    candidates: Bool,
-) -> list[tuple[int, int]]:
+def rank_next_images(scene: Scene, scores: csr_array, candidates: Bool) -> list[tuple[int, int]]:
     """Rank the unregistered candidate images, best first (COLMAP's ``FindNextImages``).
 
     One image represents each frame of a rig, the image with the best matching registered image.
