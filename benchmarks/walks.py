@@ -390,10 +390,10 @@ def _evaluate_model(folder: Path, poses: Mapping[int, Pose], rounds: float | Non
 def measure_loop_error(
     found: Mapping[str, Pose], truth: Mapping[str, Pose], num_rounds: float = ROUNDS
 ) -> float | None:
-    """Measure how far the camera positions after the first round are off, in meters (median).
+    """Measure the median error in meters of the camera positions after the first round.
 
-    The model is aligned with the true poses of the keyframes at the start of the first round, so
-    the error is the drift of one round if the loop is not closed.
+    The model is aligned with the true poses of the keyframes at the start of the first round. If
+    the loop is not closed, the error is the drift of one round.
 
     Args:
         found: Estimated poses ``cam_from_world`` by frame number.

@@ -233,7 +233,7 @@ class MappingProblem:
 
     @property
     def distinct_pairs(self) -> tuple[VerifiedPair, ...]:
-        """Verified pairs of images that are no duplicates."""
+        """Verified pairs in which neither image is a duplicate."""
         originals = self.originals
         return tuple(
             p for p in self.pairs if p.image_a not in originals and p.image_b not in originals

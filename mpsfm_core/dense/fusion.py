@@ -110,9 +110,10 @@ def fuse_depth_maps(
 
 
 def count_consistent_views(images: Sequence[RegisteredImage]) -> list[UInt8]:
-    """Count the images (h, w) that are consistent with each pixel, including its own image.
+    """Count for each pixel the images whose depth agrees with it, including its own image.
 
-    The count is 0 at pixels with large depth std and at inconsistent pixels, which the cloud omits.
+    Returns one count map (h, w) per image. The count is 0 at pixels with large depth std and at
+    inconsistent pixels, which the cloud omits.
     """
 
     def build_counts(row: int, pixels: Int64, votes: _ConsistencyVotes) -> UInt8:

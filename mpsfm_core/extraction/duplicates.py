@@ -1,4 +1,4 @@
-"""Detection of duplicates, such as copies, exposure brackets or frames of a camera at rest.
+"""Detection of duplicate images: copies, exposure brackets and frames of a camera at rest.
 
 A duplicate adds no parallax, so duplicates are found before features are extracted. Candidates are
 images whose thumbnails correlate. Patch alignment then measures the displacement of corners between
@@ -31,7 +31,8 @@ MIN_ALIGNED_RATIO = 0.5
 """Minimum ratio of the corners that patch alignment finds at the same pixels of two duplicates. The
 measured ratio is 0.6 to 1 for edited copies, and at most 0.01 for different views. [ours]"""
 MAX_SHIFT_PX = 1.0
-"""Maximum displacement of a corner between duplicates, equal to the std of a keypoint. [ours]"""
+"""Maximum displacement in pixels of a corner between two duplicates. The value is the default std
+of a keypoint position. [ours]"""
 NUM_CORNERS = 200
 """Number of corners whose displacement is measured."""
 MIN_CORNERS = 50

@@ -40,8 +40,9 @@ from mpsfm_core.support.npz import read_npz
 from mpsfm_core.support.threads import limit_threads
 
 MAX_WHOLE_IMAGES = 2000
-"""Number of images above which workers map parts, if ``mapping.parts`` is ``auto``. Four workers
-then save more time than their start takes. [tuned: benchmarks.scale]"""
+"""Largest number of images that are mapped in one piece if ``mapping.parts`` is ``auto`` and an
+executor is set. Above it, four workers save time, including their start.
+[tuned: benchmarks.scale]"""
 AUTO_PART_IMAGES = 500
 """Number of images in each part if ``mapping.parts`` is ``auto``. [tuned: benchmarks.scale]"""
 _STEP = "parts"

@@ -215,7 +215,7 @@ class DepthOfRays(ToldMatcher):
 
 
 class PairConfidence(ToldMatcher):
-    """Fault: returns the confidence of depth as its variance."""
+    """Fault: returns the confidence of the network in the field for the depth variance."""
 
     def depths(self, a: Example, b: Example) -> PairDepth:
         depth = super().depths(a, b)
