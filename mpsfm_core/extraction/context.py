@@ -52,6 +52,9 @@ class ExtractionContext:
         """Error message of each skipped image, by image index."""
         self.pair_failures: dict[tuple[int, ...], str] = {}
         """Error message of each skipped pair or group of images, by image indices."""
+        self.originals: dict[int, int] | None = None
+        """Index of the original image by index of the duplicate, or None before duplicates are
+        searched."""
         self._events = events
         self.run_remotely: Callable[[str, Sequence[Any]], Generator[None, None, None]] | None = None
         """Function that runs an extraction stage on remote workers, or None without a remote

@@ -52,12 +52,19 @@ def find_duplicates(context: ExtractionContext) -> dict[int, int]:
     """Find images that show the same view as an earlier image of the same size.
 
     Args:
-        context: Context of the extraction with images and cache.
+        context: Context of the extraction with images and cache, which keeps the result.
 
     Returns:
         Index of the original image by index of the duplicate. The original is the first image of a
         view.
     """
+    if context.originals is None:
+        context.originals = _search_duplicates(context)
+    return context.originals
+
+
+def _search_duplicates(context: ExtractionContext) -> dict[int, int]:
+    """Compare similar images, and return the original of each duplicate."""
     images = context.images
     groups = group_similar(
         [images.thumbnail(index) for index in range(len(images))],
