@@ -267,7 +267,9 @@ class Hooks:
         """
 
     @hookspec
-    def mpsfm_filter_pairs(self, pairs: Sequence[tuple[str, str]]) -> Sequence[tuple[str, str]]:  # type: ignore[empty-body]
+    def mpsfm_filter_pairs(
+        self, pairs: Sequence[tuple[str, str]]
+    ) -> Sequence[tuple[str, str]] | None:
         """Select the image pairs to match from the candidate pairs.
 
         The run matches an image pair only if the hook ``mpsfm_filter_pairs`` of every plugin
@@ -277,8 +279,8 @@ class Hooks:
             pairs: Candidate pairs of image names.
 
         Returns:
-            Selected pairs of image names, a subset of ``pairs``. The order of the pairs, and of
-            the two names of a pair, has no meaning.
+            Selected pairs of image names, a subset of ``pairs``, or None for all. The order of the
+            pairs, and of the two names of a pair, has no meaning.
         """
 
     @hookspec(firstresult=True)
