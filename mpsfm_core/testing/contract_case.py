@@ -58,6 +58,9 @@ TruthSource = Literal["painted", "prepared", "image", "none"]
 
 _NUM_DETECTIONS = 96
 """Number of views whose features a process stores for sparse matchers with the same detector."""
+_NUM_FEATURES = 300
+"""Largest number of features of a view that a sparse matcher receives in most checks. AdaLAM
+and LighterGlue take up to three times as long for the 734 SIFT features of a 192 x 144 view."""
 _MAX_ANSWER_BYTES = 100_000_000
 """Total size in bytes of the outputs of a provider that later checks reuse."""
 AUXILIARY_RELATIVE_STD = 0.02
@@ -390,11 +393,11 @@ class ContractCase:
             if self.setup.prepare is not None:
                 self.setup.prepare(example)
 
-    def extract_features(self, *views: View) -> Any:
-        """Detect features for a sparse matcher; return None for other providers."""
+    def extract_features(self, *views: View, max_count: int = _NUM_FEATURES) -> Any:
+        """Detect the strongest features for a sparse matcher; return None for other providers."""
         if not self.declares("sparse"):
             return None
-        return tuple(self._detect(view) for view in views)
+        return tuple(_select_strongest(self._detect(view), max_count) for view in views)
 
     def received_depth(self) -> list[bool]:
         """Return whether each call of a wrapped normals provider received a depth prior."""
@@ -530,6 +533,14 @@ def _detect_once(detection: _Detection) -> Features:
     """Detect the features of a view, of which each call of a provider receives a copy."""
     detector = detection.create(detection.spec)
     return run_features(detection.spec, detector, detection.view)
+
+
+def _select_strongest(features: Features, max_count: int) -> Features:
+    """Select the features with the highest scores or largest scales, without changing the order."""
+    strength = features.scales if features.scores is None else features.scores
+    if len(features) <= max_count or strength is None:
+        return features.select(np.arange(min(len(features), max_count)))
+    return features.select(np.sort(np.argsort(-strength, kind="stable")[:max_count]))
 
 
 def restore_case(

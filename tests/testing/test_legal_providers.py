@@ -41,7 +41,7 @@ from tests.support.reference_providers import (
     Wrapper,
     depth_prior,
 )
-from tests.support.sparse_providers import SiftDetector
+from tests.support.sparse_providers import CellMatcher, SiftDetector
 
 SLOW_CHECKS = {"second-process", "memory-released", "offline", "speed"}
 """Checks of the process, which are omitted because other tests cover them."""
@@ -297,6 +297,7 @@ DEPTH: tuple[Capability, ...] = ("metric", "variance")
         ("features", ReducedImage, ()),
         ("matcher", OneWayMatcher, ("sparse",)),
         ("matcher", ScaleVariantMatcher, ("dense",)),
+        ("matcher", CellMatcher, ("dense",)),
         ("multiview", RelativeGroup, ("variance",)),
         ("retrieval", ShortDescriptor, ()),
         ("mask", CautiousMask, ()),

@@ -23,8 +23,8 @@ from mpsfm_core import (
     SparseMatches,
     View,
 )
+from mpsfm_core.data import Float64
 from mpsfm_core.providers.builtin.options import SiftOptions
-from mpsfm_core.providers.builtin.sift import Sift
 from mpsfm_core.testing import ContractSetup
 from mpsfm_core.testing.contract import check_id, list_checks
 from mpsfm_core.testing.painted_views import RELATIVE_STD, read_depth
@@ -35,7 +35,12 @@ from tests.support.reference_providers import (
     Thumbnail,
     Wrapper,
 )
-from tests.support.sparse_providers import NearestMatcher, SiftDetector
+from tests.support.sparse_providers import (
+    CellMatcher,
+    DenseSift,
+    NearestMatcher,
+    SiftDetector,
+)
 from tests.testing import (
     test_mutants_any_kind,
     test_mutants_camera,
@@ -331,21 +336,6 @@ class DistanceScores(Nearest):
         return slice(None), 1 - found.scores
 
 
-class DenseSift(NearestMatcher):
-    """Correct dense matcher, which detects features inside."""
-
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(options, context)
-        self.detector = Sift(SiftOptions(), context)
-
-    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
-        features = self.detector.extract(a), self.detector.extract(b)
-        sparse = super().match(a, b, *features).sparse
-        assert sparse is not None
-        points = [f.keypoints[sparse.indices[:, i]] for i, f in enumerate(features)]
-        return PairMatches(dense=DenseMatches(*points, sparse.scores))
-
-
 class InventsMatches(DenseSift):
     """Fault: matches the same pixels of both images if too few matches are found."""
 
@@ -367,6 +357,19 @@ class OverlappingWindows(DenseSift):
         return PairMatches(dense=DenseMatches(*(np.repeat(part, 5, axis=0) for part in parts)))
 
 
+class CellCorners(CellMatcher):
+    """Fault: returns the upper left corners of cells instead of their centers."""
+
+    offset_px = 0.0
+
+
+class IntegerPositions(DenseSift):
+    """Fault: rounds positions down to integers."""
+
+    def move(self, xy: Float64) -> Float64:
+        return np.floor(xy)
+
+
 class CropsToStride(DenseSift):
     """Fault: crops both images to multiples of 32 and does not add the offset of the crop."""
 
@@ -385,6 +388,8 @@ class CropsToStride(DenseSift):
     [
         (InventsMatches, "matcher-scores", "50 matches with a view without texture score 1.00"),
         (OverlappingWindows, "matcher-coverage", "only .*% of the matches are different"),
+        (CellCorners, "matcher-pixel-convention", "shifted by"),
+        (IntegerPositions, "matcher-pixel-convention", "shifted by"),
         (CropsToStride, "matcher-pixel-convention", r"3/4 of the size are shifted by \(\+10"),
     ],
 )

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from mpsfm_core import (
-    DenseMatches,
     DepthPrior,
     Features,
     NormalPrior,
@@ -21,7 +20,6 @@ from mpsfm_core import (
     View,
 )
 from mpsfm_core.providers.builtin.options import SiftOptions
-from mpsfm_core.providers.builtin.sift import Sift
 from mpsfm_core.testing import ContractSetup
 from mpsfm_core.testing.painted_views import read_depth, read_normals
 from tests.support.reference_providers import (
@@ -32,7 +30,7 @@ from tests.support.reference_providers import (
     depth_prior,
     normal_prior,
 )
-from tests.support.sparse_providers import NearestMatcher, SiftDetector
+from tests.support.sparse_providers import CellMatcher, NearestMatcher, SiftDetector
 
 PAINTED = ContractSetup(truth_source="painted")
 
@@ -273,31 +271,10 @@ class Coordinates8(NearestMatcher):
         return PairMatches(SparseMatches(found.indices[inside], found.scores[inside]))
 
 
-class DenseSift(NearestMatcher):
-    """Dense matcher of SIFT features."""
-
-    std_px = 1.0
-
-    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
-        features = [
-            Sift(SiftOptions(), ProviderContext(lambda *_: None)).extract(v) for v in (a, b)
-        ]
-        found = super().match(a, b, *features).sparse
-        assert found is not None
-        points = [self.change(f.keypoints[found.indices[:, i]]) for i, f in enumerate(features)]
-        return PairMatches(dense=DenseMatches(*points, found.scores, self.std_px))
-
-    def change(self, xy: Any) -> Any:
-        return xy
-
-
-class TinyStd(DenseSift):
+class TinyStd(CellMatcher):
     """Fault: rounds matches to cells of 4 pixels, but declares a std_px of 0.1 pixels."""
 
     std_px = 0.1
-
-    def change(self, xy: Any) -> Any:
-        return np.floor(xy / 4) * 4 + 2
 
 
 @pytest.mark.parametrize(

@@ -29,8 +29,6 @@ from mpsfm_core import (
 )
 from mpsfm_core.data import Float64, PairDepth, PinholeCamera
 from mpsfm_core.providers import WeightsFile
-from mpsfm_core.providers.builtin.options import SiftOptions
-from mpsfm_core.providers.builtin.sift import Sift
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing import ContractSetup, run_checks
 from mpsfm_core.testing.painted_views import read_depth, read_normals
@@ -46,7 +44,7 @@ from tests.support.reference_providers import (
     depth_prior,
     normal_prior,
 )
-from tests.support.sparse_providers import NearestMatcher, SiftDetector
+from tests.support.sparse_providers import DenseSift, NearestMatcher, SiftDetector
 from tests.testing.test_mutants_multiview import EVERYTHING, told
 
 PAINTED = ContractSetup(truth_source="painted")
@@ -338,22 +336,17 @@ def test_faulty_features_provider_fails_its_check(
     caught("features", factory, check, message)
 
 
-class ReducingMatcher(NearestMatcher):
+class ReducingMatcher(DenseSift):
     """Dense matcher that reduces both views to 1024 pixels."""
-
-    def __init__(self, options: Any, context: ProviderContext) -> None:
-        super().__init__(options, context)
-        self.detector = Sift(SiftOptions(), context)
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
         (small_a, factors_a), (small_b, factors_b) = (reduced(view, 1024) for view in (a, b))
-        features = self.detector.extract(small_a), self.detector.extract(small_b)
-        sparse = super().match(small_a, small_b, *features).sparse
-        assert sparse is not None
-        points = [f.keypoints[sparse.indices[:, i]] for i, f in enumerate(features)]
+        dense = super().match(small_a, small_b).dense
+        assert dense is not None
+        points = dense.points_a, dense.points_b
         first, second = self.enlarge(points, (factors_a, factors_b))
         inside = (first <= a.camera.size).all(axis=1) & (second <= b.camera.size).all(axis=1)
-        return PairMatches(dense=DenseMatches(first[inside], second[inside], sparse.scores[inside]))
+        return PairMatches(dense=DenseMatches(first[inside], second[inside], dense.scores[inside]))
 
     def enlarge(self, points: Any, factors: Any) -> tuple[Float64, Float64]:
         raise NotImplementedError

@@ -20,7 +20,7 @@ def not_symmetric(folder: Path) -> ContractSetup:
 
 def sift(folder: Path) -> ContractSetup:
     """Return a contract test setup with few features, because kornia's SIFT is slow."""
-    return ContractSetup(options={"max_keypoints": 400})
+    return ContractSetup(options={"max_keypoints": 200})
 
 
 def loftr(folder: Path) -> ContractSetup:

@@ -12,7 +12,7 @@ from contextlib import nullcontext
 import numpy as np
 import torch
 from kornia.color import rgb_to_grayscale
-from kornia.feature import ALIKED, DISK, DeDoDe, SIFTFeature, XFeat, get_laf_center
+from kornia.feature import ALIKED, DISK, DeDoDe, SIFTFeature, XFeat, get_laf_center, scale_laf
 
 from mpsfm_core import Features, ProviderContext, View
 from mpsfm_core.providers.torch_runtime import (
@@ -31,6 +31,7 @@ from mpsfm_kornia.options import (
 )
 from mpsfm_kornia.runtime import Grid, is_inside_mask, load_state, load_weights
 
+_SIFT_DIMENSION = 128
 _Detections = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
@@ -176,8 +177,14 @@ class SiftFeatures(KorniaFeatures):
         ).eval()
 
     def _detect(self, image: torch.Tensor) -> _Detections:
+        gray, network = rgb_to_grayscale(image), self._network
         # The histograms of gradient orientations are sums in any order on a GPU.
         with deterministic_algorithms() if self._device != "cpu" else nullcontext():
-            frames, contrast, descriptors = self._network(rgb_to_grayscale(image))
-        clear = contrast[0] > self._threshold
-        return get_laf_center(frames)[0][clear], contrast[0][clear], descriptors[0][clear]
+            frames, contrast = network.detector(gray)
+            # The detector fills up the keypoints with zeros, whose descriptors take time.
+            clear = contrast[0] > self._threshold
+            frames, contrast = frames[:, clear], contrast[0, clear]
+            if not len(contrast):
+                return get_laf_center(frames)[0], contrast, gray.new_zeros(0, _SIFT_DIMENSION)
+            descriptors = network.descriptor(gray, scale_laf(frames, network.scaling_coef))
+        return get_laf_center(frames)[0], contrast, descriptors[0]
