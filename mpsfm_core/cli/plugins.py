@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mpsfm_core.cli.check_log import CheckLog
 from mpsfm_core.cli.plugin_probe import probe_plugins
 from mpsfm_core.support.child_process import subprocess_environment
 
@@ -24,9 +25,7 @@ if TYPE_CHECKING:
     from mpsfm_core.testing import CheckResult
 
 _CHECKING = "MPSFM_CHECKING"
-"""Environment variable that marks the subprocess of ``mpsfm plugins check``."""
-_AFTER_CRASH = "after-crash"
-"""Value of the environment variable in a subprocess that leaves out the plugins that crash."""
+"""Environment variable of the subprocess of ``mpsfm plugins check`` with the path of its log."""
 
 app = typer.Typer(no_args_is_help=True, help="Installed plugins and their providers.")
 
@@ -91,31 +90,44 @@ def check(
 
     # Importing libraries creates many objects, which garbage collection would visit many times.
     gc.set_threshold(100_000, 20, 100)
-    is_after_crash = os.environ[_CHECKING] == _AFTER_CRASH
-    registry = Registry.discover(without=probe_plugins().crashing if is_after_crash else set())
+    log = CheckLog(Path(os.environ[_CHECKING]))
+    registry = Registry.discover(
+        without=probe_plugins().crashing if log.has_crash_while_loading else set()
+    )
+    checked = log.checked()
+
+    def report(result: CheckResult) -> None:
+        log.finish(result)
+        if not as_json:
+            _print_result(result)
+
     plugin = find_plugin(registry, name)
     has_providers = plugin is None or not plugin.available
     check_ids = None if only is None else parse_check_ids(only, HOOK_CHECKS)
-    results: list[CheckResult] = []
     for kind, provider in find_providers(registry, name) if has_providers else ():
-        results += run_checks(
-            registry,
-            kind,
-            provider,
-            parse_setup(options or []),
-            only=check_ids,
-            device=device,
-            on_result=None if as_json else _print_result,
-        )
+        if f"{kind}/{registry.spec(kind, provider).name}" not in checked:
+            run_checks(
+                registry,
+                kind,
+                provider,
+                parse_setup(options or []),
+                only=check_ids,
+                device=device,
+                on_start=log.start,
+                on_result=report,
+            )
     if has_hooks(registry, name):
         setup = parse_setup(options or []) if not has_providers else None
-        results += run_hook_checks(
+        run_hook_checks(
             registry,
             name,
             only=check_ids,
+            without=checked,
             executor=str(setup.options.get("executor", "")) if setup else "",
-            on_result=None if as_json else _print_result,
+            on_start=log.start,
+            on_result=report,
         )
+    results = log.end()
     if as_json:
         typer.echo(json.dumps([asdict(result) for result in results], indent=2))
     else:
@@ -163,43 +175,47 @@ def new(
 
 
 def _check_in_subprocess(name: str, arguments: list[str]) -> int:
-    """Run the contract checks in a subprocess, which may crash; return its exit code.
+    """Run the contract checks in subprocesses, which may crash; return the last exit code.
 
-    If the subprocess crashes before it lists a check, a plugin may have crashed it. A second
-    subprocess then leaves out the plugins that crash.
+    If a provider ends the subprocess, its check fails, and the next subprocess continues with the
+    next provider. If the subprocess ends before the first check, a plugin may have crashed it. The
+    next subprocess then leaves out the plugins that crash.
     """
-    code, errors, has_output = _run_checking(arguments, "1")
-    if code < 0 and not has_output:
-        code, errors, _ = _run_checking(arguments, _AFTER_CRASH)
-    typer.echo(errors, nl=False, err=True)
-    if code >= 0:
-        return code
     from mpsfm_core.data.errors import ProviderError
 
-    signal_name = signal.Signals(-code).name
-    raise ProviderError(
-        f"{name}: the check after the last listed check crashed the process ({signal_name})"
-    )
+    with tempfile.TemporaryDirectory(prefix="mpsfm-check-") as folder:
+        path = Path(folder, "log")
+        path.touch()
+        log = CheckLog(path)
+        while True:
+            code = _run_checking(arguments, path)
+            ending = signal.Signals(-code).name if code < 0 else f"exit code {code}"
+            ended = log.fail_started(f"the check ends the process ({ending})")
+            if ended is not None:
+                if "--json" not in arguments:
+                    _print_result(ended)
+            elif code >= 0:
+                return code
+            elif log.has_crash_while_loading or log.results():
+                raise ProviderError(f"{name}: the process crashes outside of checks ({ending})")
+            else:
+                log.note_crash_while_loading()
 
 
-def _run_checking(arguments: list[str], mark: str) -> tuple[int, str, bool]:
-    """Run ``mpsfm plugins check`` in a subprocess and print its output line by line.
+def _run_checking(arguments: list[str], log: Path) -> int:
+    """Run ``mpsfm plugins check`` in a subprocess, print its output and return its exit code.
 
     OpenBLAS gets one thread by default, because the arrays of the checks are small and waiting
     threads cost CPU time.
 
     Args:
         arguments: Arguments of ``mpsfm plugins check``.
-        mark: Value of the environment variable that marks the subprocess.
-
-    Returns:
-        Exit code, text on standard error, and whether the subprocess printed a line.
+        log: File with the progress of the checks.
     """
-    has_output = False
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", "mpsfm_core", "plugins", "check", *arguments],
-            env={"OPENBLAS_NUM_THREADS": "1", **subprocess_environment(), _CHECKING: mark},
+            env={"OPENBLAS_NUM_THREADS": "1", **subprocess_environment(), _CHECKING: str(log)},
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
@@ -207,10 +223,10 @@ def _run_checking(arguments: list[str], mark: str) -> tuple[int, str, bool]:
         assert process.stdout is not None
         with process:
             for line in process.stdout:
-                has_output = True
                 typer.echo(line, nl=False)
         errors.seek(0)
-        return process.returncode, errors.read(), has_output
+        typer.echo(errors.read(), nl=False, err=True)
+        return process.returncode
 
 
 def _print_result(result: CheckResult) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib
 import logging
+import math
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
@@ -39,6 +40,7 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.source_hash import hash_requirement, hash_source
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from mpsfm_core.providers.validation import validate_filtered_pairs
+from mpsfm_core.support.time_limit import time_limit
 
 _log = logging.getLogger(__name__)
 
@@ -51,6 +53,13 @@ TIMEOUT_VARIABLE = "MPSFM_PLUGIN_TIMEOUT_S"
 
 DEFAULT_TIMEOUT_S = 10.0
 """Time limit in seconds for loading one plugin; a slow network disk needs several seconds."""
+
+HOOK_TIMEOUT_S = 20.0
+"""Time limit in seconds for a hook that a run calls. The contract of plugins allows 1 s for an
+event; the time limit allows for a busy machine."""
+
+_HOOKS_WITHOUT_TIMEOUT = {"mpsfm_filter_pairs"}
+"""Hooks whose time grows with the number of images."""
 
 _HOOK_VALIDATORS: Mapping[str, Callable[..., Any]] = MappingProxyType(
     {"mpsfm_filter_pairs": validate_filtered_pairs}
@@ -432,9 +441,10 @@ class Registry:
     def call_hook(self, name: str, /, **arguments: Any) -> list[Any]:
         """Call a hook of every plugin and return the values that are not None.
 
-        If a plugin's hook raises an exception or returns an invalid value, a warning is logged and
-        this hook of the plugin is not called again. An error in a viewer or logger plugin must not
-        end a run. :attr:`hook_reasons` lists the hooks that are left out.
+        If a plugin's hook raises an exception, returns an invalid value or does not return within
+        :data:`HOOK_TIMEOUT_S`, a warning is logged and this hook of the plugin is not called
+        again. An error in a viewer or logger plugin must not end a run. :attr:`hook_reasons` lists
+        the hooks that are left out.
 
         Args:
             name: Name of the plugin hook to call.
@@ -451,7 +461,9 @@ class Registry:
             given = {key: arguments[key] for key in implementation.argnames}
             doubts: dict[HookReason, str] = {}
             try:
-                answer = implementation.function(**given)
+                limit_s = math.inf if name in _HOOKS_WITHOUT_TIMEOUT else HOOK_TIMEOUT_S
+                with time_limit(limit_s, name):
+                    answer = implementation.function(**given)
                 if answer is not None and name in _HOOK_VALIDATORS:
                     answer, doubts = _HOOK_VALIDATORS[name](answer, **arguments)
             except Exception as error:

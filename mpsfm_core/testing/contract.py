@@ -112,6 +112,7 @@ class Contract:
         self._device = device
         self._cases: dict[str, ContractCase] = {}
         self._failed_required: dict[str, str] = {}
+        self._has_timed_out = False
 
     @property
     def provider(self) -> str:
@@ -141,6 +142,8 @@ class Contract:
 
     def _outcome(self, case: ContractCase, task: CheckTask) -> tuple[Status, str]:
         check = find_check(task.id)
+        if self._has_timed_out:
+            return "skip", "an earlier call of the provider did not return"
         if check not in REQUIRED and check not in STANDALONE:
             failed_id = self._first_failed_required(case, task.around)
             if failed_id:
@@ -152,8 +155,11 @@ class Contract:
             return ("unmeasured" if is_unmeasured else "skip"), str(skipped)
         except (CheckFailed, MpsfmError) as failed:
             return "fail", str(failed)
+        except TimeoutError as late:
+            self._has_timed_out = True  # Each further call may take the whole time limit.
+            return "fail", str(late)
         # A provider that the check calls directly raised the exception.
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             return "fail", f"{type(error).__name__}: {error}"
 
     def _first_failed_required(self, case: ContractCase, around: str) -> str:
@@ -197,6 +203,7 @@ def run_checks(
     *,
     only: Collection[str] | None = None,
     device: str = "cpu",
+    on_start: Callable[[str, str, str], None] | None = None,
     on_result: Callable[[CheckResult], None] | None = None,
 ) -> list[CheckResult]:
     """Run the contract checks of a provider.
@@ -209,6 +216,8 @@ def run_checks(
             specification names.
         only: Ids of the contract checks to run, or None to run all.
         device: Device of the provider, ``"cpu"`` or ``"cuda"``.
+        on_start: Function that is called with the first three fields of the
+            :class:`CheckResult` before each check.
         on_result: Function that is called with the result of each check.
 
     Returns:
@@ -222,6 +231,8 @@ def run_checks(
         contract = Contract(registry, kind, name, Path(folder), setup, device=device)
         for task in contract.tasks():
             if only is None or task.id in only:
+                if on_start:
+                    on_start(contract.provider, task.around, task.id)
                 results.append(contract.run(task))
                 if on_result:
                     on_result(results[-1])
@@ -373,6 +384,6 @@ def _passes(check: Check, case: ContractCase) -> bool:
         check(case)
     except CheckSkipped:
         return True
-    except Exception:
+    except (Exception, SystemExit):
         return False
     return True

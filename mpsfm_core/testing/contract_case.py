@@ -36,6 +36,7 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore
 from mpsfm_core.support.lru_cache import LruCache
+from mpsfm_core.support.time_limit import time_limit
 from mpsfm_core.testing.examples import (
     Appearance,
     Example,
@@ -56,6 +57,9 @@ from mpsfm_core.testing.process_state import read_process_settings
 TruthSource = Literal["painted", "prepared", "image", "none"]
 """Source of the ground truth for a provider under test, see :class:`ContractSetup`."""
 
+CALL_TIMEOUT_S = 60.0
+"""Time in seconds after which a call or the construction of a provider is interrupted. The check
+``speed`` fails after 20 s, and large views take longer than the views of this check."""
 _NUM_DETECTIONS = 96
 """Number of views whose features a process stores for sparse matchers with the same detector."""
 _NUM_FEATURES = 300
@@ -258,6 +262,23 @@ class ContractCase:
             provider = self._create(self.registry, self.kind, self.name, options)
             return self.run(self.example, provider)
 
+    def file_options(self) -> dict[str, Path]:
+        """Return the options of the ContractSetup that name an existing file."""
+        texts = {k: v for k, v in self.setup.options.items() if isinstance(v, (str, Path)) and v}
+        return {key: Path(value) for key, value in texts.items() if Path(value).is_file()}
+
+    def with_options(self, **changes: Any) -> ContractCase:
+        """Return a contract case of the same provider with other options."""
+        return ContractCase(
+            self.registry,
+            self.spec,
+            replace(self.setup, options={**self.setup.options, **changes}),
+            self._folder,
+            name=self.name,
+            behaves_as=self.kind if self.spec.kind == "wrapper" else None,
+            device=self._device,
+        )
+
     def require_resolved_weights(self) -> None:
         """Require that the provider opened its weights files by ``context.resolve_weights``.
 
@@ -362,6 +383,11 @@ class ContractCase:
             return self._answers.get(
                 key, lambda: self.run_on_views(views, auxiliary, self.provider)
             )
+        with time_limit(CALL_TIMEOUT_S, "a call of the provider"):
+            return self._call(provider, views, auxiliary)
+
+    def _call(self, provider: Any, views: Sequence[View], auxiliary: Any) -> Any:
+        """Call a provider instance and validate the output."""
         if self.kind == "matcher":
             return run_matcher(self._validated_spec, provider, (views[0], views[1]), auxiliary)
         if self.kind == "multiview":
@@ -513,7 +539,8 @@ class ContractCase:
             return resolve(uri, sha256)
 
         context = ProviderContext(record, device=self._device)
-        return registry.create(kind, name, options, context, wrap)
+        with time_limit(CALL_TIMEOUT_S, "the constructor of the provider"):
+            return registry.create(kind, name, options, context, wrap)
 
 
 @dataclass(frozen=True)

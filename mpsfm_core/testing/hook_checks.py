@@ -20,15 +20,19 @@ from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.data.errors import InputError, MpsfmError, did_you_mean
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers import PROVIDER_KINDS, ExportFormat, ModelExport
-from mpsfm_core.providers.registry import Registry
+from mpsfm_core.providers.registry import HOOK_TIMEOUT_S, Registry
 from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 from mpsfm_core.providers.validation import validate_filtered_pairs
+from mpsfm_core.support.time_limit import time_limit
 from mpsfm_core.testing.contract import CheckResult, Status, check_id
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 MAX_EVENT_S = 1.0
 """Time limit in seconds for a hook that receives an event. A reconstruction of 1 000 images reports
 several thousand events, and waits for each hook."""
+MAX_CHECK_S = 100.0
+"""Time limit in seconds for one check of hooks, which interrupts viewers and executors that
+block. The checks of the plugins in this repository take at most 10 s."""
 MAX_FILTER_S = 10.0
 """Time limit in seconds to filter 5 000 image pairs."""
 _PAIRS = [
@@ -67,15 +71,18 @@ class HookCase:
 
         Raises:
             CheckSkipped: the plugin does not implement the hook.
-            CheckFailed: the hook raises an exception or prints on standard output.
+            CheckFailed: the hook raises an exception, does not return, or prints on standard
+                output.
         """
         caller = getattr(self.hooks.hook, hook)
         if not caller.get_hookimpls():
             raise CheckSkipped(f"the plugin does not implement {hook}")
         printed = io.StringIO()
         try:
-            with redirect_stdout(printed):
+            with redirect_stdout(printed), time_limit(HOOK_TIMEOUT_S, hook):
                 answer = caller(**arguments)
+        except TimeoutError as error:
+            raise CheckFailed(str(error)) from error
         except ModuleNotFoundError as error:
             raise CheckFailed(f"{hook} needs {error.name!r}, which is not installed") from error
         except Exception as error:
@@ -139,15 +146,18 @@ def check_hook_viewers(case: HookCase) -> str:
     for name, reference in viewers.items():
         with tempfile.TemporaryDirectory(prefix="mpsfm-viewer-") as folder:
             try:
-                viewer = resolve_name(reference)(Path(folder), lambda _: None)
+                with time_limit(HOOK_TIMEOUT_S, "its constructor"):
+                    viewer = resolve_name(reference)(Path(folder), lambda _: None)
                 registry = Registry()
                 if _has_hooks(viewer):
                     registry.register(viewer, name=name)
                 viewed = HookCase(case.registry, name, registry)
                 scenes = run_small_reconstruction(Stages(_CountedHooks(viewed)))
                 for scene in scenes:
-                    viewer.show(scene)
-                text = viewer.finish()
+                    with time_limit(HOOK_TIMEOUT_S, "show()"):
+                        viewer.show(scene)
+                with time_limit(HOOK_TIMEOUT_S, "finish()"):
+                    text = viewer.finish()
             except CheckFailed:
                 raise
             except Exception as error:
@@ -278,6 +288,8 @@ def run_hook_checks(
     only: Collection[str] | None = None,
     executor: str = "",
     executor_options: Mapping[str, Any] | None = None,
+    without: Collection[str] = (),
+    on_start: Callable[[str, str, str], None] | None = None,
     on_result: Callable[[CheckResult], None] | None = None,
 ) -> list[CheckResult]:
     """Run the contract checks of the hooks that a plugin implements.
@@ -288,6 +300,9 @@ def run_hook_checks(
         only: Ids of the contract checks to run, or None to run all.
         executor: Name of the plugin's executor, by default the name of the plugin.
         executor_options: Options of the executor.
+        without: Plugins to leave out, as ``plugin/NAME``.
+        on_start: Function that is called with the first three fields of the
+            :class:`CheckResult` before each check.
         on_result: Function that is called with the result of each check.
 
     Returns:
@@ -298,6 +313,8 @@ def run_hook_checks(
     """
     results = []
     for plugin, module in find_hook_modules(registry, name).items():
+        if f"plugin/{plugin}" in without:
+            continue
         hooks = Registry()
         hooks.register(module, name=plugin)
         case = HookCase(registry, plugin, hooks, executor, executor_options or {})
@@ -305,13 +322,16 @@ def run_hook_checks(
             id = check_id(check)
             if only is not None and id not in only:
                 continue
+            if on_start:
+                on_start(f"plugin/{plugin}", "", id)
             started = time.perf_counter()
             status: Status = "pass"
             try:
-                message = check(case)
+                with time_limit(MAX_CHECK_S, f"the plugin {plugin!r}"):
+                    message = check(case)
             except CheckSkipped:
                 continue
-            except (CheckFailed, MpsfmError) as error:
+            except (CheckFailed, MpsfmError, TimeoutError) as error:
                 status, message = "fail", str(error)
             seconds = time.perf_counter() - started
             results.append(CheckResult(f"plugin/{plugin}", "", id, status, message, seconds))

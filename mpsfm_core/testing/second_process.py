@@ -17,7 +17,11 @@ from pathlib import Path
 from typing import IO, Any
 
 from mpsfm_core.support.child_process import subprocess_environment
+from mpsfm_core.support.time_limit import time_limit
 from mpsfm_core.testing.outcome import CheckFailed
+
+_TIMEOUT_S = 120.0
+"""Time limit in seconds to construct and call a provider in the second process."""
 
 
 class SecondProcess:
@@ -77,9 +81,13 @@ class SecondProcess:
         self.is_new = False
         try:
             print(json.dumps([function, arguments]), file=self._process.stdin, flush=True)
-            line = self._process.stdout.readline()
+            with time_limit(_TIMEOUT_S, "the second process"):
+                line = self._process.stdout.readline()
         except BrokenPipeError:
             line = ""
+        except TimeoutError as late:
+            _start.cache_clear()
+            raise CheckFailed(f"{what}: {late}") from late
         error, result = json.loads(line) if line else (self._last_error(), None)
         if error:
             _start.cache_clear()

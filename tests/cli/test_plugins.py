@@ -207,11 +207,55 @@ def test_plugins_check_plugin_without_providers_checks_hooks(
     assert "pass  plugin/listener: hook-exports" in out
 
 
+CRASHING = """
+    import os
+    import numpy as np
+    from mpsfm_core import ProviderSpec, hookimpl
+
+    class Good:
+        def __init__(self, options, context): ...
+
+        def describe(self, view):
+            return np.ones(4, np.float32) / 2
+
+    class Abort(Good):
+        def describe(self, view):
+            os.abort()
+
+    class Exit(Good):
+        def describe(self, view):
+            os._exit(0)
+
+    @hookimpl
+    def mpsfm_providers():
+        classes = {"abort": Abort, "exit": Exit, "good": Good}
+        return [ProviderSpec("retrieval", name, f"{__name__}:{value.__name__}")
+                for name, value in classes.items()]
+"""
+
+
+def test_plugins_check_names_providers_that_end_the_process(
+    install_plugin: Callable[..., str],
+) -> None:
+    install_plugin("mpsfm-crashing", CRASHING)
+    code, out, _ = mpsfm("plugins", "check", "mpsfm-crashing", "--only", "output-rules")
+    assert code == 1
+    lines = [line.split(",")[0] + line.partition(" s")[2] for line in out.splitlines()]
+    assert lines == [
+        "fail  retrieval/abort: output-rules: the check ends the process (SIGABRT)",
+        "fail  retrieval/exit: output-rules: the check ends the process (exit code 0)",
+        "pass  retrieval/good: output-rules",
+        "2 fail",
+    ]
+    assert out.endswith("2 fail, 1 pass\n")
+
+
 @pytest.mark.parametrize(("option", "code"), [((), 0), (("--strict",), 1)])
 def test_plugins_check_strict_fails_if_check_cannot_measure(
-    option: tuple[str, ...], code: int, monkeypatch: pytest.MonkeyPatch
+    option: tuple[str, ...], code: int, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setenv("MPSFM_CHECKING", "1")  # The check runs in this process.
+    (tmp_path / "log").touch()
+    monkeypatch.setenv("MPSFM_CHECKING", str(tmp_path / "log"))  # checks in this process
     found, text, _ = mpsfm("plugins", "check", "depth/flat", "--only", "depth-scale", *option)
     assert found == code, text
     assert "1 unmeasured: the ground truth is unknown" in text

@@ -6,6 +6,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import logging
+import signal
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -488,6 +490,23 @@ class TestHooks:
         assert Broken.calls == 1
         assert caplog.text.count("window closed") == 1
         assert "viewer" in caplog.text
+
+    @pytest.mark.skipif(not hasattr(signal, "setitimer"), reason="needs SIGALRM")
+    def test_blocking_event_listener_is_removed_and_named(
+        self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        class Blocking:
+            @hookimpl
+            def mpsfm_scene_changed(self) -> None:
+                threading.Event().wait()
+
+        monkeypatch.setattr("mpsfm_core.providers.registry.HOOK_TIMEOUT_S", 0.05)
+        registry = Registry()
+        registry.register(Blocking(), name="viewer")
+        for _ in range(2):
+            registry.call_hook("mpsfm_scene_changed", scene=None)
+        assert "viewer" in caplog.text
+        assert caplog.text.count("mpsfm_scene_changed does not return within 0.05 s") == 1
 
     def test_calibration_prefers_config_then_wrapper_then_hook_then_spec(self) -> None:
         declared = DepthCalibration(relative_std=0.1)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import sys
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -134,6 +135,13 @@ def test_slow_event_hook_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.status == "fail" and "mpsfm_notice takes" in result.message
 
 
+@pytest.mark.usefixtures("no_mapper")
+def test_blocking_event_hook_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hook_checks, "HOOK_TIMEOUT_S", 0.05)
+    (result,) = check(mpsfm_notice=lambda text: threading.Event().wait())
+    assert result.status == "fail" and "mpsfm_notice does not return" in result.message
+
+
 class GoodViewer:
     def __init__(self, output: Path, pictures: Any) -> None:
         assert pictures("no such image") is None
@@ -149,6 +157,12 @@ class ViewerWithoutText(GoodViewer):
         return None  # type: ignore[return-value]
 
 
+class ViewerThatWaits(GoodViewer):
+    def finish(self) -> str:
+        threading.Event().wait()
+        return "closed"
+
+
 class ViewerOfFirstImage(GoodViewer):
     def show(self, scene: Any, cloud: Any = None) -> None:
         scene.images[0]
@@ -161,10 +175,12 @@ class ViewerOfFirstImage(GoodViewer):
         ("GoodViewer", "pass", "good shows 1 scenes"),
         ("ViewerWithoutText", "fail", "returns no text, but None"),
         ("ViewerOfFirstImage", "fail", "raises IndexError"),
+        ("ViewerThatWaits", "fail", "finish() does not return within 0.2 s"),
         ("NoViewer", "fail", "raises AttributeError"),
     ],
 )
-def test_viewers(name: str, status: str, message: str) -> None:
+def test_viewers(name: str, status: str, message: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(hook_checks, "HOOK_TIMEOUT_S", 0.2)
     (result,) = check(mpsfm_viewers=lambda: {"good": f"{__name__}:{name}"})
     assert (result.id, result.status) == ("hook-viewers", status)
     assert message in result.message

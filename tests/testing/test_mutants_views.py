@@ -21,6 +21,7 @@ from mpsfm_core import (
     Features,
     MultiViewPrior,
     NormalPrior,
+    Options,
     PairMatches,
     ProviderContext,
     ProviderSpec,
@@ -445,6 +446,50 @@ def test_provider_that_opens_its_weights_itself_fails(tmp_path: Path) -> None:
     registry.add(ProviderSpec("depth", "opens-weights", PaintedDepth, weights=weights))
     (result,) = run_checks(registry, "depth", "opens-weights", PAINTED, only={"construction"})
     assert result.status == "fail" and "without context.resolve_weights" in result.message
+
+
+class RandomWithoutWeights(PaintedDepth):
+    """Fault: uses random weights if the weights file is missing."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(options, context)
+        try:
+            self.factor = float(np.load(context.resolve_weights(options.weights))["weights"])
+        except Exception:
+            self.factor = 0.9
+
+    def predict(self, view: View) -> DepthPrior:
+        return depth_prior(self.factor * read_depth(view.image))
+
+
+class HidesMissingWeights(RandomWithoutWeights):
+    """Fault: the error does not name the missing file."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(options, context)
+        if self.factor != 1:
+            raise RuntimeError("the network has no weights")
+
+
+class FileOptions(Options):
+    weights: str
+
+
+@pytest.mark.parametrize(
+    ("factory", "check", "message"),
+    [
+        (RandomWithoutWeights, "missing-file", "an output without the file of 'weights'"),
+        (HidesMissingWeights, "missing-file", "does not name the missing file .*'weights'"),
+    ],
+)
+def test_provider_without_weights_fails_its_check(
+    caught: Callable[..., None], factory: type, check: str, message: str
+) -> None:
+    def setup(folder: Path) -> ContractSetup:
+        np.savez(folder / "tiny.npz", weights=1.0)
+        return ContractSetup({"weights": str(folder / "tiny.npz")}, "painted")
+
+    caught("depth", factory, check, message, setup, options=FileOptions)
 
 
 class DepthOfLargerFirst(ToldMatcher):

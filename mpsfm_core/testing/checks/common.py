@@ -42,7 +42,7 @@ from mpsfm_core.testing.accuracy import (
     require_correct_matches,
 )
 from mpsfm_core.testing.checks.process import PROCESS_CHECKS
-from mpsfm_core.testing.contract_case import ContractCase, describe_difference
+from mpsfm_core.testing.contract_case import CALL_TIMEOUT_S, ContractCase, describe_difference
 from mpsfm_core.testing.examples import Example
 from mpsfm_core.testing.map_errors import error_quantile
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
@@ -97,6 +97,30 @@ def check_construction(case: ContractCase) -> None:
     """
     assert case.provider is not None
     case.require_resolved_weights()
+
+
+def check_missing_file(case: ContractCase) -> str:
+    """Require an error that names the file if an option names a file that does not exist.
+
+    The check replaces each option of the ContractSetup that names a file, such as the weights of
+    the test network. A provider with random weights returns maps that look like predictions.
+    """
+    files = case.file_options()
+    if not files:
+        raise CheckSkipped("no option of the ContractSetup names a file")
+    for option, path in files.items():
+        missing = path.with_name(f"missing-{path.name}")
+        try:
+            case.with_options(**{option: str(missing)}).run(case.example)
+        except Exception as error:
+            if missing.name not in str(error):
+                reason = f"{type(error).__name__}: {error}"
+                raise CheckFailed(
+                    f"the error does not name the missing file of option {option!r}: {reason}"
+                ) from error
+        else:
+            raise CheckFailed(f"the provider returns an output without the file of {option!r}")
+    return ", ".join(files)
 
 
 def check_light_import(case: ContractCase) -> str:
@@ -264,16 +288,21 @@ def check_threads(case: ContractCase) -> None:
             if parallel[index] is None or differs:
                 parallel[index] = answer
 
-    threads = [threading.Thread(target=work, args=(index,)) for index in range(len(examples))]
+    # Daemon threads do not keep the process alive if the provider waits for a lock forever.
+    threads = [
+        threading.Thread(target=work, args=(index,), daemon=True) for index in range(len(examples))
+    ]
     interval = sys.getswitchinterval()
     sys.setswitchinterval(1e-5)
     try:
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join()
+            thread.join(2 * CALL_TIMEOUT_S)
     finally:
         sys.setswitchinterval(interval)
+    if any(thread.is_alive() for thread in threads):
+        raise CheckFailed("calls of the provider in two parallel threads do not return")
     for expected, answer in zip(alone, parallel, strict=True):
         if isinstance(answer, Exception):
             raise CheckFailed(f"the provider fails in two parallel threads: {answer}") from answer
@@ -465,6 +494,7 @@ STANDALONE = (check_specification, check_construction, check_light_import)
 """Contract checks that do not call the provider under test."""
 
 COMMON = (
+    check_missing_file,
     check_deterministic,
     check_no_state,
     check_inputs_unchanged,

@@ -45,6 +45,11 @@ _LARGE_FACTOR = 21
 _SMALL_SIZE, _WIDE_SIZE = (256, 192), (2048, 256)
 """Widths and heights in pixels of views below and above the input size of dense matchers. The
 height of the wide view limits the run time."""
+_MEDIUM_SIZES = (512, 384), (384, 288)
+"""Widths and heights in pixels of two views that a network with an input of 320 pixels reduces by
+different factors."""
+_MEDIUM_SHIFT = np.array([64.0, 48.0])
+"""Position in pixels of the second medium view in the first."""
 _SMALL_SHIFT = np.array([64.0, 0.0])
 """Position in pixels of the small view in the wide one."""
 _WIDE_SHIFT = np.array([256.0, 0.0])
@@ -140,12 +145,13 @@ def check_matcher_sizes(case: ContractCase) -> str:
 
 
 def check_matcher_mixed_sizes(case: ContractCase) -> str:
-    """Require dense matches in pixels of each view if one or both views are very wide.
+    """Require dense matches in pixels of each view if a network reduces one or both views.
 
-    Two views of 256 x 192 and 2048 x 256 pixels show the same random texture. A matcher may fail
-    for views of such different sizes. If most of its matches agree on a scale and shift, the scale
-    has to be 1, and the shift the true one. Networks reduce the wide view only, so that factors of
-    the other view, of the other axis or of no view are wrong.
+    Two views of 256 x 192 and 2048 x 256 pixels, or of 512 x 384 and 384 x 288 pixels, show the
+    same random texture. A matcher may fail for views of such different sizes. If most of its
+    matches agree on a scale and shift, the scale has to be 1, and the shift the true one. Networks
+    reduce both views by different factors, so that factors of the other view, of the other axis or
+    of no view are wrong.
     """
     if not case.declares("dense"):
         raise CheckSkipped("sparse matches have no positions of their own")
@@ -155,6 +161,7 @@ def check_matcher_mixed_sizes(case: ContractCase) -> str:
         (_SMALL_SIZE, _WIDE_SIZE, -_SMALL_SHIFT),
         (_WIDE_SIZE, _SMALL_SIZE, _SMALL_SHIFT),
         (_WIDE_SIZE, _WIDE_SIZE, _WIDE_SHIFT),
+        (*_MEDIUM_SIZES, _MEDIUM_SHIFT),
     ):
         matches = point_matches(case.run_on_views(_noise_views(shift, size_a, size_b)), None)
         texts.append(_require_true_scale(matches, shift, f"{size_a} and {size_b} pixels"))
