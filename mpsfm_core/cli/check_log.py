@@ -1,4 +1,4 @@
-"""Progress of ``mpsfm plugins check`` in a file that survives a crash of the checking process."""
+"""Log of ``mpsfm plugins check`` in a file that survives a crash of the checking process."""
 
 from __future__ import annotations
 
