@@ -109,5 +109,6 @@ def test_correct_providers_pass(
     assert {r.id for r in results if r.status in ("skip", "unmeasured")} == {
         *skipped,
         "light-import",
+        "missing-file",
     }
     assert all(r.message for r in results if r.status in ("skip", "unmeasured"))
