@@ -294,11 +294,11 @@ class Component:
     def reregister_images(self, candidates: Bool) -> None:
         """Deregister misregistered images and register them with other reference images.
 
-        The poses of re-registered images are kept if no image is lost, more matches observe common
-        3D points, and the images are no longer misregistered. Each set of misregistered images is
-        re-registered at most once. If re-registration fails, images are deregistered that only one
-        image pair connects to the model and several image pairs contradict. Images with a known
-        pose stay registered, unless the known poses are only initial guesses.
+        The poses of re-registered images are kept if no image is lost and more matches observe
+        common 3D points. Each set of misregistered images is re-registered at most once. If
+        re-registration fails, images are deregistered that only one image pair connects to the
+        model and several image pairs contradict. Images with a known pose stay registered, unless
+        the known poses are only initial guesses.
 
         Args:
             candidates: (n,) bool mask of the images that may be registered.
@@ -314,10 +314,8 @@ class Component:
                 self.maintenance.refine_globally()
             lost = self._find_deregistered(before)
             if not lost and self._count_explained_matches() > num_explained:
-                remaining = self._detect_misregistrations()
-                if all(other.images != detection.images for other in remaining):
-                    detections = remaining
-                    continue
+                detections = self._detect_misregistrations()
+                continue
             self.maintenance.restore(before)
             for image in lost:
                 self._event_log.registered(image, self.size)
