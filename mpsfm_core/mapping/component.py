@@ -387,9 +387,12 @@ class Component:
         return within
 
     def finalize(self) -> None:
-        """Refine all images, and repeat the depth check."""
-        if self.maintenance.is_checked:
+        """Refine all images with a last self-calibration, and repeat the depth check."""
+        refiner = self.refiner
+        is_calibrated = refiner.calibrates_with_long_tracks or not refiner.can_refine_focals()
+        if self.maintenance.is_checked and is_calibrated:
             return
+        refiner.calibrates_with_long_tracks = True
         self.maintenance.refine_globally()
         consistency = self._options.consistency
         if consistency.enabled and consistency.check_at_end:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from mpsfm_core.mapping.initialization.camera_splitting import (
     split_cameras,
 )
 from mpsfm_core.mapping.options import MapperOptions
+from mpsfm_core.mapping.scene.estimated_intrinsics import MIN_FOCAL_IMAGES
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 
 MIN_FOCAL_CHANGE = 1.1
@@ -63,8 +65,10 @@ def _apply_shared_focals(
 ) -> tuple[MappingImage, ...]:
     """Return the images with focal lengths that refinement changed by ``MIN_FOCAL_CHANGE``.
 
-    An image with a changed focal length also takes the refined distortion of its camera.
+    An image with a changed focal length also takes the refined distortion of its camera, if at
+    least ``MIN_FOCAL_IMAGES`` images of the model share the camera.
     """
+    num_images = Counter(problem.images[image.index].shared_camera for image in model.images)
     refined = {
         problem.images[image.index].shared_camera: image
         for image in model.images
@@ -79,7 +83,8 @@ def _apply_shared_focals(
             images.append(image)
             continue
         changed = image.with_camera(source.camera)
-        if not image.camera_model.is_fisheye:
+        is_shared = num_images[image.shared_camera] >= MIN_FOCAL_IMAGES
+        if is_shared and not image.camera_model.is_fisheye:
             changed = replace(changed, initial_distortion=to_distortion(source.distortion))
         images.append(changed)
     return tuple(images)

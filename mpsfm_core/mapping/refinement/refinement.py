@@ -154,6 +154,8 @@ class Refiner:
         adapts_reprojection_loss: Whether global refinement may widen the reprojection loss. While
             images are registered one by one, a narrow reprojection loss protects against wrong
             matches.
+        calibrates_with_long_tracks: Whether self-calibration estimates intrinsics from long tracks
+            (see :func:`calibrate_cameras`).
     """
 
     def __init__(self, scene: Scene, options: MapperOptions, scores: csr_array) -> None:
@@ -167,6 +169,7 @@ class Refiner:
         self.noise = DepthNoise()
         self.loss_scale = options.refinement.bundle.reprojection_scale
         self.adapts_reprojection_loss = False
+        self.calibrates_with_long_tracks = False
         self._integrator_noise = DepthNoise()
         self._integrators = _create_cache()
 
@@ -301,6 +304,7 @@ class Refiner:
                 bundle.representatives,
                 refine_distortion=self.options.refine_distortion,
                 refine_principal_point=self.options.refine_principal_point,
+                long_tracks=self.calibrates_with_long_tracks,
             )
         else:
             result = adjust_bundle(bundle.problem, options)
@@ -536,6 +540,7 @@ class Refiner:
         self.noise = self._integrator_noise = DepthNoise()
         self.loss_scale = self.options.bundle.reprojection_scale
         self.adapts_reprojection_loss = False
+        self.calibrates_with_long_tracks = False
 
     def state_dict(self) -> StateDict:
         """Return the depth noise measurements and the fixed poses for a checkpoint."""
@@ -545,6 +550,7 @@ class Refiner:
             "integrator_noise": list(self._integrator_noise),
             "loss_scale": self.loss_scale,
             "adapts_reprojection_loss": self.adapts_reprojection_loss,
+            "calibrates_with_long_tracks": self.calibrates_with_long_tracks,
         }
 
     def load_state_dict(self, state: StateDict) -> None:
@@ -554,6 +560,7 @@ class Refiner:
         self._integrator_noise = DepthNoise(*state["integrator_noise"])
         self.loss_scale = state["loss_scale"]
         self.adapts_reprojection_loss = state["adapts_reprojection_loss"]
+        self.calibrates_with_long_tracks = state["calibrates_with_long_tracks"]
 
     def _integrate(self, image: int, covariances: Float64, angles: Float64) -> None:
         scene, tracks = self.scene, self.scene.tracks

@@ -7,6 +7,12 @@ focal length exists. Guessed focal lengths that a camera keeps are fixed, and th
 lengths are estimated again. A camera with a refined focal length also takes the other parameters of
 its camera model (distortion, aspect ratio and, on request, principal point) that are well
 determined and plausible.
+
+The last self-calibration of a reconstruction estimates intrinsics from tracks of three or more
+images. Wrong matches of two images are inliers if they agree with the current epipolar geometry,
+and so confirm wrong intrinsics. Other tracks only determine cameras that long tracks do not
+determine. While images are registered, all tracks count, because too few tracks of a new image are
+long.
 """
 
 from __future__ import annotations
@@ -38,9 +44,14 @@ MAX_STD_RATIO = 0.5
 guess. At a ratio of 0.5, the observations add three times the information of the prior. [ours]"""
 MIN_DEVIATION_FEW_IMAGES = 15.0
 """Smallest deviation of distortion or principal point from the mean of the prior, in posterior
-standard deviations, at which a camera of fewer than ``MIN_FOCAL_IMAGES`` images takes the estimate.
-Systematic errors of few images resemble distortion of many standard deviations. [tuned:
-benchmarks.mixed_cameras]"""
+standard deviations, at which a camera of fewer than ``MIN_FOCAL_IMAGES`` images takes the estimate
+from all tracks. Wrong matches of two images resemble distortion of many standard deviations.
+[tuned: benchmarks.mixed_cameras]"""
+MIN_TRACK_LENGTH = 3
+"""Smallest number of observations of a long track. [COLMAP ignore_two_view_tracks]"""
+SHORT_TRACK_STD_FACTOR = 100.0
+"""Factor on the standard deviations of short tracks, whose remaining weight keeps the poses of
+images without long tracks determined. [ours]"""
 DISTORTION_PRIOR_STD = 0.1
 """Standard deviation of the zero-mean prior on radial distortion coefficients. The coefficient k1
 of phones and zoom lenses stays below 0.05 in magnitude, that of action cameras below 0.3. [ours]"""
@@ -76,6 +87,7 @@ def calibrate_cameras(
     *,
     refine_distortion: bool,
     refine_principal_point: bool,
+    long_tracks: bool,
 ) -> BundleResult:
     """Run bundle adjustment with guessed intrinsics, and apply well-determined estimates.
 
@@ -91,6 +103,8 @@ def calibrate_cameras(
         representatives: (k,) index of one image of each camera of the problem.
         refine_distortion: Refine the distortion of the camera models.
         refine_principal_point: Refine principal points.
+        long_tracks: Estimate the intrinsics of a camera from long tracks, if these determine all
+            estimated intrinsics of the camera.
     """
     images = [scene.problem.images[image] for image in representatives]
     free = np.array(
@@ -98,15 +112,64 @@ def calibrate_cameras(
     )
     free[:, IntrinsicParameter.RADIAL_DISTORTION :] &= refine_distortion
     free &= mask_guessed_focals(scene, representatives)[:, None]
-    estimated = free.copy()
-    active = free.copy()
-    active[:, 1:] &= scene.estimated_intrinsics.is_refined(FOCAL)[representatives][:, None]
     means, stds = compute_intrinsic_priors(images)
     problem = replace(problem, prior_intrinsics=means, prior_std_intrinsics=stds)
+    if not long_tracks:
+        return _estimate_intrinsics(
+            scene, problem, options, representatives, free, MIN_DEVIATION_FEW_IMAGES
+        )
+    weakened = _weaken_short_tracks(problem)
+    result = _estimate_intrinsics(scene, weakened, options, representatives, free, 0.0)
+    outcomes = scene.estimated_intrinsics.outcomes[representatives]
+    is_undetermined = (free & (outcomes != CalibrationOutcome.REFINED)).any(axis=1)
+    return _estimate_intrinsics(
+        scene,
+        start_at(problem, result),
+        options,
+        representatives,
+        free & is_undetermined[:, None],
+        MIN_DEVIATION_FEW_IMAGES,
+    )
+
+
+def _weaken_short_tracks(problem: BundleProblem) -> BundleProblem:
+    """Return the problem with larger standard deviations of tracks that are not long."""
+    lengths = np.bincount(problem.obs_point)[problem.obs_point]
+    factor = np.where(lengths < MIN_TRACK_LENGTH, SHORT_TRACK_STD_FACTOR, 1.0)
+    return replace(
+        problem,
+        obs_std_px=factor * problem.obs_std_px,
+        obs_std_log_depth=factor * problem.obs_std_log_depth,
+    )
+
+
+def _estimate_intrinsics(
+    scene: Scene,
+    problem: BundleProblem,
+    options: BundleOptions,
+    representatives: Int64,
+    free: Bool,
+    min_deviation: float,
+) -> BundleResult:
+    """Run bundle adjustment with variable intrinsics, and apply well-determined estimates.
+
+    Args:
+        scene: The scene, which receives the refined intrinsics.
+        problem: The bundle adjustment problem with priors on intrinsics.
+        options: Options of bundle adjustment.
+        representatives: (k,) index of one image of each camera of the problem.
+        free: (k, 8) bool, True for the intrinsic parameters to estimate.
+        min_deviation: Smallest deviation of distortion or principal point from the mean of the
+            prior, in posterior standard deviations, at which a camera of few images takes the
+            estimate.
+    """
+    images = [scene.problem.images[image] for image in representatives]
+    estimated, free, active = free, free.copy(), free.copy()
+    active[:, 1:] &= scene.estimated_intrinsics.is_refined(FOCAL)[representatives][:, None]
     while True:
         problem = replace(problem, variable_intrinsics=active)
         result = adjust_bundle(problem, options)
-        refused = _decide(scene, result, images, representatives, problem)
+        refused = _decide(scene, result, images, representatives, problem, min_deviation)
         free &= ~refused
         free[:, 1:] &= free[:, :1]
         if refused.any():
@@ -171,6 +234,7 @@ def _decide(
     images: Sequence[MappingImage],
     representatives: Int64,
     problem: BundleProblem,
+    min_deviation: float,
 ) -> Bool:
     """Record the outcome of each variable intrinsic parameter, and return those refused.
 
@@ -193,7 +257,7 @@ def _decide(
             parameter, value = IntrinsicParameter(column), float(values[row, column])
             std, deviation = float(result.std_intrinsics[row, column]), value - means[row, column]
             has_few_images = parameter != FOCAL and num_images[row] < MIN_FOCAL_IMAGES
-            is_small = has_few_images and abs(deviation) < MIN_DEVIATION_FEW_IMAGES * std
+            is_small = has_few_images and abs(deviation) < min_deviation * std
             if parameter == FOCAL:
                 value = float(result.intrinsics[row, 0])
                 size = images[row].camera.size

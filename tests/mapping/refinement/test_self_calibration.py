@@ -148,7 +148,7 @@ def test_compute_intrinsic_priors_allows_more_distortion_of_long_focal_lengths(
     assert stds[:, RADIAL] == pytest.approx([0.1, 0.025 / corner_radius**2])
 
 
-def test_reconstruct_with_one_image_per_camera_refines_only_clear_distortion(
+def test_reconstruct_with_one_image_per_camera_refines_its_distortion(
     room: MappingProblem,
 ) -> None:
     clear, none = distort(room, -0.25), room
@@ -157,12 +157,36 @@ def test_reconstruct_with_one_image_per_camera_refines_only_clear_distortion(
     options = MapperOptions.model_validate({"max_runs": 1})
     for image in reconstruct(problem, options).reconstructions[0].images:
         assert image.camera.fx == pytest.approx(CAMERA.fx, rel=0.01)
-        reason = image.calibration[RADIAL].reason
-        if image.index == 2:
-            assert image.distortion[0] == 0 and reason is not None
-            assert reason.code == CameraReason.DISTORTION_NOT_OBSERVABLE
-        else:
-            assert image.distortion[0] == pytest.approx(-0.25, abs=0.02) and reason is None
+        assert image.calibration[RADIAL].is_refined
+        expected = 0.0 if image.index == 2 else -0.25
+        assert image.distortion[0] == pytest.approx(expected, abs=0.01)
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.03])
+def test_adjust_with_wrong_tracks_of_two_images_takes_the_camera_of_long_tracks(
+    room: MappingProblem, factor: float
+) -> None:
+    """The keypoints of each track of two images follow another lens."""
+    component = register_true_poses(guess_focals(room, [factor] * 5))
+    scene, tracks = component.scene, component.scene.tracks
+    keypoints, points = tracks.observations_of(np.arange(0, len(tracks.xyz), 2))
+    is_third = np.concatenate([[False, False], points[2:] == points[:-2]])
+    tracks.remove_observations(keypoints[is_third])
+    observations = tracks.observations()
+    lengths = tracks.lengths()[tracks.point_of[observations]]
+    wrong = observations[lengths == 2]
+    assert 0.2 < len(wrong) / len(observations) < 0.8
+    center = [CAMERA.cx, CAMERA.cy]
+    rays = (scene.distorted_keypoints[wrong] - center) / CAMERA.fx
+    scene.distorted_keypoints[wrong] = center + 0.95 * CAMERA.fx * distort_rays(
+        rays, [-0.1, 0, 0, 0]
+    )
+    errors = []
+    for component.refiner.calibrates_with_long_tracks in (False, True):
+        component.refiner.adjust(list(range(5)), focal=True)
+        errors.append(np.abs(scene.intrinsics[:, 0] / CAMERA.fx - 1).max())
+    assert errors[0] > 2 * errors[1] and errors[1] < 0.01
+    assert scene.distortion[:, 0] == pytest.approx(0.0, abs=0.01)
 
 
 def test_reconstruct_of_partly_undistorted_views_refines_the_original_distortion(
