@@ -25,6 +25,7 @@ from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, Norma
 from mpsfm_core.providers.validation import validate_filtered_pairs
 from mpsfm_core.support.time_limit import time_limit
 from mpsfm_core.testing.contract import CheckResult, Status, check_id
+from mpsfm_core.testing.contract_case import load_setup
 from mpsfm_core.testing.outcome import CheckFailed, CheckSkipped
 
 MAX_EVENT_S = 1.0
@@ -115,8 +116,12 @@ def check_hook_filter_pairs(case: HookCase) -> str:
     _filter(case, [])
     _filter(case, _PAIRS[:1])
     started = time.perf_counter()
-    _filter(case, [(f"{number}.jpg", f"{number + 1}.jpg") for number in range(5000)])
+    many = _filter(case, [(f"{number}.jpg", f"{number + 1}.jpg") for number in range(5000)])
     seconds = time.perf_counter() - started
+    if not kept and not many and many is not None:
+        raise CheckFailed(
+            "cannot tell: mpsfm_filter_pairs selects none of 5 000 pairs; return None for all"
+        )
     if seconds > MAX_FILTER_S:
         raise CheckFailed(f"mpsfm_filter_pairs takes {seconds:.0f} s for 5 000 pairs")
     return f"keeps {len(kept)} of {len(_PAIRS)} pairs; {seconds:.2f} s for 5 000 pairs"
@@ -206,11 +211,14 @@ def check_hook_calibration(case: HookCase) -> str:
         if status.kind not in PROVIDER_KINDS or not status.available:
             continue
         defaults = case.hooks.default_options(status.kind, status.name)
+        values = {key: value for key, value in defaults.items() if value is not None}
         try:
-            values = {key: value for key, value in defaults.items() if value is not None}
             options = case.hooks.validate_options(status.kind, status.name, values)
         except MpsfmError:  # A required option has no default.
-            continue
+            with tempfile.TemporaryDirectory(prefix="mpsfm-calibration-") as folder:
+                spec = case.hooks.spec(status.kind, status.name)
+                values |= load_setup(spec, Path(folder)).options
+                options = case.hooks.validate_options(status.kind, status.name, values)
         model = case.call(
             "mpsfm_calibration", kind=status.kind, provider=status.name, options=options
         )

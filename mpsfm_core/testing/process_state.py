@@ -126,6 +126,7 @@ def read_process_state() -> ProcessSettings:
         "the random numbers of Python": random.getstate(),
         "the files of the working directory": sorted(p.name for p in Path.cwd().iterdir()),
         "the module search path": list(sys.path),
+        "the warning filters": list(warnings.filters),
         "the temporary files": _list_temporary_files(),
         _ENVIRONMENT: None,
     }
@@ -154,6 +155,8 @@ def known_process_state(before: ProcessSettings) -> Iterator[None]:
     numbers, python_numbers = np.random.get_state(), random.getstate()
     torch: Any = sys.modules.get("torch")
     with ExitStack() as stack:
+        stack.enter_context(warnings.catch_warnings())
+        warnings.resetwarnings()  # A repeated filter changes nothing.
         if torch is not None and hasattr(torch, "random"):
             stack.enter_context(torch.random.fork_rng(devices=[]))
             torch.manual_seed(_SEED)

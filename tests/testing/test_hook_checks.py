@@ -11,10 +11,11 @@ from typing import Any
 
 import pytest
 
+from mpsfm_core import Options
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.providers import ExportFormat, ProviderSpec, hookimpl
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.testing import CheckResult, hook_checks
+from mpsfm_core.testing import CheckResult, ContractSetup, hook_checks
 from mpsfm_core.testing.hook_checks import run_hook_checks
 from mpsfm_core.testing.scaffold import write_plugin
 from tests.support.reference_providers import PaintedDepth
@@ -78,6 +79,7 @@ def names(pair: Any) -> Any:
         (lambda pairs: [*pairs, *pairs], "returns a pair twice"),
         (lambda pairs: pairs.sort(reverse=True), "modifies its argument"),
         (lambda pairs: sys.stdout.write("filtered") and pairs, "prints 'filtered"),
+        (lambda pairs: [], "selects none of 5 000 pairs"),
         (lambda pairs: dict(pairs), "must return pairs of image names, got 'left/a.jpg'"),
     ],
 )
@@ -142,6 +144,10 @@ def test_blocking_event_hook_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     assert result.status == "fail" and "mpsfm_notice does not return" in result.message
 
 
+class FileOptions(Options):
+    weights: str
+
+
 class GoodViewer:
     def __init__(self, output: Path, pictures: Any) -> None:
         assert pictures("no such image") is None
@@ -197,7 +203,10 @@ def test_calibration_of_foreign_provider_fails() -> None:
     from mpsfm_core.providers.uncertainty.calibration import DepthCalibration, NormalCalibration
 
     def providers() -> list[ProviderSpec]:
-        return [ProviderSpec("depth", "mine", PaintedDepth)]
+        return [ProviderSpec("depth", "mine", PaintedDepth, FileOptions, contract=setup)]
+
+    def setup(folder: Path) -> ContractSetup:
+        return ContractSetup(options={"weights": str(folder / "tiny.npz")})
 
     (result,) = check(mpsfm_calibration=lambda kind, provider, options: DepthCalibration())
     assert "returns a model for a foreign depth provider" in result.message

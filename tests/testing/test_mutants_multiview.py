@@ -117,6 +117,13 @@ class OwnGrid(Changed):
         return replace(group, intrinsics=group.intrinsics * 518 / widths)
 
 
+class FirstPixelAtZero(Changed):
+    """Fault: the principal point is in pixels whose first center is (0, 0)."""
+
+    def change(self, group: MultiViewPrior, views: Sequence[View]) -> MultiViewPrior:
+        return replace(group, intrinsics=group.intrinsics - np.array([0, 0, 0.5, 0.5]))
+
+
 class RowsFirst(Changed):
     """Fault: the principal point has row and column swapped."""
 
@@ -206,6 +213,7 @@ class Chains(Changed):
         (UnitSteps, "multiview-pose-unit", "are 5 times as long as the unit of depth"),
         (OwnGrid, "multiview-intrinsics", "fx is .* off"),
         (RowsFirst, "multiview-intrinsics", "cx is .*% off"),
+        (FirstPixelAtZero, "multiview-intrinsics", "principal point is up to 0.5 px off"),
         (NeedsTwo, "multiview-alone", "index 1 is out of bounds"),
         (OneSize, "multiview-sizes", "must have the same shape"),
         (CropsToTheSmallest, "multiview-sizes", "relative error|shifted"),

@@ -6,6 +6,7 @@ import logging
 import os
 import tempfile
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -112,6 +113,26 @@ class SilencesCore(PaintedDepth):
         logging.getLogger("mpsfm_core").setLevel(logging.ERROR)
 
 
+class FiltersWarnings(PaintedDepth):
+    def predict(self, view: View) -> DepthPrior:
+        warnings.filterwarnings("ignore", category=UserWarning, module="torch")
+        return super().predict(view)
+
+
+class CachedBySum(PaintedDepth):
+    """Fault: the key of a cache is the sum of all pixels, which a mirrored view shares."""
+
+    def __init__(self, options: Any, context: ProviderContext) -> None:
+        super().__init__(options, context)
+        self.known: dict[Any, DepthPrior] = {}
+
+    def predict(self, view: View) -> DepthPrior:
+        key = view.image.shape, int(view.image.sum())
+        if key not in self.known:
+            self.known[key] = super().predict(view)
+        return self.known[key]
+
+
 class JointIgnoresMask(PaintedDepth):
     """Fault: the joint prediction ignores the mask of the view."""
 
@@ -203,6 +224,8 @@ class ExcludesVisible(PaintedMask):
         ("depth", "no-state", "another view with some equal pixels", CachedBySample, ()),
         ("depth", "global-state", "changes the temporary files", LeavesFiles, ()),
         ("depth", "global-state", "logger of mpsfm_core", SilencesCore, ()),
+        ("depth", "global-state", "call .* changes the warning filters", FiltersWarnings, ()),
+        ("depth", "no-state", "for the mirrored view", CachedBySum, ()),
         ("depth", "depth-joint", "for a view with a mask", JointIgnoresMask, ("joint-normals",)),
         ("depth", "depth-focal", "192 x 72 view is", FocalOfArea, ("estimates-focal",)),
         ("depth", "large-view", "of the map is shifted", EverySecondPixel, ()),
@@ -358,6 +381,20 @@ class FactorOfFirst(ReducingMatcher):
         return points[0] * factors[0], points[1] * factors[0]
 
 
+class KeepsBorder(DenseSift):
+    """Fault: points of portrait photos keep the border of the square input of the network."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        found = super().match(a, b).dense
+        assert found is not None
+        points = []
+        for xy, view in ((found.points_a, a), (found.points_b, b)):
+            width, height = view.camera.size
+            border = np.array([max(0, height - width) / 2, 0.0])
+            points.append((xy + border) * (min(1, width / height), 1))
+        return PairMatches(dense=DenseMatches(*points, found.scores))
+
+
 class LargerFirst(ReducingMatcher):
     """Fault: matches the larger view first, and does not swap the points back."""
 
@@ -385,6 +422,7 @@ class IntegerCenters(ReducingMatcher):
     [
         (FactorOfFirst, "matcher-mixed-sizes", "have a scale of 0.5 and 0.5 in x and y"),
         (LargerFirst, "matcher-mixed-sizes", "have a scale of 1 and 1 in x and y"),
+        (KeepsBorder, "matcher-mixed-sizes", "have a scale of 0.75 and 1 in x and y"),
         (IntegerCenters, "matcher-mixed-sizes", r"shifted by \(-0\.[45]"),
     ],
 )

@@ -545,9 +545,10 @@ def _select_valid_in_both(first: NormalPrior, second: NormalPrior) -> tuple[obje
 
 
 def _require_no_stale_output(case: ContractCase) -> None:
-    """Require another output for a view that has some pixels of the example view only.
+    """Require another output for a mirrored view, and for a view with some equal pixels only.
 
-    A provider may take both for the same view if it compares their sizes and a few pixels.
+    A provider may take both for the same view if it compares their sizes and a few pixels or the
+    sum of all pixels. The output of retrieval and masks may be the same for the mirrored view.
     """
     if case.setup.prepare is not None or case.declares("uncached") or case.declares("needs-depth"):
         return
@@ -563,6 +564,12 @@ def _require_no_stale_output(case: ContractCase) -> None:
     answer = case.run_on_view(replace(other.view, image=image), example, case.provider)
     if not describe_difference(before, answer):
         raise CheckFailed("the output is that of another view with some equal pixels")
+    if case.kind == "features" or case.description.predicts_maps:
+        mirrored = replace(other.view, image=np.ascontiguousarray(example.view.image[:, ::-1]))
+        case.run(example, case.provider)
+        answer = case.run_on_view(mirrored, example, case.provider)
+        if not describe_difference(before, answer):
+            raise CheckFailed("the output for the mirrored view is that of the view")
 
 
 def _run_and_compare(case: ContractCase, example: Example) -> str:

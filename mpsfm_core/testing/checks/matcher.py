@@ -45,9 +45,9 @@ _LARGE_FACTOR = 21
 _SMALL_SIZE, _WIDE_SIZE = (256, 192), (2048, 256)
 """Widths and heights in pixels of views below and above the input size of dense matchers. The
 height of the wide view limits the run time."""
-_MEDIUM_SIZES = (512, 384), (384, 288)
+_MEDIUM_SIZES = (512, 384), (288, 384)
 """Widths and heights in pixels of two views that a network with an input of 320 pixels reduces by
-different factors."""
+different factors. A network with a square input also has different borders around these views."""
 _MEDIUM_SHIFT = np.array([64.0, 48.0])
 """Position in pixels of the second medium view in the first."""
 _SMALL_SHIFT = np.array([64.0, 0.0])
@@ -147,7 +147,7 @@ def check_matcher_sizes(case: ContractCase) -> str:
 def check_matcher_mixed_sizes(case: ContractCase) -> str:
     """Require dense matches in pixels of each view if a network reduces one or both views.
 
-    Two views of 256 x 192 and 2048 x 256 pixels, or of 512 x 384 and 384 x 288 pixels, show the
+    Two views of 256 x 192 and 2048 x 256 pixels, or of 512 x 384 and 288 x 384 pixels, show the
     same random texture. A matcher may fail for views of such different sizes. If most of its
     matches agree on a scale and shift, the scale has to be 1, and the shift the true one. Networks
     reduce both views by different factors, so that factors of the other view, of the other axis or

@@ -33,6 +33,9 @@ BASELINE_TOLERANCE = 0.1
 FOCAL_TOLERANCE = 0.1
 """Largest accepted relative error of a focal length or principal point whose ground truth is known.
 A wrong pixel grid or swapped axes cause a relative error of at least 0.25."""
+_PRINCIPAL_TOLERANCE_PX = 0.25
+"""Largest accepted error of a principal point that a provider reads from a file. Integer pixel
+centers cause an error of 0.5 pixels."""
 _GROUP_SIZES = (2, 5, 9)
 """Numbers of views in the groups with which multi-view providers are tested."""
 _FOCAL_RATIO_RANGE = (1.5, 2.7)
@@ -149,6 +152,12 @@ def check_multiview_intrinsics(case: ContractCase) -> str:
     for name, error in zip(("fx", "fy", "cx", "cy"), off.tolist(), strict=True):
         if error > FOCAL_TOLERANCE:
             raise CheckFailed(f"the predicted {name} is {np.expm1(error):.0%} off")
+    if case.truth_source == "prepared":
+        shift = (found - true)[:, 2:]
+        if np.abs(shift).max() > _PRINCIPAL_TOLERANCE_PX:
+            raise CheckFailed(
+                f"the predicted principal point is up to {np.abs(shift).max():.2g} px off"
+            )
     return f"off by {np.expm1(off.max()):.1%}"
 
 
