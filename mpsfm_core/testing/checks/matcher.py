@@ -61,6 +61,8 @@ _MIXED_TOLERANCE_PX = 0.3
 size, and the shift is 0.0 for correct matchers."""
 _TRIMMED_RATIO = 0.1
 """Ratio of the smallest and of the largest residuals that the mean shift of matches leaves out."""
+_MIN_CELL_PX = 0.5
+"""Smallest distance of different coordinates from which positions count as rounded to cells."""
 _SHIFT_STD_FACTOR = 3.5
 """Number of standard errors by which a shift has to differ from 0. If matches are rounded to cells
 of 1 to 8 pixels at random places, 1 % of the matchers that return the centers of cells fail, and
@@ -223,7 +225,7 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
         # crop of both views to the stride of a network can cancel at one of the ratios.
         expected = 0.5 if text else 0.5 * (ratio - 1)
         where = f"between a view and its copy at {numerator}/{denominator} of the size"
-        text = _describe_residual(residual, matches.std_px, expected, where, counts) or text
+        text = _describe_residual(residual, matches, expected, where, counts) or text
     if text:
         _require_no_shift_of_odd_sizes(case)
         return text
@@ -232,7 +234,7 @@ def check_matcher_pixel_convention(case: ContractCase) -> str:
         residual = case.example.camera.size - matches.points_b - matches.points_a
         text = _describe_residual(
             residual,
-            matches.std_px,
+            matches,
             1.0,
             "between a view and its copy rotated by 180 degrees",
             counts,
@@ -598,13 +600,14 @@ def _require_no_shift_of_odd_sizes(case: ContractCase) -> None:
         true = a.correspondences(b, matches.points_a)
         residual = (matches.points_b - true.xy_b)[true.visible]
         where = "between views of {} x {} and of {} x {} pixels".format(*small, *large)
-        _describe_residual(residual, matches.std_px, 0.5, where, [])
+        _describe_residual(residual, matches, 0.5, where, [])
 
 
 def _describe_residual(
-    residual: Float64, std_px: float, expected: float, where: str, counts: list[int]
+    residual: Float64, matches: DenseMatches, expected: float, where: str, counts: list[int]
 ) -> str:
     """Require a small median of match residuals (n, 2) in pixels, unless there are few matches."""
+    std_px = matches.std_px
     radius = 4 * max(1.0, std_px)
     near = np.abs(residual).max(axis=1) < radius
     # A wrong crop or padding shifts all matches by the same amount, which may exceed the radius.
@@ -615,7 +618,7 @@ def _describe_residual(
     counts.append(int(near.sum()))
     if near.sum() < MIN_MATCHES:
         return ""
-    shift, noise = _estimate_shift(residual[near])
+    shift, noise = _estimate_shift(residual[near], _is_rounded(matches))
     limit = max(0.4 * expected * max(1.0, std_px), noise.max())
     text = f"shifted by ({shift[0]:+.2f}, {shift[1]:+.2f}) px"
     if np.abs(shift).max() > limit:
@@ -623,22 +626,38 @@ def _describe_residual(
     return text
 
 
-def _estimate_shift(residual: Float64) -> tuple[Float64, Float64]:
-    """Estimate the common shift of matches by a trimmed mean of their residuals (n, 2).
+def _estimate_shift(residual: Float64, is_rounded: bool) -> tuple[Float64, Float64]:
+    """Estimate the common shift of matches from their residuals (n, 2).
 
     The median of positions that a matcher rounds to cells is one of few values, even if the
     rounding is unbiased. The trimmed mean lies between these values.
 
+    Args:
+        residual: Residuals in pixels.
+        is_rounded: True to use the trimmed mean, False to use the median.
+
     Returns:
-        Shift in x and y, and :data:`_SHIFT_STD_FACTOR` times its standard error (Tukey &
-        McLaughlin 1963).
+        Shift in x and y, and the noise above which it differs from 0. The noise of the trimmed mean
+        is a multiple of its standard error (Tukey & McLaughlin 1963).
     """
+    if not is_rounded:
+        middle = np.median(residual, axis=0)
+        return middle, 3 * np.median(np.abs(residual - middle), axis=0) / np.sqrt(len(residual))
     ordered = np.sort(residual, axis=0)
     num_trimmed = int(_TRIMMED_RATIO * len(ordered))
-    middle = ordered[num_trimmed : len(ordered) - num_trimmed]
-    winsorized = ordered.clip(middle[0], middle[-1])
-    error = winsorized.std(axis=0) * np.sqrt(len(ordered)) / len(middle)
-    return middle.mean(axis=0), _SHIFT_STD_FACTOR * error
+    inner = ordered[num_trimmed : len(ordered) - num_trimmed]
+    winsorized = ordered.clip(inner[0], inner[-1])
+    error = winsorized.std(axis=0) * np.sqrt(len(ordered)) / len(inner)
+    return inner.mean(axis=0), _SHIFT_STD_FACTOR * error
+
+
+def _is_rounded(matches: DenseMatches) -> bool:
+    """Return whether the x or y coordinates of one view are at least half a pixel apart."""
+    for column in np.hstack([matches.points_a, matches.points_b]).T:
+        steps = np.diff(np.unique(column.round(3)))
+        if len(steps) and steps.min() >= _MIN_CELL_PX:
+            return True
+    return False
 
 
 def _match_examples(case: ContractCase, a: Example, b: Example) -> DenseMatches:
@@ -735,7 +754,7 @@ def _require_true_scale(matches: DenseMatches, shift: Float64, where: str) -> st
             f"{np.abs(error).max():.0f} px off"
         )
     residual = (matches.points_b - matches.points_a + shift)[agree]
-    middle, noise = _estimate_shift(residual)
+    middle, noise = _estimate_shift(residual, _is_rounded(matches))
     # Integer pixel centers shift matches by the same amount in x and y.
     smallest = max(middle.min(), -middle.max())
     if smallest > max(_MIXED_TOLERANCE_PX * max(1.0, matches.std_px), noise.max()):
