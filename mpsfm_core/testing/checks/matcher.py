@@ -63,6 +63,10 @@ _TRIMMED_RATIO = 0.1
 """Ratio of the smallest and of the largest residuals that the mean shift of matches leaves out."""
 _MIN_CELL_PX = 0.5
 """Smallest distance of different coordinates from which positions count as rounded to cells."""
+_SHIFT_MAD_FACTOR = 4.0
+"""Ratio of the smallest significant median shift of n matches to their median absolute deviation
+divided by the square root of n. The ratio is at most 3.5 for correct matchers, and at least 4.4 for
+positions with integer pixel centers."""
 _SHIFT_STD_FACTOR = 3.5
 """Number of standard errors by which a shift has to differ from 0. If matches are rounded to cells
 of 1 to 8 pixels at random places, 1 % of the matchers that return the centers of cells fail, and
@@ -642,7 +646,8 @@ def _estimate_shift(residual: Float64, is_rounded: bool) -> tuple[Float64, Float
     """
     if not is_rounded:
         middle = np.median(residual, axis=0)
-        return middle, 3 * np.median(np.abs(residual - middle), axis=0) / np.sqrt(len(residual))
+        deviation = np.median(np.abs(residual - middle), axis=0)
+        return middle, _SHIFT_MAD_FACTOR * deviation / np.sqrt(len(residual))
     ordered = np.sort(residual, axis=0)
     num_trimmed = int(_TRIMMED_RATIO * len(ordered))
     inner = ordered[num_trimmed : len(ordered) - num_trimmed]
