@@ -60,9 +60,10 @@ def report_duplicates(
     registered = {image.name for model in models for image in model.images}
     reasons = dict(report.image_reasons)
     for image in problem.images:
-        original = image.duplicate_of or ""
-        if original in report.image_reasons:
-            reasons[image.name] = report.image_reasons[original]
-        elif original and image.name in registered:
-            del reasons[image.name]
+        if image.duplicate_of is None:
+            continue
+        if image.name in registered:  # with its original, or with the frame of its rig
+            reasons.pop(image.name, None)
+        elif image.duplicate_of in report.image_reasons:
+            reasons[image.name] = report.image_reasons[image.duplicate_of]
     return reasons

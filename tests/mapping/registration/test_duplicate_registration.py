@@ -8,11 +8,13 @@ import numpy as np
 
 from mpsfm_core.data import MappingProblem, PinholeCamera, VerifiedPair
 from mpsfm_core.data.decisions import ImageReason
+from mpsfm_core.geometry import compose, invert
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.registration.duplicate_registration import remove_duplicates
 from mpsfm_core.testing.synthetic.problems import make_mapping_problem
-from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+from mpsfm_core.testing.synthetic.rigs import make_rig_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, look_at, room_scene
 
 CAMERA = PinholeCamera(320, 240, 260.0, 260.0, 160.0, 120.0)
 OPTIONS = MapperOptions()
@@ -56,6 +58,22 @@ def test_reconstruct_gives_the_copy_of_an_unregistered_image_the_same_reason() -
     reasons = reconstruct(alone, OPTIONS).report.image_reasons
     assert {reason.code for reason in reasons.values()} == {ImageReason.NO_VERIFIED_MATCHES}
     assert set(reasons) == {problem.images[2].name, "copy"}
+
+
+def test_reconstruct_registers_a_duplicate_with_the_frame_of_its_rig() -> None:
+    poses = [look_at(np.array([x, -0.6, 1.4]), (x + 3.5, 0.0, 1.2)) for x in (-1.4, -0.9, -0.4)]
+    truth = make_rig_problem(room_scene(), "stereo", poses, num_points=300)
+    images = list(truth.problem.images)
+    images[5] = replace(images[5], duplicate_of=images[1].name)
+    result = reconstruct(replace(truth.problem, images=tuple(images)), OPTIONS)
+    model = result.reconstructions[0]
+    assert not result.report.image_reasons
+    assert len(model.images) == len(images)
+    left, right = (model.poses[image.name] for image in images[4:])
+    rotation, translation = compose(right, invert(*left))
+    known_rotation, known_translation = model.rigs[0].sensor_poses[1]
+    np.testing.assert_allclose(rotation, known_rotation, atol=1e-6)
+    np.testing.assert_allclose(translation, known_translation, atol=1e-6)
 
 
 def test_remove_duplicates_keeps_copies_without_other_views_or_with_poses_of_the_user() -> None:
