@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -239,11 +239,15 @@ class MappingProblem:
             p for p in self.pairs if p.image_a not in originals and p.image_b not in originals
         )
 
-    def frame_of_images(self) -> Int64:
-        """Return the frame (n,) of each image, as the index of the first image of the frame."""
+    def frame_of_images(self, rigs: Sequence[Rig] | None = None) -> Int64:
+        """Return the frame (n,) of each image, as the index of the first image of the frame.
+
+        Args:
+            rigs: Rigs whose frames are used, by default those of the problem.
+        """
         row_of = {image.name: row for row, image in enumerate(self.images)}
         frame_of = np.arange(len(self.images), dtype=np.int64)
-        for rig in self.rigs:
+        for rig in self.rigs if rigs is None else rigs:
             for frame in rig.frames:
                 rows = [row_of[name] for name in frame if name in row_of]
                 frame_of[rows] = rows[:1]

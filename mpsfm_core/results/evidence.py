@@ -133,7 +133,7 @@ def _round(value: float | None, digits: int) -> float | None:
 
 def _group_by_frame(reconstruction: Reconstruction, problem: MappingProblem) -> list[_Frame]:
     """Return the confirmed images of each frame, an image without a rig as its own frame."""
-    frame_of = replace(problem, rigs=reconstruction.rigs).frame_of_images()
+    frame_of = problem.frame_of_images(reconstruction.rigs)
     frames: dict[int, _Frame] = {}
     for image in reconstruction.confirmed_images:
         frames.setdefault(int(frame_of[image.index]), []).append(image)

@@ -33,7 +33,7 @@ class RigFrames:
         count = len(problem.images)
         self._rigs = tuple(rig for rig in problem.rigs if rig.is_calibrated)
         row_of = {image.name: row for row, image in enumerate(problem.images)}
-        self.frame_of: Int64 = replace(problem, rigs=self._rigs).frame_of_images()
+        self.frame_of: Int64 = problem.frame_of_images(self._rigs)
         self.rotations: Float64 = np.tile(np.eye(3), (count, 1, 1))
         self.translations: Float64 = np.zeros((count, 3))
         self.scale = 1.0
