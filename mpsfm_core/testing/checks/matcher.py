@@ -309,7 +309,8 @@ def check_matcher_feature_order(case: ContractCase) -> str:
 
     Features have no order. The second view gets further features from another scene, which have no
     match. Matches of features at the same position may differ, and wrong matches with low scores.
-    The scores of equal matches have to correlate.
+    Wrong matches with high scores must not become more. The scores of equal matches have to
+    correlate.
     """
     if not case.declares("sparse"):
         raise CheckSkipped("the matcher needs no features")
@@ -351,10 +352,13 @@ def check_matcher_feature_order(case: ContractCase) -> str:
         found = DenseMatches(*xy, np.ones(len(changed), np.float32))
         errors = match_errors_px(case.example, case.example.partner, found)
         middle = float(np.median(list(scores[0].values())))
-        sure = [max(s.get(pair, 0.0) for s in scores) > middle for pair in changed]
-        num_wrong = int((errors > _MAX_ERROR_PX)[sure].sum())
-        if num_wrong:
-            raise CheckFailed(f"{text}, {num_wrong} of them are wrong and have high scores")
+        sure = np.array([max(s.get(pair, 0.0) for s in scores) > middle for pair in changed])
+        wrong = (errors > _MAX_ERROR_PX) & sure
+        is_new = np.array([pair in pairs[1] for pair in changed])
+        num_new, num_old = int((wrong & is_new).sum()), int((wrong & ~is_new).sum())
+        if num_new > num_old:
+            counts = f"{num_new} new ones and {num_old} of the others"
+            raise CheckFailed(f"{text}, {counts} are wrong and have high scores")
     return text
 
 
