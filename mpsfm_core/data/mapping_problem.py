@@ -51,6 +51,9 @@ class MappingImage:
     """Prior std of the logarithm of a guessed focal length."""
     focal_guess_px: float | None = None
     """Prior mean of ``fx`` in pixels of the undistorted view (None means ``camera.fx``)."""
+    depth_focal_px: float | None = None
+    """Focal length ``fx`` in pixels for which the depth prior was predicted, if metric depth is
+    proportional to the focal length, or None if it does not depend on the focal length."""
     camera_model: CameraModel = CameraModel.SIMPLE_RADIAL
     """COLMAP camera model whose parameters self-calibration estimates for a guessed camera."""
     distortion: Distortion = NO_DISTORTION

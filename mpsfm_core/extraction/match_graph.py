@@ -99,3 +99,6 @@ class Priors:
     """Group number by image name; a multi-view network predicts depth of a group in one scale."""
     proposed_poses: Mapping[str, Pose] = field(default_factory=dict)
     """Pose ``cam_from_group`` that a multi-view network predicted, by image name."""
+    follows_focal: bool = False
+    """True if the provider of depth takes the intrinsics of a view into account, so that metric
+    depth is proportional to the focal length."""

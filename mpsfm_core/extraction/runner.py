@@ -177,8 +177,13 @@ def predict_priors_again(
         context.run_masks()
         priors = predict_priors(context, None)
     views = (
-        replace(view, depth=priors.depth[view.name], normals=priors.normals[view.name])
-        for view in problem.images
+        replace(
+            view,
+            depth=priors.depth[view.name],
+            normals=priors.normals[view.name],
+            depth_focal_px=image.pinhole.fx if priors.follows_focal else None,
+        )
+        for image, view in zip(images, problem.images, strict=True)
     )
     return replace(problem, images=tuple(views))
 
@@ -351,11 +356,12 @@ def predict_priors(context: ExtractionContext, graph: MatchGraph | None) -> Prio
     candidates = [] if graph is None else list(graph.candidates)
     matcher = None if graph is None else graph.matcher
     originals = find_duplicates(context)
-    predicted = PriorPredictor(context, matcher, candidates, groups).run(originals)
+    predictor = PriorPredictor(context, matcher, candidates, groups)
+    predicted = predictor.run(originals)
     depth = {name: prior for name, (prior, _) in zip(names, predicted, strict=True)}
     normals = {name: prior for name, (_, prior) in zip(names, predicted, strict=True)}
     if groups is None or context.config.depth.use != FROM_MULTIVIEW:
-        return Priors(depth, normals)
+        return Priors(depth, normals, follows_focal=predictor.follows_focal)
     places = {name: groups.place(originals.get(index, index)) for index, name in enumerate(names)}
     poses = {name: pose for name, (_, pose) in places.items() if pose is not None}
     numbers = {name: number for name, (number, _) in places.items()}
@@ -379,6 +385,7 @@ def assemble_problem(images: ImageSet, graph: MatchGraph, priors: Priors) -> Map
                 camera_id=image.camera.camera_id,
                 focal_log_std=image.focal_log_std,
                 camera_model=image.camera_model,
+                depth_focal_px=image.pinhole.fx if priors.follows_focal else None,
                 depth_group=priors.groups.get(image.name),
                 proposed_pose=priors.proposed_poses.get(image.name),
                 duplicate_of=graph.duplicates.get(image.name),

@@ -53,6 +53,11 @@ class PriorPredictor:
         self._disk = DiskArrays(cache_folder(config.runtime.cache_dir))
         self._best = _best_pairs(candidates) if config.depth.use == FROM_MATCHER else None
 
+    @property
+    def follows_focal(self) -> bool:
+        """True if predicted metric depth is proportional to the focal length of the view."""
+        return self._raw.depth.can("intrinsics-aware")
+
     def run(self, originals: Mapping[int, int]) -> list[tuple[DepthPrior, NormalPrior]]:
         """Compute depth and normals of each image on the mapper's grid, with variances.
 

@@ -47,11 +47,14 @@ def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | No
         depth priors and known baselines.
     """
     images = [int(i) for i in scene.registered_images()]
-    by_rigs = _measure_rig_metric(scene, len(images))
+    by_rigs = _measure_rig_metric(scene)
     if by_rigs is not None:
         return replace(by_rigs, trusted=not keep_units)
-    maps = [scene.maps[i] for i in images if scene.maps[i].active and scene.maps[i].prior.metric]
-    log_scales = [np.log(depth_map.scale) for depth_map in maps]
+    log_scales = [
+        _measure_log_scale(scene, i)
+        for i in images
+        if scene.maps[i].active and scene.maps[i].prior.metric
+    ]
     if not log_scales:
         return None
     center = float(np.median(log_scales))
@@ -61,12 +64,22 @@ def estimate_metric_scale(scene: Scene, *, keep_units: bool) -> MetricScale | No
     return MetricScale(float(np.exp(-center)), spread, len(log_scales), trusted)
 
 
-def _measure_rig_metric(scene: Scene, num_images: int) -> MetricScale | None:
+def _measure_log_scale(scene: Scene, image: int) -> float:
+    """Return the log of world units per meter of metric depth, for the refined focal length."""
+    log_scale = float(np.log(scene.maps[image].scale))
+    focal_px = scene.problem.images[image].depth_focal_px
+    if focal_px is not None:
+        log_scale -= float(np.log(scene.intrinsics[image, 0] / focal_px))
+    return log_scale
+
+
+def _measure_rig_metric(scene: Scene) -> MetricScale | None:
     """Return the metric scale of rigs, or None if no baseline determines the scale."""
     spread = scene.rigs.scale_std / scene.rigs.scale
     if not spread <= MAX_METRIC_SPREAD:
         return None
-    return MetricScale(1 / scene.rigs.scale, spread, num_images, True, by="rig baselines")
+    num_frames = len(np.unique(scene.rigs.frame_of[scene.registered]))
+    return MetricScale(1 / scene.rigs.scale, spread, num_frames, True, by="rig baselines")
 
 
 def convert_scene(

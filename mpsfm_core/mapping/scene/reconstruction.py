@@ -157,7 +157,7 @@ class MetricScale:
     """Robust relative standard deviation (1.4826 MAD) of the metric scales estimated by the
     images."""
     num_images: int
-    """Number of images that estimate the metric scale."""
+    """Number of images, or of frames of rigs, that estimate the metric scale."""
     trusted: bool
     """True if the coordinates of the reconstruction are in meters."""
     by: str = "depth maps"

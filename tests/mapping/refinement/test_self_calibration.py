@@ -11,7 +11,7 @@ import pytest
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.camera_models import CameraModel, IntrinsicParameter
 from mpsfm_core.data.decisions import CameraReason
-from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.geometry import camera_center, rotation_angle_deg
 from mpsfm_core.geometry.distortion import distort_rays, undistort_rays
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
@@ -137,6 +137,30 @@ def test_reconstruct_with_principal_point_refines_it() -> None:
             assert std is not None and abs(error) < 3 * std
         assert np.abs(errors).max() < 2.0
         assert image.changes_view
+
+
+def test_metric_depth_of_a_guessed_focal_length_gives_meters_with_the_refined_one(
+    room: MappingProblem,
+) -> None:
+    """The network predicts depth that is proportional to the guessed focal length."""
+    factor = 1.6
+    images = []
+    for image in guess_focals(room, [factor] * 5).images:
+        variance = image.depth.variance
+        assert variance is not None
+        depth = replace(
+            image.depth,
+            depth=image.depth.depth * np.float32(factor),
+            variance=variance * np.float32(factor**2),
+        )
+        images.append(replace(image, depth=depth, depth_focal_px=image.camera.fx))
+    problem = replace(guess_focals(room, [factor] * 5), images=tuple(images))
+    model = reconstruct(problem).reconstructions[0]
+    assert model.metric is not None and model.metric.trusted
+    first, last = (camera_center(*model.poses[image.name]) for image in (images[0], images[-1]))
+    truth = [camera_center(pose[:, :3], pose[:, 3]) for pose in (POSES[0], POSES[-1])]
+    expected = np.linalg.norm(truth[0] - truth[1])
+    assert np.linalg.norm(first - last) == pytest.approx(expected, rel=0.02)
 
 
 def test_compute_intrinsic_priors_allows_more_distortion_of_long_focal_lengths(
