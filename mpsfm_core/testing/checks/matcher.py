@@ -524,8 +524,13 @@ def _require_covered_overlap(case: ContractCase, a: Example, b: Example) -> None
     if len(points) < 2 * MIN_MATCHES or not len(shown):
         return
     low, size = shown.min(axis=0), np.ptp(shown, axis=0)
-    position = (points - low) / size
-    outer = np.concatenate([(position < 0.25).mean(0), (position > 0.75).mean(0)])
+    outer = _outer_quarters((points - low) / size)
+    if not case.declares("dense"):
+        (features,) = case.extract_features(b.view)
+        given = b.correspondences(a, features.keypoints)
+        # A quarter with hardly any features of the second view cannot contain matches.
+        is_covered = _outer_quarters((given.xy_b[given.visible] - low) / size) > 2 * _MIN_SIDE_RATIO
+        outer = np.where(is_covered, outer, 1.0)
     if outer.min() < _MIN_SIDE_RATIO:
         raise CheckFailed(
             f"only {outer.min():.0%} of the correct matches are in one outer quarter of the overlap"
@@ -542,7 +547,11 @@ def _require_enough(count: int) -> None:
 
 def _measure_outer_quarters(xy: Float64, camera: PinholeCamera) -> Float64:
     """Return the ratios of points in the outer quarters of a view: left, top, right, bottom."""
-    position = xy / camera.size
+    return _outer_quarters(xy / camera.size)
+
+
+def _outer_quarters(position: Float64) -> Float64:
+    """Return the ratios (4,) of positions (n, 2) in the outer quarters of the unit square."""
     ratios: Float64 = np.concatenate([(position < 0.25).mean(0), (position > 0.75).mean(0)])
     return ratios
 
