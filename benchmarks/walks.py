@@ -390,7 +390,7 @@ def _evaluate_model(folder: Path, poses: Mapping[int, Pose], rounds: float | Non
 def measure_loop_error(
     found: Mapping[str, Pose], truth: Mapping[str, Pose], num_rounds: float = ROUNDS
 ) -> float | None:
-    """Measure the median error in meters of the camera positions after the first round.
+    """Return the median error of camera positions after the first round, in meters.
 
     The model is aligned with the true poses of the keyframes at the start of the first round. If
     the loop is not closed, the error is the drift of one round.

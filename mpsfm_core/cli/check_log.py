@@ -16,7 +16,7 @@ MAX_CHECK_S = 600.0
 """Time limit in seconds for one check, after which the checking process ends. Calls of providers
 that return to Python are interrupted earlier."""
 _STDERR = 2
-"""File descriptor of standard error, which a test may replace in Python only."""
+"""File descriptor of standard error. ``sys.stderr`` may have none, because pytest replaces it."""
 _CRASHED_LOADING, _ENDED = "crashed-loading", "ended"
 """Entries of the log that do not belong to a check."""
 

@@ -52,8 +52,9 @@ class MappingImage:
     focal_guess_px: float | None = None
     """Prior mean of ``fx`` in pixels of the undistorted view (None means ``camera.fx``)."""
     depth_focal_px: float | None = None
-    """Focal length ``fx`` in pixels for which the depth prior was predicted, if metric depth is
-    proportional to the focal length, or None if it does not depend on the focal length."""
+    """Focal length ``fx`` in pixels that a depth network received, whose metric depth is
+    proportional to the focal length. None if predicted depth does not depend on the focal length.
+    """
     camera_model: CameraModel = CameraModel.SIMPLE_RADIAL
     """COLMAP camera model whose parameters self-calibration estimates for a guessed camera."""
     distortion: Distortion = NO_DISTORTION
@@ -236,7 +237,7 @@ class MappingProblem:
 
     @property
     def distinct_pairs(self) -> tuple[VerifiedPair, ...]:
-        """Verified pairs in which neither image is a duplicate."""
+        """Verified pairs without the pairs that contain a duplicate."""
         originals = self.originals
         return tuple(
             p for p in self.pairs if p.image_a not in originals and p.image_b not in originals

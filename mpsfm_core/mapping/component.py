@@ -387,7 +387,7 @@ class Component:
         return within
 
     def finalize(self) -> None:
-        """Refine all images with a last self-calibration, and repeat the depth check."""
+        """Refine all images and guessed cameras a last time, and repeat the depth check."""
         refiner = self.refiner
         is_calibrated = refiner.calibrates_with_long_tracks or not refiner.can_refine_focals()
         if self.maintenance.is_checked and is_calibrated:

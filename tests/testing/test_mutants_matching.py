@@ -215,7 +215,7 @@ class DepthOfRays(ToldMatcher):
 
 
 class PairConfidence(ToldMatcher):
-    """Fault: returns the confidence of the network in the field for the depth variance."""
+    """Fault: stores the confidence of the network as the variance of depth."""
 
     def depths(self, a: Example, b: Example) -> PairDepth:
         depth = super().depths(a, b)

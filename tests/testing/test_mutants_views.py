@@ -501,7 +501,7 @@ class RandomWithoutWeights(PaintedDepth):
 
 
 class HidesMissingWeights(RandomWithoutWeights):
-    """Fault: the error does not name the missing file."""
+    """Fault: the error for a missing weights file does not contain the name of the file."""
 
     def __init__(self, options: Any, context: ProviderContext) -> None:
         super().__init__(options, context)

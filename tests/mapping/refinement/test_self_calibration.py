@@ -144,8 +144,9 @@ def test_metric_depth_of_a_guessed_focal_length_gives_meters_with_the_refined_on
 ) -> None:
     """The network predicts depth that is proportional to the guessed focal length."""
     factor = 1.6
+    guessed = guess_focals(room, [factor] * 5)
     images = []
-    for image in guess_focals(room, [factor] * 5).images:
+    for image in guessed.images:
         variance = image.depth.variance
         assert variance is not None
         depth = replace(
@@ -154,7 +155,7 @@ def test_metric_depth_of_a_guessed_focal_length_gives_meters_with_the_refined_on
             variance=variance * np.float32(factor**2),
         )
         images.append(replace(image, depth=depth, depth_focal_px=image.camera.fx))
-    problem = replace(guess_focals(room, [factor] * 5), images=tuple(images))
+    problem = replace(guessed, images=tuple(images))
     model = reconstruct(problem).reconstructions[0]
     assert model.metric is not None and model.metric.trusted
     first, last = (camera_center(*model.poses[image.name]) for image in (images[0], images[-1]))
