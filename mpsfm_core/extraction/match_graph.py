@@ -10,6 +10,7 @@ from mpsfm_core.data import (
     Features,
     Float64,
     NormalPrior,
+    PinholeCamera,
     Pose,
     SparseMatches,
     VerifiedPair,
@@ -102,3 +103,7 @@ class Priors:
     follows_focal: bool = False
     """True if the provider of depth takes the intrinsics of a view into account, so that metric
     depth is proportional to the focal length."""
+
+    def depth_focal_px(self, camera: PinholeCamera) -> float | None:
+        """Return the focal length to which metric depth of a view with a camera is proportional."""
+        return camera.fx if self.follows_focal else None

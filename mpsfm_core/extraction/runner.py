@@ -181,7 +181,7 @@ def predict_priors_again(
             view,
             depth=priors.depth[view.name],
             normals=priors.normals[view.name],
-            depth_focal_px=image.pinhole.fx if priors.follows_focal else None,
+            depth_focal_px=priors.depth_focal_px(image.pinhole),
         )
         for image, view in zip(images, problem.images, strict=True)
     )
@@ -385,7 +385,7 @@ def assemble_problem(images: ImageSet, graph: MatchGraph, priors: Priors) -> Map
                 camera_id=image.camera.camera_id,
                 focal_log_std=image.focal_log_std,
                 camera_model=image.camera_model,
-                depth_focal_px=image.pinhole.fx if priors.follows_focal else None,
+                depth_focal_px=priors.depth_focal_px(image.pinhole),
                 depth_group=priors.groups.get(image.name),
                 proposed_pose=priors.proposed_poses.get(image.name),
                 duplicate_of=graph.duplicates.get(image.name),

@@ -24,7 +24,6 @@ from mpsfm_core.mapping.registration.pose_hypotheses import (
     MAX_FOCAL_CORRESPONDENCES,
     estimate_absolute_pose,
     estimate_pose_with_focal,
-    sample_focal_lengths,
 )
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 
@@ -95,7 +94,7 @@ def find_deviating_focals(
         cost = _measure_cost(camera, shared[:2], xy, xyz, max_error_px) if shared else 1.0
         if cost < MIN_COST:
             continue
-        own = estimate_pose_with_focal(camera, xy, xyz, sample_focal_lengths(image), options, seed)
+        own = estimate_pose_with_focal(camera, xy, xyz, options, seed)
         if own is None or abs(np.log(own.focal_px / camera.fx)) < np.log(MIN_FOCAL_RATIO):
             continue
         own_cost = _measure_cost(own.camera, own.pose, xy, xyz, max_error_px)

@@ -141,7 +141,7 @@ def estimate_shared_lens(
     pairs = sorted(pairs, key=lambda pair: -_total_displacement(problem, pair))[:MAX_PAIRS]
     image = problem.images[pairs[0].image_a]
     matches = _collect_matches(problem, pairs)
-    log_focals = np.log(sample_focal_lengths(image))
+    log_focals = np.log(sample_focal_lengths(image.camera))
     log_guess = float(np.log(image.camera.fx))
     log_focal, poses = _maximize_posterior(
         _Profile(log_focals, float(np.log(image.focal_prior_px)), image.focal_log_std),

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Bool, Float64, Int64, MappingImage, PinholeCamera, Pose
+from mpsfm_core.data import Bool, Float64, Int64, PinholeCamera, Pose
 from mpsfm_core.geometry import compose, invert
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.mapping.options import RegistrationOptions
@@ -54,8 +54,6 @@ NUM_RESAMPLES = 8
 attempt. [ours]"""
 FOCAL_RANGE = (0.4, 10.0)
 """Smallest and largest focal length to try, relative to the longer side of the image. [ours]"""
-MAX_FOCAL_DEVIATION = 3.0
-"""Largest deviation of a focal length to try from its prior, in standard deviations. [ours]"""
 MAX_FOCAL_CORRESPONDENCES = 200
 """Approximate number of correspondences by which a focal length is selected; with more
 correspondences, the selection is slower. [ours]"""
@@ -114,24 +112,18 @@ def estimate_absolute_pose(
     return rotation, translation, np.asarray(result["inlier_mask"], dtype=np.bool_)
 
 
-def sample_focal_lengths(image: MappingImage) -> Float64:
-    """Sample focal lengths to try for an image, on a logarithmic grid around its prior.
+def sample_focal_lengths(camera: PinholeCamera) -> Float64:
+    """Sample focal lengths in ``FOCAL_RANGE`` on a logarithmic grid.
 
     Args:
-        image: Image with a focal length prior (``focal_prior_px`` and ``focal_log_std``).
+        camera: Camera, of which only the image size matters.
 
     Returns:
-        (m,) ascending focal lengths ``fx`` in pixels, within ``MAX_FOCAL_DEVIATION`` and
-        ``FOCAL_RANGE``.
+        (m,) ascending focal lengths ``fx`` in pixels.
     """
-    prior_px, reach = image.focal_prior_px, MAX_FOCAL_DEVIATION * image.focal_log_std
-    min_px, max_px = np.array(FOCAL_RANGE) * max(image.camera.size)
-    min_px = max(min_px, prior_px * np.exp(-reach))
-    max_px = min(max_px, prior_px * np.exp(reach))
-    if not min_px < max_px:
-        return np.array([prior_px])
-    num_steps = int(np.ceil(np.log(max_px / min_px) / np.log(FOCAL_STEP)))
-    return np.geomspace(min_px, max_px, 1 + num_steps)
+    min_ratio, max_ratio = FOCAL_RANGE
+    num_steps = int(np.ceil(np.log(max_ratio / min_ratio) / np.log(FOCAL_STEP)))
+    return max(camera.size) * np.geomspace(min_ratio, max_ratio, 1 + num_steps)
 
 
 class PoseWithFocal(NamedTuple):
@@ -152,29 +144,28 @@ def estimate_pose_with_focal(
     camera: PinholeCamera,
     xy: Float64,
     points: Float64,
-    focal_lengths: Float64,
     options: RegistrationOptions,
     seed: int,
 ) -> PoseWithFocal | None:
     """Estimate an absolute pose and the focal length.
 
-    PnP runs with each of the ``focal_lengths``. The focal length with the most PnP inliers is
-    refined together with its pose.
+    PnP runs with each of the focal lengths of :func:`sample_focal_lengths`, whatever the prior of
+    the image, because EXIF may be wrong. The focal length with the most PnP inliers is refined
+    together with its pose.
 
     Args:
         camera: Camera of the image, whose aspect ratio and principal point are used.
         xy: (m, 2) keypoints in pixels.
         points: (m, 3) points in the world frame.
-        focal_lengths: (k,) ascending focal lengths ``fx`` to try, in pixels.
         options: Registration options ``max_error_px`` and ``min_inlier_ratio``.
         seed: Seed of RANSAC.
 
     Returns:
-        Pose and camera of the image, or None if PnP fails or the focal length leaves the range of
-        ``focal_lengths``.
+        Pose and camera of the image, or None if PnP fails or the focal length leaves
+        ``FOCAL_RANGE``.
     """
     best: tuple[pycolmap.Camera, dict[str, Any]] | None = None
-    aspect = camera.fy / camera.fx
+    aspect, focal_lengths = camera.fy / camera.fx, sample_focal_lengths(camera)
     for focal_px in focal_lengths:
         trial = colmap_from_pinhole(replace(camera, fx=focal_px, fy=focal_px * aspect))
         result = _run_pnp_ransac(trial, xy, points, options, seed, refine=False)
@@ -191,9 +182,8 @@ def estimate_pose_with_focal(
         trial,
         pycolmap.AbsolutePoseRefinementOptions(refine_focal_length=True),
     )
-    min_px, max_px = focal_lengths[[0, -1]] * [1 / FOCAL_STEP, FOCAL_STEP]
     focal_px = float(trial.params[0])  # pose refinement changed the focal length of ``trial``
-    if refined is None or not min_px <= focal_px <= max_px:
+    if refined is None or not focal_lengths[0] <= focal_px <= focal_lengths[-1]:
         return None
     pose = _pose_from_rigid3d(refined["cam_from_world"])
     return PoseWithFocal(pose, replace(camera, fx=focal_px, fy=focal_px * aspect))
@@ -367,7 +357,6 @@ class PoseHypothesisGenerator:
             scene.camera(self.image),
             scene.keypoints[correspondences.keypoints],
             correspondences.points,
-            sample_focal_lengths(scene.problem.images[self.image]),
             options,
             self.seed,
         )
