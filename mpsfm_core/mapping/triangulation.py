@@ -164,24 +164,36 @@ def triangulate_or_lift(
 def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int]) -> None:
     """Merge the 3D points of matched keypoints if the mean point fits all their observations.
 
+    Merging is repeated until no two matched points can be merged.
+
     Args:
         scene: The scene.
         options: Options, where ``max_error_px`` limits the reprojection errors in pixels.
         images: Images whose matched points are merged.
     """
-    tracks, graph = scene.tracks, scene.graph
+    graph = scene.graph
     edges = [graph.edges_of(image) for image in images]
-    p, q = (
-        tracks.point_of[np.concatenate([ends[of_image] for of_image in edges] or [ends[:0]])]
+    source, target = (
+        np.concatenate([ends[of_image] for of_image in edges] or [ends[:0]])
         for ends in (graph.source, graph.target)
     )
+    while _merge_disjoint_pairs(scene, options, source, target):
+        pass
+
+
+def _merge_disjoint_pairs(
+    scene: Scene, options: TriangulationOptions, source: Int64, target: Int64
+) -> bool:
+    """Merge pairs of matched points that have no point in common, and return whether any merged."""
+    tracks, graph = scene.tracks, scene.graph
+    p, q = tracks.point_of[source], tracks.point_of[target]
     differ = (p >= 0) & (q >= 0) & (p != q)
     low, high = np.minimum(p, q)[differ], np.maximum(p, q)[differ]
     num_points = len(tracks.xyz)
     keys = np.unique(low * num_points + high)
     candidates = np.stack(np.divmod(keys, max(num_points, 1)), axis=1)
     if not len(candidates):
-        return
+        return False
     lengths = tracks.lengths()
     weights = lengths[candidates].astype(np.float64)
     mean = (tracks.xyz[candidates] * weights[..., None]).sum(axis=1)
@@ -206,6 +218,7 @@ def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int])
     new_point[merged] = remaining
     observed = tracks.point_of >= 0
     tracks.point_of[observed] = new_point[tracks.point_of[observed]]
+    return bool(is_disjoint.any())
 
 
 def lift_low_parallax(scene: Scene, options: TriangulationOptions) -> None:
