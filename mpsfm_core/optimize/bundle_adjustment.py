@@ -11,7 +11,8 @@ adjustment minimizes::
 The optimizer is Levenberg-Marquardt (Triggs et al., "Bundle Adjustment -- A Modern Synthesis",
 2000). Each step eliminates the 3D points with the Schur complement, solves the reduced camera
 system, and recovers the points by back-substitution. After each joint step, the points are
-optimized individually with fixed cameras.
+optimized individually with fixed cameras. Robust losses are replaced by their IRLS majorizers,
+whose minimum is too near, so the steps of the cameras are lengthened (over-relaxation).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
@@ -62,12 +64,18 @@ takes at most 600 MB of memory. [ours]"""
 ENOUGH_CG_ITERATIONS = 100
 """Number of conjugate-gradient iterations that take as long as a sparse factorization, after which
 the system is factorized. [tuned: benchmarks.walks]"""
+ENOUGH_FACTOR_ITERATIONS = 20
+"""Number of conjugate-gradient iterations with a factorization of an earlier system as
+preconditioner, after which the system is factorized again. [tuned: benchmarks.walks]"""
 MAX_RIG_POSES = 500
 """Maximum number of variable poses for the standard deviation of the scale of a rig, which needs a
 dense factorization. [ours]"""
 MIN_GAIN = 1e-3
 """Smallest ratio of the actual and the predicted decrease of the cost for a step to be accepted.
 [Ceres min_relative_decrease]"""
+MAX_RELAXATION = 1.7
+"""Largest factor on the camera step of the normal equations. Factors below 2 decrease the cost of a
+quadratic majorizer. [tuned: benchmarks.walks]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,25 +162,27 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
     """Minimize the cost by Levenberg-Marquardt with Nielsen's damping schedule, as Ceres does."""
     state, trial = p.state, kernels.BundleParameters(*(np.empty_like(array) for array in p.state))
     normal = SchurComplementSolver(p, options, run)
-    damping, growth = INITIAL_DAMPING, 2.0
+    damping, growth, relaxation = INITIAL_DAMPING, 2.0, 1.0
     initial_cost = np.inf
     converged, message = False, "iteration limit reached"
     for iteration in range(1, options.max_iterations + 1):
         cost = normal.linearize(state, damping)
         initial_cost = cost if iteration == 1 else initial_cost
-        trial_cost, decrease, predicted = normal.step(state, trial, damping, cost)
+        step = normal.step(state, trial, damping, relaxation, cost)
         min_decrease = max(options.function_tolerance, np.finfo(float).eps) * cost
-        if np.isfinite(decrease) and decrease >= max(MIN_GAIN * predicted, 0.0):
-            state, trial, cost = trial, state, trial_cost
+        if np.isfinite(step.decrease) and step.decrease >= max(MIN_GAIN * step.predicted, 0.0):
+            state, trial, cost = trial, state, step.cost
             normal.accept_step(state)
-            gain = min(decrease / predicted, 1.0) if predicted > 0 else 1.0
+            gain = min(step.decrease / step.predicted, 1.0) if step.predicted > 0 else 1.0
             damping = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), MIN_DAMPING)
             growth = 2.0
-            converged = bool(decrease <= min_decrease)
+            relaxation = step.choose_relaxation(relaxation)
+            converged = bool(step.decrease <= min_decrease)
         else:
             damping *= growth
             growth *= 2.0
-            converged = bool(predicted <= min_decrease)
+            relaxation = 1.0
+            converged = bool(step.predicted <= min_decrease)
         if converged:
             message = "cost change below the tolerance"
             break
@@ -183,6 +193,34 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
     return BundleResult(
         *state, stds, initial_cost, cost, iteration, converged, message, normal.rig, std_rig_scale
     )
+
+
+class TrialStep(NamedTuple):
+    """Costs of a trial step of all parameters."""
+
+    cost: float
+    """Cost after the step; infinite if the reduced camera system has no finite solution."""
+    decrease: float
+    """Decrease of the cost, where observations that became invisible are unchanged."""
+    predicted: float
+    """Decrease of the cost that the quadratic model predicts."""
+    slope: float
+    """Directional derivative of the cost along the unrelaxed camera step, with optimal points and
+    opposite sign. The same value is the curvature of the quadratic model along the step."""
+
+    def choose_relaxation(self, relaxation: float) -> float:
+        """Return the relaxation of the next step, which would have minimized the cost of this step.
+
+        The curvature of the cost along the camera step follows from the difference of the actual
+        and the predicted decrease.
+
+        Args:
+            relaxation: Relaxation of this step.
+        """
+        curvature = self.slope - 2 * (self.decrease - self.predicted) / relaxation**2
+        if MAX_RELAXATION * curvature <= self.slope:
+            return MAX_RELAXATION
+        return max(self.slope / curvature, 1.0)
 
 
 class SchurComplementSolver:
@@ -204,7 +242,7 @@ class SchurComplementSolver:
         self.p = p
         self.run = run
         self.dense = poses <= options.dense_poses
-        self._factorizes = False
+        self._factor: Callable[[Float64], Float64] | None = None
         self.tolerance = options.function_tolerance
         self.rig, self.basis = p.rig, self._build_basis(p.rig, p.state)
         self._trial_rig = p.rig
@@ -335,21 +373,25 @@ class SchurComplementSolver:
         state: kernels.BundleParameters,
         trial: kernels.BundleParameters,
         damping: float,
+        relaxation: float,
         cost: float,
-    ) -> tuple[float, float, float]:
+    ) -> TrialStep:
         """Compute a Levenberg-Marquardt step from ``state`` and write the result to ``trial``.
 
-        Returns:
-            Cost of the visible observations, actual decrease of the cost, and predicted decrease of
-            the cost. The actual decrease of the cost treats observations that become invisible as
-            unchanged. If the reduced camera system has no finite solution, the cost is infinite.
+        Args:
+            state: Parameters at which the residuals are linearized.
+            trial: Receives the parameters after the step.
+            damping: Levenberg-Marquardt damping.
+            relaxation: Factor on the camera step.
+            cost: Cost at ``state``.
         """
         diagonal = self.total.diagonal
         boost = np.where(diagonal > 0, damping * diagonal, 1.0)
         solve = self._solve_dense if self.dense else self._solve_sparse
         steps = solve(boost, -self.total.rhs)
         if not np.isfinite(steps).all():
-            return np.inf, -np.inf, np.inf
+            return TrialStep(np.inf, -np.inf, np.inf, 0.0)
+        steps *= relaxation
         delta = self._expand(steps)
         self._limit_intrinsic_steps(delta)
         for old, new in zip(state[:-1], trial[:-1], strict=True):
@@ -374,8 +416,10 @@ class SchurComplementSolver:
 
         visible, lost, predicted = (float(x) for x in np.sum(self.run(move), axis=0))
         visible += self._prior_cost(trial)
+        slope = -float(delta @ self.total.rhs) / relaxation
         predicted += 0.5 * float(delta @ (boost * delta - self.total.gradient))
-        return visible, cost - visible - lost, predicted
+        predicted -= 0.5 * (relaxation - 1) * relaxation * slope
+        return TrialStep(visible, cost - visible - lost, predicted, slope)
 
     def _expand(self, steps: Float64) -> Float64:
         """Return the steps of the reduced camera system for steps of the rig's parameters."""
@@ -422,10 +466,12 @@ class SchurComplementSolver:
         return solution if info == 0 else np.full_like(boost, np.nan)
 
     def _solve_sparse(self, boost: Float64, rhs: Float64) -> Float64:
-        """Solve the reduced camera system by conjugate gradients or by sparse factorization.
+        """Solve the reduced camera system by preconditioned conjugate gradients.
 
-        Conjugate gradients converge slowly for long chains of images, as in a video. If conjugate
-        gradients do not converge soon, this system and all later systems are factorized.
+        Conjugate gradients with block-Jacobi preconditioner converge slowly for long chains of
+        images, as in a video. If conjugate gradients do not converge soon, this system is
+        factorized. The factorization is the preconditioner of later systems, which differ less and
+        less.
 
         Args:
             boost: (d,) Levenberg-Marquardt damping, which is added to the diagonal.
@@ -437,16 +483,14 @@ class SchurComplementSolver:
         can_factorize = (
             self.basis is None and len(self.p.bundle.layout.pair) <= MAX_FACTORIZED_POSES
         )
-        max_iterations = ENOUGH_CG_ITERATIONS if can_factorize else MAX_CG_ITERATIONS
         solutions = []
-        for column in () if self._factorizes else rhs.reshape(len(rhs), -1).T:
-            solution, converged = self._iterate(boost, column, max_iterations)
+        for column in rhs.reshape(len(rhs), -1).T:
+            solution, converged = self._iterate(boost, column, can_factorize)
             if can_factorize and not converged:
-                self._factorizes = True
-                break
+                self._factor = None  # frees the memory before the next factorization
+                self._factor = self._factorize(boost)
+                solution = self._factor(column)
             solutions.append(solution)
-        if self._factorizes:
-            return self._solve_factorized(boost, rhs)
         stacked: Float64 = np.stack(solutions, axis=1)
         return stacked.reshape(-1, *rhs.shape[1:])
 
@@ -460,14 +504,14 @@ class SchurComplementSolver:
         diagonal[:, range(size), range(size)] += damping
         return diagonal
 
-    def _solve_factorized(self, boost: Float64, rhs: Float64) -> Float64:
-        """Solve the reduced camera system by a sparse factorization of the blocks of poses.
+    def _factorize(self, boost: Float64) -> Callable[[Float64], Float64]:
+        """Factorize the reduced camera system, and return a function that solves it.
 
         The fill-reducing order is minimum degree (SuperLU). The intrinsic parameters are eliminated
-        last, because they have dense rows.
+        last, because they have dense rows. The solutions of a singular system are NaN.
         """
         total, pairs = self.total, self.p.pairs
-        num_poses, border = total.border.shape[1], total.border
+        num_poses, border = total.border.shape[1], total.border.copy()
         is_diagonal = pairs[:, 0] == pairs[:, 1]
         off_diagonal = total.blocks[~is_diagonal]
         rows, columns = np.concatenate(
@@ -487,16 +531,26 @@ class SchurComplementSolver:
                 options={"SymmetricMode": True},
             )
         except RuntimeError:  # the matrix is singular
-            return np.full_like(rhs, np.nan)
+            return lambda rhs: np.full_like(rhs, np.nan)
         by_border = factor.solve(np.ascontiguousarray(border.T))
         corner = total.corner + np.diag(boost[num_poses:]) - border @ by_border
-        of_poses = factor.solve(rhs[:num_poses])
-        of_intrinsics = np.linalg.solve(corner, rhs[num_poses:] - border @ of_poses)
-        solution: Float64 = np.concatenate([of_poses - by_border @ of_intrinsics, of_intrinsics])
-        return solution
 
-    def _iterate(self, boost: Float64, rhs: Float64, max_iterations: int) -> tuple[Float64, bool]:
-        """Solve the reduced camera system by block-Jacobi preconditioned conjugate gradients.
+        def solve(rhs: Float64) -> Float64:
+            of_poses = factor.solve(rhs[:num_poses])
+            of_intrinsics = np.linalg.solve(corner, rhs[num_poses:] - border @ of_poses)
+            return np.concatenate([of_poses - by_border @ of_intrinsics, of_intrinsics])
+
+        return solve
+
+    def _iterate(self, boost: Float64, rhs: Float64, can_factorize: bool) -> tuple[Float64, bool]:
+        """Solve the reduced camera system by preconditioned conjugate gradients.
+
+        The preconditioner is the last factorization, or else block Jacobi.
+
+        Args:
+            boost: (d,) Levenberg-Marquardt damping, which is added to the diagonal.
+            rhs: (d,) right-hand side.
+            can_factorize: If true, stop if a factorization is faster than further iterations.
 
         Returns:
             The solution (d,), and whether conjugate gradients converged.
@@ -512,6 +566,9 @@ class SchurComplementSolver:
             kernels.multiply_reduced_matrix(total, boost, self.p.pairs, x, out)
             return out
 
+        max_iterations = ENOUGH_CG_ITERATIONS if can_factorize else MAX_CG_ITERATIONS
+        if self._factor is not None:
+            return _conjugate_gradients(multiply, self._factor, rhs, ENOUGH_FACTOR_ITERATIONS)
         basis = self.basis
         if basis is not None:
             blocks = total.blocks.copy()
