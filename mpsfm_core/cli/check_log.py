@@ -45,11 +45,11 @@ class CheckLog:
 
     def fail_started(self, reason: str) -> CheckResult | None:
         """Record a failure of the check during which the process ended; return None without one."""
-        from mpsfm_core.testing import CheckResult
-
         entries = self._read()
         if not entries or not isinstance(entries[-1], list):
             return None
+        from mpsfm_core.testing import CheckResult  # The import takes long, and few checks crash.
+
         provider, around, id, started = entries[-1]
         result = CheckResult(provider, around, id, "fail", reason, time.time() - started)
         self._append(asdict(result))

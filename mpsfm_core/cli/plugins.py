@@ -128,6 +128,7 @@ def check(
             on_result=report,
         )
     results = log.end()
+    gc.freeze()  # The interpreter would collect the objects of all imported libraries at its end.
     if as_json:
         typer.echo(json.dumps([asdict(result) for result in results], indent=2))
     else:
@@ -181,8 +182,6 @@ def _check_in_subprocess(name: str, arguments: list[str]) -> int:
     next provider. If the subprocess ends before the first check, a plugin may have crashed it. The
     next subprocess then leaves out the plugins that crash.
     """
-    from mpsfm_core.data.errors import ProviderError
-
     with tempfile.TemporaryDirectory(prefix="mpsfm-check-") as folder:
         path = Path(folder, "log")
         path.touch()
@@ -197,6 +196,8 @@ def _check_in_subprocess(name: str, arguments: list[str]) -> int:
             elif code >= 0:
                 return code
             elif log.has_crash_while_loading or log.results():
+                from mpsfm_core.data.errors import ProviderError
+
                 raise ProviderError(f"{name}: the process crashes outside of checks ({ending})")
             else:
                 log.note_crash_while_loading()
@@ -206,7 +207,8 @@ def _run_checking(arguments: list[str], log: Path) -> int:
     """Run ``mpsfm plugins check`` in a subprocess, print its output and return its exit code.
 
     OpenBLAS gets one thread by default, because the arrays of the checks are small and waiting
-    threads cost CPU time.
+    threads cost CPU time. Temporary files are written next to the log, so that those of a crashed
+    process are removed with the log.
 
     Args:
         arguments: Arguments of ``mpsfm plugins check``.
@@ -215,7 +217,12 @@ def _run_checking(arguments: list[str], log: Path) -> int:
     with tempfile.TemporaryFile("w+") as errors:
         process = subprocess.Popen(
             [sys.executable, "-m", "mpsfm_core", "plugins", "check", *arguments],
-            env={"OPENBLAS_NUM_THREADS": "1", **subprocess_environment(), _CHECKING: str(log)},
+            env={
+                "OPENBLAS_NUM_THREADS": "1",
+                **subprocess_environment(),
+                "TMPDIR": str(log.parent),
+                _CHECKING: str(log),
+            },
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,

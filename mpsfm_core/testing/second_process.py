@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -31,15 +32,17 @@ class SecondProcess:
         self.is_new = True
         """True until the process has imported a plugin or a provider."""
         self._errors = tempfile.TemporaryFile("w+")  # noqa: SIM115 - lives as long as the process
+        # A killed process does not remove the temporary files of its provider.
+        self._folder = Path(tempfile.mkdtemp(prefix="mpsfm-second-process-"))
         self._process = subprocess.Popen(
             [sys.executable, "-c", _SCRIPT],
-            env={**subprocess_environment(), "PYTHONHASHSEED": "4321"},
+            env={**subprocess_environment(), "PYTHONHASHSEED": "4321", "TMPDIR": str(self._folder)},
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
             text=True,
         )
-        weakref.finalize(self, _stop, self._process, self._errors)
+        weakref.finalize(self, _stop, self._process, self._errors, self._folder)
 
     def measure_import(self, modules: tuple[str, ...], heavy: tuple[str, ...]) -> Any:
         """Import plugin modules in the second process, which must be new.
@@ -62,12 +65,11 @@ class SecondProcess:
         Raises:
             CheckFailed: the provider raises an exception or ends the process.
         """
-        with tempfile.TemporaryDirectory(prefix="mpsfm-second-process-") as folder:
-            path = Path(folder, "input")
-            path.write_bytes(data)
-            what = "the provider fails in a second process"
-            self._call(what, "run_provider", str(path), str(Path.cwd()))
-            return path.with_suffix(".answer").read_bytes()
+        path = self._folder / "input"
+        path.write_bytes(data)
+        what = "the provider fails in a second process"
+        self._call(what, "run_provider", str(path), str(Path.cwd()))
+        return path.with_suffix(".answer").read_bytes()
 
     def _call(self, what: str, function: str, *arguments: Any) -> Any:
         """Call a function of the second process and return its result.
@@ -132,10 +134,11 @@ def _start(pid: int, path: tuple[str, ...]) -> SecondProcess:
     return SecondProcess()
 
 
-def _stop(process: subprocess.Popen[str], errors: IO[str]) -> None:
+def _stop(process: subprocess.Popen[str], errors: IO[str], folder: Path) -> None:
     process.kill()
     process.communicate()
     errors.close()
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 _SCRIPT = """

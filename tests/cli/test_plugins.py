@@ -234,10 +234,13 @@ CRASHING = """
 """
 
 
-def test_plugins_check_names_providers_that_end_the_process(
-    install_plugin: Callable[..., str],
+def test_plugins_check_names_providers_that_end_the_process_and_leaves_no_files(
+    install_plugin: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     install_plugin("mpsfm-crashing", CRASHING)
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(temporary))
     code, out, _ = mpsfm("plugins", "check", "mpsfm-crashing", "--only", "output-rules")
     assert code == 1
     lines = [line.split(",")[0] + line.partition(" s")[2] for line in out.splitlines()]
@@ -248,6 +251,7 @@ def test_plugins_check_names_providers_that_end_the_process(
         "2 fail",
     ]
     assert out.endswith("2 fail, 1 pass\n")
+    assert not list(temporary.iterdir())
 
 
 @pytest.mark.parametrize(("option", "code"), [((), 0), (("--strict",), 1)])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +198,7 @@ class FailsInSecondProcess(PaintedDepth):
 
 class EndsSecondProcess(FailsInSecondProcess):
     def fail(self) -> None:
+        tempfile.mkdtemp()
         os.write(2, b"Segmentation fault\n")
         os._exit(1)
 
@@ -206,10 +208,13 @@ class EndsSecondProcess(FailsInSecondProcess):
     [(FailsInSecondProcess, "no display"), (EndsSecondProcess, "Segmentation fault")],
 )
 def test_second_process_failure_is_reported_and_later_providers_are_checked(
-    factory: type, message: str, monkeypatch: pytest.MonkeyPatch
+    factory: type, message: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setenv("PYTHONHASHSEED", "0")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     status, text = outcomes(factory, PAINTED, "second-process")["second-process"]
     assert status == "fail"
     assert text.startswith("the provider fails in a second process") and text.endswith(message)
     assert outcomes(PaintedDepth, PAINTED, "second-process")["second-process"][0] == "pass"
+    # The ended process leaves no files; those of the running process are in its folder.
+    assert {path.name for path in tmp_path.glob("*/*")} == {"input", "input.answer"}
