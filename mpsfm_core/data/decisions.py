@@ -200,7 +200,8 @@ class DoubtReason(ReasonCode):
     CAMERA_JUMP = ("camera-jump", "image_a", "image_b")
     """The camera of a video jumps between two successive keyframes, which share few 3D points."""
     MEANINGLESS_SCORES = ("meaningless-scores", "provider", "num_pairs")
-    """The match scores of a matcher are not higher for inliers than for outliers."""
+    """The match scores of a matcher are unrelated to the matches, or lower for inliers than for
+    outliers."""
 
 
 class KeyframeReason(ReasonCode):

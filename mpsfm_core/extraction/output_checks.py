@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
+from scipy.stats import rankdata
 
-from mpsfm_core.data import Bool, Float32
+from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera
 from mpsfm_core.data.decisions import DoubtReason, Reason
-from mpsfm_core.data.mapping_problem import MappingImage
+from mpsfm_core.extraction.context import ExtractionContext
+from mpsfm_core.extraction.match_graph import MatchGraph
 
 _MIN_IMAGES = 3
 _MIN_KEYPOINTS = 50
@@ -17,30 +22,91 @@ _MAX_EXTENT = 0.8
 _MAX_MARGIN = 0.1
 """Maximum left and upper margin of the keypoints, relative to image size, that causes a doubt.
 An object in the image center has a larger margin, and therefore causes no doubt."""
-_MIN_OUTLIERS = 60
-"""Minimum number of outliers in all pairs whose scores are compared. For meaningless scores, the
-area under the ROC curve of 60 outliers is 0.5 with a std of 0.04."""
-_CHANCE_AUC = 0.5
-"""Probability that an inlier has a higher score than an outlier if scores mean nothing."""
+_MIN_MATCHES = 1000
+"""Minimum number of matches in all pairs from which unrelated scores cause a doubt. The correlation
+of the scores of neighboring matches is 0 with a std of 0.023 if 1000 scores are random."""
+_NUM_NEIGHBORS = 3
+"""Number of nearest matches whose scores are compared with the score of a match."""
+_SIGNIFICANT_STDS = 3.0
+"""Number of standard deviations from 0 above which a correlation is no coincidence."""
+_NUM_BLOCKS = 4
+"""Number of rows and columns of blocks in an image whose outliers are not independent. AdaLAM gives
+all matches of a neighborhood similar scores."""
+_MIN_CORRELATION = 0.08
+"""Smallest correlation of meaningful scores. The scores of neighboring matches have correlations
+from 0.12 (mutual nearest neighbors of XFeat) to 0.7."""
 
 
-def find_partial_coverage(images: Sequence[MappingImage], provider: str) -> Reason | None:
+@dataclass(frozen=True, eq=False)
+class ScoredMatches:
+    """Matches of a verified image pair, with the result of two-view verification."""
+
+    xy: Float64
+    """(m, 2) matched points in the first image, pixels."""
+    scores: Float32
+    """(m,) scores of the matches."""
+    inlier: Bool
+    """(m,) mask of the inliers."""
+
+
+def find_wrong_providers(context: ExtractionContext, graph: MatchGraph) -> tuple[Reason, ...]:
+    """Return reasons to doubt a features provider or matcher that is wrong for all images.
+
+    Args:
+        context: Context of the extraction that computed the match graph.
+        graph: Keypoints, matches and two-view geometries.
+    """
+    config, doubts = context.config, []
+    if config.features is not None:
+        keypoints, cameras = graph.assembled.keypoints, [im.pinhole for im in context.images]
+        doubts.append(find_partial_coverage(keypoints, cameras, config.features.use))
+    matchers = [m for m in (config.matcher, config.dense_matcher) if m is not None]
+    for number, matcher in enumerate(matchers):
+        part = number if len(matchers) > 1 else None
+        doubts.append(find_meaningless_scores(list(_scored_matches(graph, part)), matcher.use))
+    return tuple(doubt for doubt in doubts if doubt is not None)
+
+
+def _scored_matches(graph: MatchGraph, part: int | None) -> Iterator[ScoredMatches]:
+    """Yield the matches of each verified pair.
+
+    Args:
+        graph: Matches and two-view geometries.
+        part: 0 for matches of keypoints only, 1 for dense matches only, None for both.
+    """
+    for matches, geometry in zip(graph.candidates, graph.geometries, strict=True):
+        if geometry.dropped:
+            continue
+        keypoints = graph.assembled.keypoints[matches.pair[0]][matches.sparse.indices[:, 0]]
+        xy = np.concatenate([keypoints, matches.points.xy_a])
+        scores = np.concatenate([matches.sparse.scores, matches.points.scores])
+        inlier = np.zeros(len(scores), np.bool_)
+        inlier[geometry.inliers] = True
+        middle = len(matches.sparse)
+        rows = slice(None) if part is None else (slice(middle), slice(middle, None))[part]
+        yield ScoredMatches(xy[rows], scores[rows], inlier[rows])
+
+
+def find_partial_coverage(
+    keypoints: Sequence[Float64], cameras: Sequence[PinholeCamera], provider: str
+) -> Reason | None:
     """Find out whether keypoints cover only the upper left part of every image.
 
     A wrong provider returns keypoints in pixels of a reduced or cropped image, or only of the first
     tile of an image. Keypoints in wrong pixels give wrong poses of all images.
 
     Args:
-        images: Images with their keypoints.
+        keypoints: Keypoints (n, 2) of each image, pixels.
+        cameras: Camera of each image.
         provider: Name of the features provider.
 
     Returns:
         Reason (``DoubtReason``) to doubt the run, or None.
     """
     extents = [
-        np.stack([image.keypoints.min(axis=0), image.keypoints.max(axis=0)]) / image.camera.size
-        for image in images
-        if len(image.keypoints) >= _MIN_KEYPOINTS
+        np.stack([xy.min(axis=0), xy.max(axis=0)]) / camera.size
+        for xy, camera in zip(keypoints, cameras, strict=True)
+        if len(xy) >= _MIN_KEYPOINTS
     ]
     if len(extents) < _MIN_IMAGES:
         return None
@@ -55,35 +121,99 @@ def find_partial_coverage(images: Sequence[MappingImage], provider: str) -> Reas
     )
 
 
-def find_meaningless_scores(pairs: Sequence[tuple[Float32, Bool]], provider: str) -> Reason | None:
-    """Find out whether the scores of matches are not higher for inliers than for outliers.
+def find_meaningless_scores(pairs: Sequence[ScoredMatches], provider: str) -> Reason | None:
+    """Find out whether the scores of matches are inverted or unrelated to the matches.
 
     Best scores select matches of a keypoint and points of dense matches, so inverted scores select
-    outliers. The criterion is the mean over pairs of the area under the ROC curve, weighted by the
-    number of outliers of a pair. Equal scores of all matches cause no doubt.
+    outliers. Two rank correlations are computed in each pair and averaged over all pairs:
+
+    * between score and inlier (rank-biserial correlation, Cureton 1956), which is negative for
+      inverted scores;
+    * between the scores of neighboring matches. Texture, blur and perspective are similar at
+      neighboring points, so meaningful scores are similar. This correlation needs no outliers.
+
+    Scores are meaningless if both correlations are 0 within the limits of chance. Equal scores of
+    all matches cause no doubt.
 
     Args:
-        pairs: Scores (m,) float32 of the matches of each verified pair, and mask (m,) bool of the
-            inliers.
+        pairs: Matches of each verified pair.
         provider: Name of the matcher.
 
     Returns:
         Reason (``DoubtReason``) to doubt the run, or None.
     """
-    compared = [
-        (scores, inlier)
-        for scores, inlier in pairs
-        if inlier.any() and not inlier.all() and np.ptp(scores) > 0
-    ]
-    areas = [_roc_area(scores[inlier], scores[~inlier]) for scores, inlier in compared]
-    num_outliers = [int((~inlier).sum()) for _, inlier in compared]
-    if sum(num_outliers) < _MIN_OUTLIERS or np.average(areas, weights=num_outliers) > _CHANCE_AUC:
+    compared = [pair for pair in pairs if len(pair.scores) > 1 and np.ptp(pair.scores) > 0]
+    with_inlier, with_neighbor = _correlate_with_inlier(compared), _correlate_neighbors(compared)
+    is_related = max(with_inlier.strength, with_neighbor.strength) > 1
+    is_undecided = sum(len(pair.scores) for pair in compared) < _MIN_MATCHES
+    if with_inlier.strength >= -1 and (is_related or is_undecided):
         return None
-    return DoubtReason.MEANINGLESS_SCORES.because(provider=provider, num_pairs=len(areas))
+    return DoubtReason.MEANINGLESS_SCORES.because(provider=provider, num_pairs=len(compared))
 
 
-def _roc_area(inliers: Float32, outliers: Float32) -> float:
-    """Return the probability that an inlier has a higher score than an outlier."""
-    ordered = np.sort(outliers)
-    lower = np.searchsorted(ordered, inliers, "left") + np.searchsorted(ordered, inliers, "right")
-    return float(lower.mean() / 2 / len(ordered))
+class _Correlation(NamedTuple):
+    """Mean correlation of all pairs, and its standard deviation for meaningless scores."""
+
+    value: float
+    std: float
+
+    @property
+    def strength(self) -> float:
+        """Ratio of the correlation and the limit above which the correlation is no coincidence."""
+        return self.value / max(_MIN_CORRELATION, _SIGNIFICANT_STDS * self.std)
+
+
+_UNKNOWN = _Correlation(0.0, np.inf)
+
+
+def _correlate_with_inlier(pairs: Sequence[ScoredMatches]) -> _Correlation:
+    """Correlate scores and inliers, with the number of outliers as weight of a pair.
+
+    Neighboring outliers have similar scores, so the outliers in a block of an image count as one
+    observation for the standard deviation.
+    """
+    sums: list[Float64] = []
+    num_outliers = 0
+    for pair in pairs:
+        inliers = np.sort(pair.scores[pair.inlier])
+        outliers = pair.scores[~pair.inlier]
+        if not (len(inliers) and len(outliers)):
+            continue
+        num_lower, num_equal_or_lower = (
+            np.searchsorted(inliers, outliers, side) for side in ("left", "right")
+        )
+        order = 1 - (num_lower + num_equal_or_lower) / len(inliers)
+        low, size = pair.xy.min(axis=0), np.maximum(np.ptp(pair.xy, axis=0), 1)
+        blocks = np.floor(_NUM_BLOCKS * (pair.xy[~pair.inlier] - low) / size)
+        block = np.unique(blocks, axis=0, return_inverse=True)[1]
+        sums.append(np.bincount(block, order).astype(np.float64))
+        num_outliers += len(outliers)
+    if not num_outliers:
+        return _UNKNOWN
+    total = np.concatenate(sums)
+    return _Correlation(total.sum() / num_outliers, float(np.linalg.norm(total)) / num_outliers)
+
+
+def _correlate_neighbors(pairs: Sequence[ScoredMatches]) -> _Correlation:
+    """Correlate the score ranks of each match and of its nearest matches in the first image.
+
+    The number of matches is the weight of a pair. For random scores, only the products of matches
+    that are among the nearest of each other are equal, which gives the variance.
+    """
+    total, variance, num_products = 0.0, 0, 0
+    for pair in pairs:
+        count = len(pair.scores)
+        nearest = cKDTree(pair.xy).query(pair.xy, k=min(_NUM_NEIGHBORS + 1, count))[1]
+        rows, columns = np.repeat(np.arange(count), nearest.shape[1]), nearest.ravel()
+        # The nearest match of most matches is the match itself.
+        rows, columns = rows[rows != columns], columns[rows != columns]
+        ranks = rankdata(pair.scores)
+        ranks = (ranks - ranks.mean()) / ranks.std()
+        # Drawing without replacement gives ranks of two matches a correlation of -1 / (count - 1).
+        total += float(ranks[rows] @ ranks[columns]) + len(rows) / (count - 1)
+        is_mutual = np.isin(columns * count + rows, rows * count + columns)
+        variance += len(rows) + int(is_mutual.sum())
+        num_products += len(rows)
+    if not num_products:
+        return _UNKNOWN
+    return _Correlation(total / num_products, float(np.sqrt(variance)) / num_products)

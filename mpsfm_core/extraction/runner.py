@@ -42,7 +42,7 @@ from mpsfm_core.extraction.matching.pair_matching import (
     assemble_matches,
     merge_matches,
 )
-from mpsfm_core.extraction.output_checks import find_meaningless_scores, find_partial_coverage
+from mpsfm_core.extraction.output_checks import find_wrong_providers
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.extraction.pairs.selection import PairSelection
 from mpsfm_core.extraction.priors.multiview import GroupPriors
@@ -151,7 +151,8 @@ def extend_matches(
         )
     problem = merge_matches(first.problem, graph.assembled)
     second = describe(context, problem, graph)
-    return Extraction(problem, merge_reports(first.report, second))
+    doubts = (*first.doubts, *find_wrong_providers(context, graph))
+    return Extraction(problem, merge_reports(first.report, second), doubts)
 
 
 def predict_priors_again(
@@ -215,28 +216,8 @@ def _extract(context: ExtractionContext, imported: ImportedMatches | None) -> Ex
         graph = verify_imported(context, imported)
     priors = predict_priors(context, graph)
     problem = assemble_problem(context.images, graph, priors)
-    doubts = () if imported is not None else _find_wrong_providers(context.config, graph, problem)
+    doubts = () if imported is not None else find_wrong_providers(context, graph)
     return Extraction(problem, describe(context, problem, graph), doubts)
-
-
-def _find_wrong_providers(
-    config: Config, graph: MatchGraph, problem: MappingProblem
-) -> tuple[Reason, ...]:
-    """Return reasons to doubt a features provider or matcher that is wrong for all images."""
-    doubts = []
-    if config.features is not None:
-        doubts.append(find_partial_coverage(problem.images, config.features.use))
-    pairs = []
-    for matches, geometry in zip(graph.candidates, graph.geometries, strict=True):
-        if not geometry.dropped:
-            scores = np.concatenate([matches.sparse.scores, matches.points.scores])
-            inlier = np.zeros(len(scores), np.bool_)
-            inlier[geometry.inliers] = True
-            pairs.append((scores, inlier))
-    matcher = config.matcher or config.dense_matcher
-    if matcher is not None:
-        doubts.append(find_meaningless_scores(pairs, matcher.use))
-    return tuple(doubt for doubt in doubts if doubt is not None)
 
 
 def feature_table(context: ExtractionContext) -> FeatureTable | None:

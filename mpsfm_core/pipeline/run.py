@@ -267,7 +267,9 @@ class _Run:
         passes = MappingPasses(
             self._config, self._registry, self._stages, self._inputs, self._checkpoints
         )
+        num_doubts = len(extraction.doubts)
         extraction, mapping, originals = passes.run(images, extraction)
+        self._add_doubts(extraction.doubts[num_doubts:])
         self._part_records = passes.part_records
         self._add_doubts(
             DoubtReason.CAMERA_JUMP.because(image_a=before, image_b=after)

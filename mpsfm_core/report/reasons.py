@@ -356,8 +356,8 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
     ),
     DoubtReason.MEANINGLESS_SCORES: (
         "meaningless match scores",
-        "The scores of the matcher {provider} are not higher for inliers than for outliers in "
-        "{num_pairs} pairs of photos: scores may be inverted or random.",
+        "The scores of the matcher {provider} are unrelated to its matches in {num_pairs} pairs of "
+        "photos, or lower for inliers than for outliers: scores may be random or inverted.",
         "Test the matcher with mpsfm plugins check {provider}.",
     ),
     CameraReason.KNOWN: ("known focal length", "The focal length is given.", _NO_REMEDY),

@@ -2,35 +2,34 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mpsfm_core.data import DepthPrior, NormalPrior, PinholeCamera
-from mpsfm_core.data.mapping_problem import MappingImage
-from mpsfm_core.extraction.output_checks import find_meaningless_scores, find_partial_coverage
+from mpsfm_core.data import PinholeCamera
+from mpsfm_core.extraction.output_checks import (
+    ScoredMatches,
+    find_meaningless_scores,
+    find_partial_coverage,
+)
 from mpsfm_core.report.reasons import explain
 
 CAMERA = PinholeCamera(2000, 1500, 1600.0, 1600.0, 1000.0, 750.0)
 
 
-def images_with_keypoints(
+def keypoints_of_images(
     low: tuple[float, float], high: tuple[float, float], count: int = 4
-) -> list[MappingImage]:
-    """Return images whose keypoints lie between two corners, as ratios of the image size."""
+) -> list[np.ndarray]:
+    """Return keypoints of images between two corners, which are ratios of the image size."""
     rng = np.random.default_rng(0)
-    depth = DepthPrior.from_arrays(np.ones((2, 2)), np.full((2, 2), 0.01))
-    facing = np.broadcast_to((0.0, 0.0, -1.0), (2, 2, 3))
-    normals = NormalPrior.from_arrays(facing, np.full((2, 2), 0.01))
-    return [
-        MappingImage(
-            f"{i}.jpg", CAMERA, rng.uniform(low, high, (200, 2)) * CAMERA.size, depth, normals
-        )
-        for i in range(count)
-    ]
+    return [rng.uniform(low, high, (200, 2)) * CAMERA.size for _ in range(count)]
 
 
 def test_find_partial_coverage_of_reduced_image_names_provider() -> None:
-    doubt = find_partial_coverage(images_with_keypoints((0, 0), (0.32, 0.32)), "my-features")
+    doubt = find_partial_coverage(
+        keypoints_of_images((0, 0), (0.32, 0.32)), [CAMERA] * 4, "my-features"
+    )
     assert doubt is not None
     explained = explain(doubt)
     assert "my-features finds keypoints only in the upper left 32% x 32% of all 4" in explained.text
@@ -49,42 +48,79 @@ def test_find_partial_coverage_of_reduced_image_names_provider() -> None:
 def test_find_partial_coverage_of_usual_images_is_silent(
     low: tuple[float, float], high: tuple[float, float], count: int
 ) -> None:
-    assert find_partial_coverage(images_with_keypoints(low, high, count), "sift") is None
+    keypoints = keypoints_of_images(low, high, count)
+    assert find_partial_coverage(keypoints, [CAMERA] * count, "sift") is None
 
 
-def scored_pairs(shift: float, count: int = 4) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return scores of 80 inliers and 40 outliers, where inliers have scores higher by a shift."""
+def scored_pairs(
+    *, advantage: float = 0.0, smooth: float = 0.0, count: int = 10, ratio: float = 1 / 3
+) -> list[ScoredMatches]:
+    """Return pairs with 120 random scores each.
+
+    Args:
+        advantage: Excess of the scores of inliers over those of outliers.
+        smooth: Range of a part of the scores that depends on the position in the image.
+        count: Number of pairs.
+        ratio: Ratio of outliers.
+    """
     rng = np.random.default_rng(0)
-    inlier = np.arange(120) < 80
-    return [
-        (rng.uniform(0.2, 0.8, 120).astype(np.float32) + np.float32(shift) * inlier, inlier)
-        for _ in range(count)
-    ]
-
-
-def test_find_meaningless_scores_of_inverted_scores_names_matcher() -> None:
-    doubt = find_meaningless_scores(scored_pairs(-0.2), "my-matcher")
-    assert doubt is not None
-    explained = explain(doubt)
-    assert "scores of the matcher my-matcher are not higher for inliers" in explained.text
-    assert "in 4 pairs" in explained.text
-    assert "mpsfm plugins check my-matcher" in explained.remedy
-
-
-def test_find_meaningless_scores_pools_the_few_outliers_of_good_pairs() -> None:
-    pairs = [(scores[:92], inlier[:92]) for scores, inlier in scored_pairs(-0.2, count=6)]
-    assert find_meaningless_scores(pairs, "my-matcher") is not None
+    pairs = []
+    for _ in range(count):
+        xy = rng.uniform(size=(120, 2)) * CAMERA.size
+        inlier = np.arange(120) >= ratio * 120
+        scores = rng.uniform(0.3, 0.5, 120) + advantage * inlier
+        scores += smooth * np.sin(xy[:, 0] / 200)
+        pairs.append(ScoredMatches(xy, scores.astype(np.float32), inlier))
+    return pairs
 
 
 @pytest.mark.parametrize(
     "pairs",
     [
-        scored_pairs(0.1),
-        scored_pairs(-0.2, count=1),
-        [(np.ones_like(scores), inlier) for scores, inlier in scored_pairs(0.0)],
-        [(scores[:90], inlier[:90]) for scores, inlier in scored_pairs(-0.2)],
+        scored_pairs(),
+        scored_pairs(ratio=0),
+        scored_pairs(count=40, ratio=0.02),
+        scored_pairs(advantage=-0.2),
+        scored_pairs(advantage=-0.2, smooth=0.1),
+        scored_pairs(advantage=-0.2, count=1),
     ],
-    ids=["good", "one pair", "constant", "few outliers"],
+    ids=["random", "without outliers", "few outliers", "inverted", "inverted smooth", "one pair"],
 )
-def test_find_meaningless_scores_of_usual_scores_is_silent(pairs: list) -> None:
+def test_find_meaningless_scores_of_wrong_scores_names_matcher(pairs: list[ScoredMatches]) -> None:
+    doubt = find_meaningless_scores(pairs, "my-matcher")
+    assert doubt is not None
+    explained = explain(doubt)
+    assert "The scores of the matcher my-matcher are unrelated" in explained.text
+    assert f"in {len(pairs)} pairs" in explained.text
+    assert "mpsfm plugins check my-matcher" in explained.remedy
+
+
+@pytest.mark.parametrize(
+    "pairs",
+    [
+        scored_pairs(advantage=0.1),
+        scored_pairs(smooth=0.1),
+        scored_pairs(smooth=0.1, ratio=0),
+        scored_pairs(count=2),
+        [],
+        [replace(pair, scores=np.ones_like(pair.scores)) for pair in scored_pairs()],
+    ],
+    ids=["good", "smooth", "without outliers", "few matches", "no pairs", "constant"],
+)
+def test_find_meaningless_scores_of_usual_scores_is_silent(pairs: list[ScoredMatches]) -> None:
     assert find_meaningless_scores(pairs, "nearest") is None
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_find_meaningless_scores_of_permuted_scores_names_matcher(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pairs = [
+        replace(pair, scores=rng.permutation(pair.scores))
+        for pair in scored_pairs(advantage=0.1, smooth=0.1)
+    ]
+    assert find_meaningless_scores(pairs, "my-matcher") is not None
+
+
+def test_find_meaningless_scores_compares_matches_at_equal_positions() -> None:
+    pairs = [replace(pair, xy=np.zeros_like(pair.xy)) for pair in scored_pairs()]
+    assert find_meaningless_scores(pairs, "my-matcher") is not None
