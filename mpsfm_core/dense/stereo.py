@@ -18,6 +18,7 @@ from mpsfm_core.data import Float32, Float64
 from mpsfm_core.dense.dense_view import DenseView
 from mpsfm_core.dense.depth_posterior import UNKNOWN_LOG_STD
 from mpsfm_core.dense.stereo_kernels import (
+    add_prior_costs,
     aggregate_costs,
     compute_ncc_costs,
     merge_view_costs,
@@ -132,14 +133,21 @@ def _sweep(
     """
     base = np.where(view.usable, np.exp(surface), np.float32(0))
     merged = _match_costs(view, sources, base, offsets, _UNSEEN_COST)
-    change = (surface - view.log_depth)[..., None] + offsets.astype(np.float32)
-    deviation = change / view.log_std[..., None]
-    unary = merged + np.float32(_PRIOR_WEIGHT) * np.minimum(deviation**2, _MAX_PRIOR)
-    reach = _search_range(view)[..., None] + (offsets[1] - offsets[0])
-    unary[np.abs(change) > reach] = _OUT_OF_RANGE_COST
-    total = np.zeros_like(merged)
+    unary, total = np.empty_like(merged), np.zeros_like(merged)
+    reach = _search_range(view) + (offsets[1] - offsets[0])
+    add_prior_costs(
+        merged,
+        surface - view.log_depth,
+        view.log_std,
+        reach,
+        offsets.astype(np.float32),
+        np.float32(_PRIOR_WEIGHT),
+        np.float32(_MAX_PRIOR),
+        np.float32(_OUT_OF_RANGE_COST),
+        unary,
+    )
     penalties = _SMALL_STEP_PENALTY, _LARGE_STEP_PENALTY
-    aggregate_costs(unary.astype(np.float32), view.gray, *penalties, _GRAY_EDGE, total)
+    aggregate_costs(unary, view.gray, *penalties, _GRAY_EDGE, total)
     offset, cost = np.empty_like(base), np.empty_like(base)
     select_labels(total, merged, offsets, offset, cost)
     return surface + offset, cost

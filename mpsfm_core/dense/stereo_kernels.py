@@ -167,6 +167,41 @@ def merge_view_costs(costs: UInt8, ratio: float, unseen: float, merged: Float32)
                 merged[i, j, label] = total / (MAX_COST * num_used)
 
 
+@kernel()
+def add_prior_costs(
+    costs: Float32,
+    change: Float32,
+    std: Float32,
+    reach: Float64,
+    offsets: Float32,
+    weight: np.float32,
+    max_prior: np.float32,
+    out_of_range: np.float32,
+    total: Float32,
+) -> None:
+    """Add the cost of the deviation from the input depth to the matching cost of each label.
+
+    Args:
+        costs: (h, w, k) matching costs of k labels at each pixel.
+        change: (h, w) log depth of the base surface minus log depth of the input depth.
+        std: (h, w) std of the log of the input depth.
+        reach: (h, w) half width of the search range in log depth.
+        offsets: (k,) offsets of log depth of the labels from the base surface.
+        weight: Cost per squared deviation in stds.
+        max_prior: Maximum squared deviation in squared stds.
+        out_of_range: Cost of a depth outside the search range.
+        total: (h, w, k) float32 output, the sum of both costs.
+    """
+    height, width, labels = costs.shape
+    for i in range(height):
+        for j in range(width):
+            for k in range(labels):
+                deviation = change[i, j] + offsets[k]
+                stds = deviation / std[i, j]
+                cost = costs[i, j, k] + weight * min(stds * stds, max_prior)
+                total[i, j, k] = out_of_range if abs(deviation) > reach[i, j] else cost
+
+
 @kernel(fastmath=_FASTMATH)
 def _aggregate_path(
     costs: Float32,
