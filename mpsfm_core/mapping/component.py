@@ -26,6 +26,7 @@ from mpsfm_core.mapping.initialization.initial_pair import (
 from mpsfm_core.mapping.model_maintenance import ModelMaintenance, ModelState
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.filtering import filter_points, find_lost_images
+from mpsfm_core.mapping.refinement.refinement import ROUGH_TOLERANCE
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
@@ -190,7 +191,7 @@ class Component:
         for image in images[len(poses.images) :]:
             self.refiner.estimate_scale(image, [])
         loss_factor = options.refinement.first_reprojection_scale
-        self.refiner.adjust(images, reprojection_scale=loss_factor)
+        self.refiner.adjust(images, reprojection_scale=loss_factor, tolerance=ROUGH_TOLERANCE)
         filter_points(scene, options.triangulation)
 
     def _first_images(self) -> list[int]:

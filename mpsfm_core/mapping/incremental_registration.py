@@ -171,7 +171,8 @@ class IncrementalRegistration:
             image: Index of the image to register.
             references: Registered images whose matches determine the pose of the image.
             refine_globally: Refine all registered images before the depth check. Because global
-                refinement is slow, only poses with a high inlier ratio are tried.
+                refinement is slow, only poses with a high inlier ratio are tried, and the depth is
+                first checked after a rough bundle adjustment.
 
         Returns:
             None if the image is registered, else the rejection reason of the image, with the scene
@@ -253,8 +254,13 @@ class IncrementalRegistration:
         if refine_globally:
             with self._event_log.timed("global refinement"):
                 self._refiner.refine_locally(image)
+                self._refiner.close_loop()
+        max_violations = self._options.consistency.max_violations
+        reason = self._maintenance.check_depth(image, max_violations)
+        if refine_globally and not reason:
+            with self._event_log.timed("global refinement"):
                 self._refiner.refine_globally()
-        reason = self._maintenance.check_depth(image, self._options.consistency.max_violations)
+            reason = self._maintenance.check_depth(image, max_violations)
         if reason:
             self._exclude_references(pose, correspondences)
             return reason

@@ -69,6 +69,9 @@ MAX_GLOBAL_REFINEMENTS = 5
 MAX_GLOBAL_CHANGE = 0.0005
 """Share of changed observations below which global refinement stops.
 [COLMAP ba_global_max_refinement_change]"""
+ROUGH_TOLERANCE = 1e-4
+"""Relative decrease of the cost at which a bundle adjustment stops that another one follows after
+changes of the tracks. [tuned: benchmarks.walks]"""
 MAX_DEPTH_RATIO = 1.5
 """Largest ratio between the depth of a point and the depth map for which bundle adjustment uses the
 depth. [reference scale_filter]"""
@@ -274,6 +277,7 @@ class Refiner:
         focal: bool = False,
         reprojection_scale: float = 1.0,
         max_iterations: int | None = None,
+        tolerance: float | None = None,
     ) -> None:
         """Adjust poses and depth scales of images, and the points that the images observe.
 
@@ -287,15 +291,18 @@ class Refiner:
             reprojection_scale: Factor on the scale of the reprojection loss.
             max_iterations: Maximum number of bundle adjustment iterations, or None to use the
                 option.
+            tolerance: Relative decrease of the cost at which bundle adjustment stops, or None to
+                use the option.
         """
         scene = self.scene
         variable = scene.rigs.complete(variable)
         bundle = self._collect_bundle(variable, local=local)
         if bundle is None:
             return
-        options = self._scale_losses(reprojection_scale)
-        if max_iterations:
-            options = options.model_copy(update={"max_iterations": max_iterations})
+        limits = {"max_iterations": max_iterations, "function_tolerance": tolerance}
+        options = self._scale_losses(reprojection_scale).model_copy(
+            update={name: limit for name, limit in limits.items() if limit is not None}
+        )
         if focal:
             result = calibrate_cameras(
                 scene,
@@ -510,6 +517,13 @@ class Refiner:
             if changed < MAX_LOCAL_CHANGE * max(self._num_observations(), 1):
                 break
 
+    def close_loop(self) -> None:
+        """Merge tracks and roughly adjust all images, which distributes the drift of a loop."""
+        images = [int(i) for i in self.scene.registered_images()]
+        complete_and_merge_tracks(self.scene, self.triangulation, create=True)
+        self.adjust(images, tolerance=ROUGH_TOLERANCE)
+        filter_points(self.scene, self.triangulation)
+
     def refine_globally(self, *, depth_maps: bool = True) -> None:
         """Adjust all images and update tracks until few tracks change, then refine depth maps.
 
@@ -521,7 +535,7 @@ class Refiner:
         lift_low_parallax(self.scene, self.triangulation)
         refines_focals = self.can_refine_focals()
         if refines_focals:
-            self.adjust(images, focal=True)
+            self.adjust(images, focal=True, tolerance=ROUGH_TOLERANCE)
         for _ in range(MAX_GLOBAL_REFINEMENTS):
             self.estimate_shared_scales()
             self._measure_keypoint_noise()
