@@ -26,11 +26,11 @@ from mpsfm_core.mapping.initialization.initial_pair import (
 from mpsfm_core.mapping.model_maintenance import ModelMaintenance, ModelState
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.refinement.filtering import filter_points, find_lost_images
-from mpsfm_core.mapping.refinement.refinement import ROUGH_TOLERANCE
 from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimator
 from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, triangulate_image
+from mpsfm_core.optimize.options import ROUGH_TOLERANCE
 
 _log = logging.getLogger(__name__)
 

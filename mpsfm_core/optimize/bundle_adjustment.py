@@ -48,7 +48,7 @@ INITIAL_DAMPING = 1e-4
 MIN_DAMPING = 1e-10
 """Minimum Levenberg-Marquardt damping, which keeps unobserved parameters constant. [ours]"""
 MIN_DAMPING_FACTOR = 0.1
-"""Smallest factor on the damping after an accepted step, 1 / 3 in Ceres. [tuned: benchmarks.walks]"""
+"""Smallest factor on the damping after an accepted step, 1 / 3 in Ceres. [ours]"""
 MAX_DAMPING = 1e16
 """Levenberg-Marquardt damping above which bundle adjustment stops. [ours]"""
 MAX_FOCAL_STEP = 1.0

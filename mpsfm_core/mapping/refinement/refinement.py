@@ -43,6 +43,7 @@ from mpsfm_core.optimize.covariance import (
 )
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator, RefinedDepth
 from mpsfm_core.optimize.options import (
+    ROUGH_TOLERANCE,
     SOFT_L1_OPTIONS,
     BundleOptions,
     IntegrationOptions,
@@ -69,9 +70,6 @@ MAX_GLOBAL_REFINEMENTS = 5
 MAX_GLOBAL_CHANGE = 0.0005
 """Share of changed observations below which global refinement stops.
 [COLMAP ba_global_max_refinement_change]"""
-ROUGH_TOLERANCE = 1e-4
-"""Relative decrease of the cost at which a bundle adjustment stops that another one follows after
-changes of the tracks. [tuned: benchmarks.walks]"""
 MAX_DEPTH_RATIO = 1.5
 """Largest ratio between the depth of a point and the depth map for which bundle adjustment uses the
 depth. [reference scale_filter]"""
