@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import Bool, DepthPrior, Float64, NormalPrior
+from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, NormalPrior
 from mpsfm_core.geometry import angle_between_deg, pixel_centers
 from mpsfm_core.testing.examples import Example, TrueMaps, thin
 from mpsfm_core.testing.outcome import CheckFailed
@@ -142,31 +143,78 @@ def estimate_ray_exponent(prior: DepthPrior, example: Example) -> float:
 
 def estimate_depth_shift(prior: DepthPrior, example: Example) -> MapShift:
     """Estimate the shift of a depth map from pixels where the true depth changes."""
-    step = _choose_step(prior.shape, example)
-    truth = example.truth(prior.shape, step=step)
-    moved = [
-        [example.truth(prior.shape, (s * x, s * y), step).depth for s in (1, -1)]
-        for x, y in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX))
-    ]
-    # On a grid finer than the view, half a pixel of the view can cross the border of a surface.
-    where = select_comparable(thin(prior.valid, step), truth)
-    where &= np.min(moved, axis=(0, 1)) > 0
-    error = np.log(thin(prior.depth, step)[where].astype(np.float64) / truth.depth[where])
-    slopes = [np.log(after[where] / before[where])[:, None] for after, before in moved]
-    return _solve_shift(error[:, None], slopes, _normalized_positions(prior.shape, step)[where])
+    return _estimate_smallest_shift(_estimate_depth_shift, prior.depth, prior.valid, example)
 
 
 def estimate_normals_shift(prior: NormalPrior, example: Example) -> MapShift:
     """Estimate the shift of a normal map from pixels where the true normals change."""
-    step = _choose_step(prior.shape, example)
-    truth = example.truth(prior.shape, step=step)
-    where = select_comparable(thin(prior.valid, step), truth)
-    error = thin(prior.normals, step)[where].astype(np.float64) - truth.normals[where]
+    return _estimate_smallest_shift(_estimate_normals_shift, prior.normals, prior.valid, example)
+
+
+def _estimate_smallest_shift(
+    estimate: Callable[[Float32, Bool, Example], MapShift],
+    values: Float32,
+    valid: Bool,
+    example: Example,
+) -> MapShift:
+    """Estimate the shift of a map that may repeat the pixels of its view.
+
+    In a map of 1.5 times the size of its view, a repeated pixel is up to half a pixel away from its
+    true position, and some pixels are repeated more often than others. The shift of such a map is
+    also estimated from the map pixels at the centers of the view's pixels, and the smaller shift
+    counts.
+
+    Args:
+        estimate: Function that estimates the shift from values, validity and synthetic view.
+        values: Map (h, w) of depth or (h, w, 3) of normals.
+        valid: Validity mask (h, w).
+        example: Synthetic view that shows the true content of the map.
+    """
+    shift = estimate(values, valid, example)
+    sizes = list(zip(valid.shape, (example.camera.height, example.camera.width), strict=True))
+    if any(fine < coarse for fine, coarse in sizes) or not any(fine % n for fine, n in sizes):
+        return shift
+    centers = np.ix_(*(_nearest_to_centers(fine, coarse) for fine, coarse in sizes))
+    unrepeated = estimate(values[centers], valid[centers], example)
+    return min(shift, unrepeated, key=lambda each: (np.isinf(each.std), each.largest))
+
+
+def _nearest_to_centers(fine: int, coarse: int) -> Int64:
+    """Return the pixels (coarse,) of a fine grid nearest to the pixel centers of a coarse one.
+
+    If two pixels have the same distance, the first and the second are returned in turn.
+    """
+    pixels = np.arange(coarse)
+    position = (pixels + 0.5) * fine / coarse
+    nearest = np.where(pixels % 2, np.ceil(position) - 1, np.floor(position))
+    return nearest.astype(np.int64)
+
+
+def _estimate_depth_shift(depth: Float32, valid: Bool, example: Example) -> MapShift:
+    step = _choose_step(valid.shape, example)
+    truth = example.truth(valid.shape, step=step)
+    moved = [
+        [example.truth(valid.shape, (s * x, s * y), step).depth for s in (1, -1)]
+        for x, y in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX))
+    ]
+    # On a grid finer than the view, half a pixel of the view can cross the border of a surface.
+    where = select_comparable(thin(valid, step), truth)
+    where &= np.min(moved, axis=(0, 1)) > 0
+    error = np.log(thin(depth, step)[where].astype(np.float64) / truth.depth[where])
+    slopes = [np.log(after[where] / before[where])[:, None] for after, before in moved]
+    return _solve_shift(error[:, None], slopes, _normalized_positions(valid.shape, step)[where])
+
+
+def _estimate_normals_shift(normals: Float32, valid: Bool, example: Example) -> MapShift:
+    step = _choose_step(valid.shape, example)
+    truth = example.truth(valid.shape, step=step)
+    where = select_comparable(thin(valid, step), truth)
+    error = thin(normals, step)[where].astype(np.float64) - truth.normals[where]
     slopes = []
     for x, y in ((_HALF_STEP_PX, 0.0), (0.0, _HALF_STEP_PX)):
-        after, before = (example.truth(prior.shape, (s * x, s * y), step) for s in (1, -1))
+        after, before = (example.truth(valid.shape, (s * x, s * y), step) for s in (1, -1))
         slopes.append(after.normals[where] - before.normals[where])
-    return _solve_shift(error, slopes, _normalized_positions(prior.shape, step)[where])
+    return _solve_shift(error, slopes, _normalized_positions(valid.shape, step)[where])
 
 
 def _choose_step(shape: tuple[int, int], example: Example) -> int:

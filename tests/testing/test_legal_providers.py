@@ -41,7 +41,7 @@ from tests.support.reference_providers import (
     Wrapper,
     depth_prior,
 )
-from tests.support.sparse_providers import CellMatcher, SiftDetector
+from tests.support.sparse_providers import CellMatcher, DenseSift, SiftDetector
 
 SLOW_CHECKS = {"second-process", "memory-released", "offline", "speed"}
 """Checks of the process, which are omitted because other tests cover them."""
@@ -84,6 +84,13 @@ class SquareDepth(NearestDepth):
 class FineDepth(NearestDepth):
     def size(self, view: View) -> tuple[int, int]:
         return 2 * view.camera.width, 2 * view.camera.height
+
+
+class EnlargedDepth(NearestDepth):
+    """Depth map of 1.5 times the size of the view, in which some pixels are repeated."""
+
+    def size(self, view: View) -> tuple[int, int]:
+        return 3 * view.camera.width // 2 + 1, 3 * view.camera.height // 2 + 1
 
 
 class CautiousDepth(PaintedDepth):
@@ -218,6 +225,17 @@ class OneWayMatcher:
         return PairMatches(SparseMatches.from_best_scores(indices, best[keep]))
 
 
+class BestMatches(DenseSift):
+    """Dense matcher that returns its 100 best matches, which leave out a side of a large view."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        dense = super().match(a, b, fa, fb).dense
+        assert dense is not None
+        best = np.argsort(-dense.scores, kind="stable")[:100]
+        points = dense.points_a[best], dense.points_b[best]
+        return PairMatches(dense=DenseMatches(*points, dense.scores[best], dense.std_px))
+
+
 class ScaleVariantMatcher(UprightPatches):
     """Dense matcher that finds matches between views of about the same scale only."""
 
@@ -285,6 +303,7 @@ DEPTH: tuple[Capability, ...] = ("metric", "variance")
         ("depth", CoarseDepth, DEPTH),
         ("depth", SquareDepth, DEPTH),
         ("depth", FineDepth, DEPTH),
+        ("depth", EnlargedDepth, DEPTH),
         ("depth", CautiousDepth, DEPTH),
         ("depth", CachedDepth, DEPTH),
         ("depth", CanonicalDepth, (*DEPTH, "intrinsics-aware")),
@@ -298,6 +317,7 @@ DEPTH: tuple[Capability, ...] = ("metric", "variance")
         ("matcher", OneWayMatcher, ("sparse",)),
         ("matcher", ScaleVariantMatcher, ("dense",)),
         ("matcher", CellMatcher, ("dense",)),
+        ("matcher", BestMatches, ("dense",)),
         ("multiview", RelativeGroup, ("variance",)),
         ("retrieval", ShortDescriptor, ()),
         ("mask", CautiousMask, ()),

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from mpsfm_core import (
+    DenseMatches,
     DepthPrior,
     Features,
     NormalPrior,
@@ -30,7 +31,7 @@ from tests.support.reference_providers import (
     depth_prior,
     normal_prior,
 )
-from tests.support.sparse_providers import CellMatcher, NearestMatcher, SiftDetector
+from tests.support.sparse_providers import CellMatcher, DenseSift, NearestMatcher, SiftDetector
 
 PAINTED = ContractSetup(truth_source="painted")
 
@@ -271,6 +272,28 @@ class Coordinates8(NearestMatcher):
         return PairMatches(SparseMatches(found.indices[inside], found.scores[inside]))
 
 
+class FullBuffer(DenseSift):
+    """Fault: returns only the first matches of more than fit into a buffer, from top to bottom."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        dense = super().match(a, b, fa, fb).dense
+        assert dense is not None
+        first = np.argsort(dense.points_a[:, 1], kind="stable")[:500]
+        points = dense.points_a[first], dense.points_b[first]
+        return PairMatches(dense=DenseMatches(*points, dense.scores[first], dense.std_px))
+
+
+class LeftOfLarge(DenseSift):
+    """Fault: drops matches beyond the first 640 columns."""
+
+    def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
+        dense = super().match(a, b, fa, fb).dense
+        assert dense is not None
+        left = dense.points_a[:, 0] < 640
+        points = dense.points_a[left], dense.points_b[left]
+        return PairMatches(dense=DenseMatches(*points, dense.scores[left], dense.std_px))
+
+
 class TinyStd(CellMatcher):
     """Fault: rounds matches to cells of 4 pixels, but declares a std_px of 0.1 pixels."""
 
@@ -283,6 +306,8 @@ class TinyStd(CellMatcher):
         (DummyMatch, "matcher-feature-order", "wrong and have high scores", "sparse"),
         (SortedScores, "matcher-feature-order", "scores of the same matches", "sparse"),
         (Coordinates8, "matcher-large-view", "4032 x 3024", "sparse"),
+        (FullBuffer, "matcher-large-view", "in the outer quarter of one side", "dense"),
+        (LeftOfLarge, "matcher-large-view", "in the outer quarter of one side", "dense"),
         (TinyStd, "matcher-std", "times the declared std_px", "dense"),
     ],
 )

@@ -172,7 +172,7 @@ class SizeInModule(PaintedDepth):
 
     def predict(self, view: View) -> DepthPrior:
         SizeInModule.size = view.image.shape[:2]
-        time.sleep(0.005)  # the network runs
+        time.sleep(0.02)  # the network runs
         depth = read_depth(view.image)
         return depth_prior(depth[: self.size[0], : self.size[1]])
 
