@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.stats import rankdata
 
-from mpsfm_core.data import Bool, Float32, Float64, PinholeCamera
+from mpsfm_core.data import Bool, DenseMatches, Float32, Float64, PinholeCamera
 from mpsfm_core.data.decisions import DoubtReason, Reason
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.match_graph import MatchGraph
@@ -29,6 +29,10 @@ _NUM_NEIGHBORS = 3
 """Number of nearest matches whose scores are compared with the score of a match."""
 _SIGNIFICANT_STDS = 3.0
 """Number of standard deviations from 0 above which a correlation is no coincidence."""
+_MAX_COMPARED = 5000
+"""Maximum number of matches of a pair that are compared with their nearest matches."""
+_MAX_DENSE_PAIRS = 20
+"""Maximum number of pairs of which all dense matches are read from the cache."""
 _NUM_BLOCKS = 4
 """Number of rows and columns of blocks in an image whose outliers are not independent. AdaLAM gives
 all matches of a neighborhood similar scores."""
@@ -47,6 +51,8 @@ class ScoredMatches:
     """(m,) scores of the matches."""
     inlier: Bool
     """(m,) mask of the inliers."""
+    dense: DenseMatches | None = None
+    """All dense matches of the pair, from which the matches were selected by their scores."""
 
 
 def find_wrong_providers(context: ExtractionContext, graph: MatchGraph) -> tuple[Reason, ...]:
@@ -61,30 +67,40 @@ def find_wrong_providers(context: ExtractionContext, graph: MatchGraph) -> tuple
         keypoints, cameras = graph.assembled.keypoints, [im.pinhole for im in context.images]
         doubts.append(find_partial_coverage(keypoints, cameras, config.features.use))
     matchers = [m for m in (config.matcher, config.dense_matcher) if m is not None]
-    for number, matcher in enumerate(matchers):
-        part = number if len(matchers) > 1 else None
-        doubts.append(find_meaningless_scores(list(_scored_matches(graph, part)), matcher.use))
+    for matcher in matchers:
+        is_dense, is_only = matcher is config.dense_matcher, len(matchers) == 1
+        pairs = list(_scored_matches(graph, is_dense=is_dense, is_only=is_only))
+        doubts.append(find_meaningless_scores(pairs, matcher.use))
     return tuple(doubt for doubt in doubts if doubt is not None)
 
 
-def _scored_matches(graph: MatchGraph, part: int | None) -> Iterator[ScoredMatches]:
-    """Yield the matches of each verified pair.
+def _scored_matches(graph: MatchGraph, *, is_dense: bool, is_only: bool) -> Iterator[ScoredMatches]:
+    """Yield the matches of one matcher in each verified pair.
 
     Args:
         graph: Matches and two-view geometries.
-        part: 0 for matches of keypoints only, 1 for dense matches only, None for both.
+        is_dense: True for a dense matcher.
+        is_only: True if the run has no other matcher.
     """
-    for matches, geometry in zip(graph.candidates, graph.geometries, strict=True):
-        if geometry.dropped:
-            continue
+    outcomes = zip(graph.candidates, graph.geometries, strict=True)
+    verified = [outcome for outcome in outcomes if not outcome[1].dropped]
+    reads_dense = is_dense and graph.matcher is not None and graph.matcher.keeps_results
+    for number, (matches, geometry) in enumerate(verified):
         keypoints = graph.assembled.keypoints[matches.pair[0]][matches.sparse.indices[:, 0]]
         xy = np.concatenate([keypoints, matches.points.xy_a])
         scores = np.concatenate([matches.sparse.scores, matches.points.scores])
         inlier = np.zeros(len(scores), np.bool_)
         inlier[geometry.inliers] = True
         middle = len(matches.sparse)
-        rows = slice(None) if part is None else (slice(middle), slice(middle, None))[part]
-        yield ScoredMatches(xy[rows], scores[rows], inlier[rows])
+        rows = slice(None)
+        if not is_only:
+            rows = slice(middle, None) if is_dense else slice(middle)
+        dense = None
+        if reads_dense and number < _MAX_DENSE_PAIRS:
+            assert graph.matcher is not None
+            results = graph.matcher.results(matches.pair)
+            dense = next((r.dense for r in results if r.dense is not None), None)
+        yield ScoredMatches(xy[rows], scores[rows], inlier[rows], dense)
 
 
 def find_partial_coverage(
@@ -132,8 +148,8 @@ def find_meaningless_scores(pairs: Sequence[ScoredMatches], provider: str) -> Re
     * between the scores of neighboring matches. Texture, blur and perspective are similar at
       neighboring points, so meaningful scores are similar. This correlation needs no outliers.
 
-    Scores are meaningless if both correlations are 0 within the limits of chance. Equal scores of
-    all matches cause no doubt.
+    Scores are meaningless if both correlations are 0 within the limits of chance. Only the second
+    one counts for dense matches. Equal scores of all matches cause no doubt.
 
     Args:
         pairs: Matches of each verified pair.
@@ -144,7 +160,9 @@ def find_meaningless_scores(pairs: Sequence[ScoredMatches], provider: str) -> Re
     """
     compared = [pair for pair in pairs if len(pair.scores) > 1 and np.ptp(pair.scores) > 0]
     with_inlier, with_neighbor = _correlate_with_inlier(compared), _correlate_neighbors(compared)
-    is_related = max(with_inlier.strength, with_neighbor.strength) > 1
+    # The best of several random scores of a dense matcher are also higher for inliers.
+    is_selected = any(pair.dense is not None for pair in compared)
+    is_related = with_neighbor.strength > 1 or (with_inlier.strength > 1 and not is_selected)
     is_undecided = sum(len(pair.scores) for pair in compared) < _MIN_MATCHES
     if with_inlier.strength >= -1 and (is_related or is_undecided):
         return None
@@ -198,16 +216,21 @@ def _correlate_neighbors(pairs: Sequence[ScoredMatches]) -> _Correlation:
     """Correlate the score ranks of each match and of its nearest matches in the first image.
 
     The number of matches is the weight of a pair. For random scores, only the products of matches
-    that are among the nearest of each other are equal, which gives the variance.
+    that are among the nearest of each other are equal, which gives the variance. All dense matches
+    are compared, because the best of several random scores is higher where matches are dense.
     """
     total, variance, num_products = 0.0, 0, 0
     for pair in pairs:
-        count = len(pair.scores)
-        nearest = cKDTree(pair.xy).query(pair.xy, k=min(_NUM_NEIGHBORS + 1, count))[1]
-        rows, columns = np.repeat(np.arange(count), nearest.shape[1]), nearest.ravel()
+        xy, scores = pair.xy, pair.scores
+        if pair.dense is not None:
+            xy, scores = pair.dense.points_a, pair.dense.scores
+        count = len(scores)
+        some = np.unique(np.linspace(0, count - 1, _MAX_COMPARED).astype(np.int64))
+        nearest = cKDTree(xy).query(xy[some], k=min(_NUM_NEIGHBORS + 1, count))[1]
+        rows, columns = np.repeat(some, nearest.shape[1]), nearest.ravel()
         # The nearest match of most matches is the match itself.
         rows, columns = rows[rows != columns], columns[rows != columns]
-        ranks = rankdata(pair.scores)
+        ranks = rankdata(scores)
         ranks = (ranks - ranks.mean()) / ranks.std()
         # Drawing without replacement gives ranks of two matches a correlation of -1 / (count - 1).
         total += float(ranks[rows] @ ranks[columns]) + len(rows) / (count - 1)

@@ -149,9 +149,9 @@ def extend_matches(
             unconstrained=unconstrained,
             verified=first.problem.pairs,
         )
+        doubts = (*first.doubts, *find_wrong_providers(context, graph))
     problem = merge_matches(first.problem, graph.assembled)
     second = describe(context, problem, graph)
-    doubts = (*first.doubts, *find_wrong_providers(context, graph))
     return Extraction(problem, merge_reports(first.report, second), doubts)
 
 

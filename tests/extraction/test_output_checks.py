@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.data import PinholeCamera
+from mpsfm_core.data import DenseMatches, PinholeCamera
 from mpsfm_core.extraction.output_checks import (
     ScoredMatches,
     find_meaningless_scores,
@@ -124,3 +124,20 @@ def test_find_meaningless_scores_of_permuted_scores_names_matcher(seed: int) -> 
 def test_find_meaningless_scores_compares_matches_at_equal_positions() -> None:
     pairs = [replace(pair, xy=np.zeros_like(pair.xy)) for pair in scored_pairs()]
     assert find_meaningless_scores(pairs, "my-matcher") is not None
+
+
+def test_find_meaningless_scores_of_selected_dense_matches_names_matcher() -> None:
+    """Selecting the best of several random scores gives neighboring scores a correlation."""
+    rng = np.random.default_rng(0)
+    pairs = []
+    for _ in range(10):
+        centers = rng.uniform(size=(120, 2)) * CAMERA.size
+        # In the left half of the image, each selected match is the best of 20 instead of one.
+        counts = np.where(centers[:, 0] < CAMERA.width / 2, 20, 1)
+        xy = np.repeat(centers, counts, axis=0) + rng.normal(size=(counts.sum(), 2))
+        scores = rng.random(len(xy), np.float32)
+        best = np.maximum.reduceat(scores, np.cumsum(counts) - counts)
+        dense = DenseMatches(xy, xy, scores)
+        pairs.append(ScoredMatches(centers, best, np.ones(120, bool), dense))
+    assert find_meaningless_scores(pairs, "my-matcher") is not None
+    assert find_meaningless_scores([replace(p, dense=None) for p in pairs], "my-matcher") is None

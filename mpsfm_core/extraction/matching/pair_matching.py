@@ -112,6 +112,11 @@ class PairMatcher:
         """True if all results of the matchers are in the cache."""
         return all(provider.is_cached for provider in self._providers)
 
+    @property
+    def keeps_results(self) -> bool:
+        """True if all results of the matchers are in the cache of this run or of all runs."""
+        return not any(provider.can("uncached") for provider in self._providers)
+
     def match_pair(self, pair: Pair, located: LocatedFeatures) -> CandidateMatches:
         """Match an image pair with the features of all images, whose descriptors may be empty."""
         a, b = located[pair[0]], located[pair[1]]
