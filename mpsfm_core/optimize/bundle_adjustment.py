@@ -208,14 +208,14 @@ class TrialStep(NamedTuple):
     predicted: float
     """Decrease of the cost that the quadratic model predicts."""
     slope: float
-    """Directional derivative of the cost along the unrelaxed camera step, with optimal points and
-    opposite sign. The same value is the curvature of the quadratic model along the step."""
+    """First-order decrease of the cost along the unrelaxed camera step, if the points stay optimal.
+    The curvature of the quadratic model along this step has the same value."""
 
     def choose_relaxation(self, relaxation: float) -> float:
-        """Return the relaxation of the next step, which would have minimized the cost of this step.
+        """Return the relaxation with which this step would have minimized the cost.
 
-        The curvature of the cost along the camera step follows from the difference of the actual
-        and the predicted decrease.
+        The next step uses this relaxation. The curvature of the cost along the camera step follows
+        from the difference of the actual and the predicted decrease.
 
         Args:
             relaxation: Relaxation of this step.

@@ -7,7 +7,12 @@ import pytest
 
 from mpsfm_core.data import Float64
 from mpsfm_core.optimize import bundle_kernels as kernels
-from mpsfm_core.optimize.bundle_adjustment import BundleProblem, SchurComplementSolver
+from mpsfm_core.optimize.bundle_adjustment import (
+    MAX_RELAXATION,
+    BundleProblem,
+    SchurComplementSolver,
+    TrialStep,
+)
 from mpsfm_core.optimize.bundle_problem import PreparedBundle, prepare_bundle, range_executor
 from mpsfm_core.optimize.options import Loss
 from tests.optimize.bundle_reference import (
@@ -243,6 +248,18 @@ def test_step_solves_the_damped_normal_equations(
     linear = residuals(p, p.state) + jacobian @ expected
     decrease = cost - 0.5 * linear @ linear
     assert step.predicted == pytest.approx(decrease, rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("curvature_ratio", "expected"), [(1.2, 1.0), (1.0, 1.0), (0.8, 1.25), (0.3, MAX_RELAXATION)]
+)
+def test_relaxation_minimizes_a_quadratic_cost(curvature_ratio: float, expected: float) -> None:
+    """If the cost is less curved than its model, the next camera step is longer."""
+    slope, relaxation = 3.0, 1.5
+    predicted = relaxation * slope - relaxation**2 / 2 * slope
+    decrease = relaxation * slope - relaxation**2 / 2 * curvature_ratio * slope
+    step = TrialStep(1.0, decrease, predicted, slope)
+    assert step.choose_relaxation(relaxation) == pytest.approx(expected)
 
 
 def test_rotation_near_zero_and_beyond_half_a_turn() -> None:
