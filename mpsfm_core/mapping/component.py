@@ -30,7 +30,6 @@ from mpsfm_core.mapping.registration.pose_estimation import AbsolutePoseEstimato
 from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks, triangulate_image
-from mpsfm_core.optimize.options import ROUGH_TOLERANCE
 
 _log = logging.getLogger(__name__)
 
@@ -191,7 +190,7 @@ class Component:
         for image in images[len(poses.images) :]:
             self.refiner.estimate_scale(image, [])
         loss_factor = options.refinement.first_reprojection_scale
-        self.refiner.adjust(images, reprojection_scale=loss_factor, tolerance=ROUGH_TOLERANCE)
+        self.refiner.adjust(images, reprojection_scale=loss_factor)
         filter_points(scene, options.triangulation)
 
     def _first_images(self) -> list[int]:

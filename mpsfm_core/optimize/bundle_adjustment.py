@@ -47,8 +47,6 @@ INITIAL_DAMPING = 1e-4
 """Levenberg-Marquardt damping of the first step. [Ceres 1 / initial_trust_region_radius]"""
 MIN_DAMPING = 1e-10
 """Minimum Levenberg-Marquardt damping, which keeps unobserved parameters constant. [ours]"""
-MIN_DAMPING_FACTOR = 0.1
-"""Smallest factor on the damping after an accepted step, 1 / 3 in Ceres. [ours]"""
 MAX_DAMPING = 1e16
 """Levenberg-Marquardt damping above which bundle adjustment stops. [ours]"""
 MAX_FOCAL_STEP = 1.0
@@ -161,7 +159,7 @@ def _blas() -> ThreadpoolController:
 
 
 def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> BundleResult:
-    """Minimize the cost by Levenberg-Marquardt with Nielsen's damping schedule (Ceres)."""
+    """Minimize the cost by Levenberg-Marquardt with Nielsen's damping schedule, as Ceres does."""
     state, trial = p.state, kernels.BundleParameters(*(np.empty_like(array) for array in p.state))
     normal = SchurComplementSolver(p, options, run)
     damping, growth, relaxation = INITIAL_DAMPING, 2.0, 1.0
@@ -176,10 +174,10 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
             state, trial, cost = trial, state, step.cost
             normal.accept_step(state)
             gain = min(step.decrease / step.predicted, 1.0) if step.predicted > 0 else 1.0
-            damping *= max(MIN_DAMPING_FACTOR, 1 - (2 * gain - 1) ** 3)
-            damping = max(damping, MIN_DAMPING)
+            damping = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), MIN_DAMPING)
             growth = 2.0
-            relaxation = step.choose_relaxation(relaxation)
+            if not normal.dense:  # longer steps could lead a small problem to another minimum
+                relaxation = step.choose_relaxation(relaxation)
             converged = bool(step.decrease <= min_decrease)
         else:
             damping *= growth

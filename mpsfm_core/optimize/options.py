@@ -20,11 +20,6 @@ class Loss(IntEnum):
     TRUNCATED = 3
 
 
-ROUGH_TOLERANCE = 1e-4
-"""Relative decrease of the cost at which a bundle adjustment stops that another one follows, with
-other tracks or losses. [tuned: benchmarks.walks]"""
-
-
 class BundleOptions(Options):
     """Options of bundle adjustment. All loss scales are in standard deviations of the residual."""
 

@@ -43,7 +43,6 @@ from mpsfm_core.optimize.covariance import (
 )
 from mpsfm_core.optimize.depth_integration import Anchors, DepthIntegrator, RefinedDepth
 from mpsfm_core.optimize.options import (
-    ROUGH_TOLERANCE,
     SOFT_L1_OPTIONS,
     BundleOptions,
     IntegrationOptions,
@@ -70,6 +69,9 @@ MAX_GLOBAL_REFINEMENTS = 5
 MAX_GLOBAL_CHANGE = 0.0005
 """Share of changed observations below which global refinement stops.
 [COLMAP ba_global_max_refinement_change]"""
+ROUGH_TOLERANCE = 1e-4
+"""Relative decrease of the cost at which the bundle adjustment of a possible loop stops. [tuned:
+benchmarks.walks]"""
 MAX_DEPTH_RATIO = 1.5
 """Largest ratio between the depth of a point and the depth map for which bundle adjustment uses the
 depth. [reference scale_filter]"""
@@ -533,7 +535,7 @@ class Refiner:
         lift_low_parallax(self.scene, self.triangulation)
         refines_focals = self.can_refine_focals()
         if refines_focals:
-            self.adjust(images, focal=True, tolerance=ROUGH_TOLERANCE)
+            self.adjust(images, focal=True)
         for _ in range(MAX_GLOBAL_REFINEMENTS):
             self.estimate_shared_scales()
             self._measure_keypoint_noise()

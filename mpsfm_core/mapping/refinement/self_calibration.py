@@ -37,7 +37,7 @@ from mpsfm_core.optimize.bundle_adjustment import (
     adjust_bundle,
     start_at,
 )
-from mpsfm_core.optimize.options import ROUGH_TOLERANCE, BundleOptions
+from mpsfm_core.optimize.options import BundleOptions
 
 MAX_STD_RATIO = 0.5
 """Ratio of posterior and prior standard deviation above which an intrinsic parameter keeps its
@@ -119,8 +119,7 @@ def calibrate_cameras(
             scene, problem, options, representatives, free, MIN_DEVIATION_FEW_IMAGES
         )
     weakened = _weaken_short_tracks(problem)
-    rough = options.model_copy(update={"function_tolerance": ROUGH_TOLERANCE})
-    result = _estimate_intrinsics(scene, weakened, rough, representatives, free, 0.0)
+    result = _estimate_intrinsics(scene, weakened, options, representatives, free, 0.0)
     outcomes = scene.estimated_intrinsics.outcomes[representatives]
     is_undetermined = (free & (outcomes != CalibrationOutcome.REFINED)).any(axis=1)
     return _estimate_intrinsics(
