@@ -12,7 +12,8 @@ The optimizer is Levenberg-Marquardt (Triggs et al., "Bundle Adjustment -- A Mod
 2000). Each step eliminates the 3D points with the Schur complement, solves the reduced camera
 system, and recovers the points by back-substitution. After each joint step, the points are
 optimized individually with fixed cameras. Robust losses are replaced by their IRLS majorizers,
-whose minimum is too near, so the steps of the cameras are lengthened (over-relaxation).
+whose minimum is too near. With many poses, the steps of the cameras are lengthened
+(over-relaxation). With few poses, longer steps lead to wrong local minima more often.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ MIN_GAIN = 1e-3
 [Ceres min_relative_decrease]"""
 MAX_RELAXATION = 1.7
 """Largest factor on the camera step of the normal equations. Factors below 2 decrease the cost of a
-quadratic majorizer. [tuned: benchmarks.walks]"""
+quadratic majorizer. [tuned: benchmarks.walks, benchmarks.real_photos]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +177,7 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
             gain = min(step.decrease / step.predicted, 1.0) if step.predicted > 0 else 1.0
             damping = max(damping * max(1 / 3, 1 - (2 * gain - 1) ** 3), MIN_DAMPING)
             growth = 2.0
-            if not normal.dense:  # longer steps could lead a small problem to another minimum
+            if not normal.dense:
                 relaxation = step.choose_relaxation(relaxation)
             converged = bool(step.decrease <= min_decrease)
         else:
