@@ -170,14 +170,14 @@ def find_meaningless_scores(pairs: Sequence[ScoredMatches], provider: str) -> Re
 
 
 class _Correlation(NamedTuple):
-    """Mean correlation of all pairs, and its standard deviation for meaningless scores."""
+    """Correlation averaged over all pairs, and the std that it has for random scores."""
 
     value: float
     std: float
 
     @property
     def strength(self) -> float:
-        """Ratio of the correlation and the limit above which the correlation is no coincidence."""
+        """Correlation divided by the largest correlation of random scores."""
         return self.value / max(_MIN_CORRELATION, _SIGNIFICANT_STDS * self.std)
 
 

@@ -87,7 +87,7 @@ class FineDepth(NearestDepth):
 
 
 class EnlargedDepth(NearestDepth):
-    """Depth map of 1.5 times the size of the view, in which some pixels are repeated."""
+    """Legal provider that enlarges its map 1.5 times by repeating the nearest pixels."""
 
     def size(self, view: View) -> tuple[int, int]:
         return 3 * view.camera.width // 2 + 1, 3 * view.camera.height // 2 + 1

@@ -284,7 +284,7 @@ class FullBuffer(DenseSift):
 
 
 class LeftOfLarge(DenseSift):
-    """Fault: drops matches beyond the first 640 columns."""
+    """Fault: returns no matches right of column 640."""
 
     def match(self, a: View, b: View, fa: Any = None, fb: Any = None) -> PairMatches:
         dense = super().match(a, b, fa, fb).dense

@@ -114,7 +114,7 @@ class PairMatcher:
 
     @property
     def keeps_results(self) -> bool:
-        """True if all results of the matchers are in the cache of this run or of all runs."""
+        """True if the results of all matchers are cached, at least until the run ends."""
         return not any(provider.can("uncached") for provider in self._providers)
 
     def match_pair(self, pair: Pair, located: LocatedFeatures) -> CandidateMatches:

@@ -55,7 +55,7 @@ class PriorPredictor:
 
     @property
     def follows_focal(self) -> bool:
-        """True if predicted metric depth is proportional to the focal length of the view."""
+        """True if the network uses the focal length, to which its metric depth is proportional."""
         return self._raw.depth.can("intrinsics-aware")
 
     def run(self, originals: Mapping[int, int]) -> list[tuple[DepthPrior, NormalPrior]]:

@@ -113,13 +113,13 @@ def estimate_absolute_pose(
 
 
 def sample_focal_lengths(camera: PinholeCamera) -> Float64:
-    """Sample focal lengths in ``FOCAL_RANGE`` on a logarithmic grid.
+    """Return the focal lengths to try, whose ratios are constant and at most ``FOCAL_STEP``.
 
     Args:
         camera: Camera, of which only the image size matters.
 
     Returns:
-        (m,) ascending focal lengths ``fx`` in pixels.
+        (m,) ascending focal lengths ``fx`` in pixels, within ``FOCAL_RANGE``.
     """
     min_ratio, max_ratio = FOCAL_RANGE
     num_steps = int(np.ceil(np.log(max_ratio / min_ratio) / np.log(FOCAL_STEP)))
