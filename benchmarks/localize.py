@@ -247,14 +247,14 @@ def make_table(records: Sequence[Record]) -> str:
         )
         for known in (True, False):
             pair = [[row for row in part if row["known"] == known] for part in (ours, theirs)]
-            cells += [*map(_recall, pair), ", ".join(map(_median, pair))]
+            cells += [*map(format_recall, pair), ", ".join(map(format_median, pair))]
         cells += [f"{_count_false(ours)}, {_count_false(theirs)}"]
         cells += [f"{np.mean([row['seconds'] for row in ours]):.1f}"]
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
 
-def _recall(records: Sequence[Record]) -> str:
+def format_recall(records: Sequence[Record]) -> str:
     """Return the percentages of the queries within each threshold."""
     queries = [record for record in records if not record["is_other"]]
     shares = [
@@ -264,7 +264,7 @@ def _recall(records: Sequence[Record]) -> str:
     return " / ".join(f"{100 * share:.0f}" for share in shares)
 
 
-def _median(records: Sequence[Record]) -> str:
+def format_median(records: Sequence[Record]) -> str:
     """Return the median position error in centimeters of the localized queries."""
     found = [row["position"] for row in records if row["found"] and not row["is_other"]]
     return f"{100 * np.median(found):.1f}" if found else "none"

@@ -23,7 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +34,7 @@ import pycolmap
 from benchmarks._scenes import MPSFM, shared_folder
 from mpsfm_core.data import (
     DepthPrior,
+    Float64,
     MappingImage,
     MappingProblem,
     NormalPrior,
@@ -60,8 +61,7 @@ from mpsfm_core.results.summary import read_summary
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "plugins" / "mpsfm-compact"))
 
-SIZE = 480, 360
-FOCAL_PX = 380.0
+CAMERA = PinholeCamera(480, 360, 380.0, 380.0, 240.0, 180.0)
 FPS = 20.0
 SPEED = 0.8
 """Walking speed in meters per second."""
@@ -157,35 +157,41 @@ def make_path(rng: np.random.Generator, rounds: float = ROUNDS, fps: float = FPS
     shake *= np.array([0.02, 0.02, 0.02, 0.012, 0.012, 0.012]) / shake.std(axis=0)
     poses = []
     for place, angle, (dx, dy, dz, pitch, roll, extra) in zip(xy, yaw, shake, strict=True):
-        angle += extra
-        tilt = -0.12 + pitch
-        forward = np.array(
-            [np.cos(angle) * np.cos(tilt), np.sin(angle) * np.cos(tilt), np.sin(tilt)]
-        )
-        right = np.cross(forward, [0, 0, 1.0])
-        right /= np.linalg.norm(right)
-        rotation = np.stack([right, np.cross(forward, right), forward])
-        cosine, sine = np.cos(roll), np.sin(roll)
-        rotation = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]]) @ rotation
         center = np.array([place[0] + dx, place[1] + dy, 1.5 + dz])
-        poses.append((rotation, -rotation @ center))
+        poses.append(camera_pose(center, angle + extra, -0.12 + pitch, roll))
     return poses
 
 
+def camera_pose(center: Float64, yaw: float, tilt: float, roll: float = 0.0) -> Pose:
+    """Return ``cam_from_world`` of a camera, from its heading and its tilt upward in radians."""
+    forward = np.array([np.cos(yaw) * np.cos(tilt), np.sin(yaw) * np.cos(tilt), np.sin(tilt)])
+    right = np.cross(forward, [0, 0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    cosine, sine = np.cos(roll), np.sin(roll)
+    rotation = np.array([[cosine, sine, 0], [-sine, cosine, 0], [0, 0, 1]]) @ rotation
+    return rotation, -rotation @ center
+
+
 def draw_view(
-    world: tuple[Any, Any, Any], pose: Pose, factor: int = 1
+    world: tuple[Any, Any, Any], pose: Pose, factor: int = 1, camera: PinholeCamera = CAMERA
 ) -> tuple[Any, Any, Any, Any]:
     """Render light, depth, normals and kind of surface of a view, downscaled by a factor."""
     from training.synthetic.raycast import draw
 
-    width, height = SIZE[0] // factor, SIZE[1] // factor
+    width, height = camera.width // factor, camera.height // factor
     light, depth = np.zeros((height, width, 3)), np.zeros((height, width))
     normals, kind = np.zeros((height, width, 3)), np.zeros((height, width), np.uint8)
     to_world = np.ascontiguousarray(pose[0].T)
     center = -to_world @ pose[1]
-    focal = FOCAL_PX / factor
+    focal = camera.fx / factor
     draw(*world, center, to_world, focal, width, height, light, depth, normals, kind)
     return light, depth, normals, kind
+
+
+def develop(light: Float64) -> Float64:
+    """Convert linear light to RGB values from 0 to 255."""
+    return np.clip(light, 0, 1) ** (1 / 2.2) * 255
 
 
 def render_frames(
@@ -196,7 +202,7 @@ def render_frames(
     for number, pose in enumerate(poses):
         light = draw_view(world, pose)[0]
         gain += 0.1 * (0.3 / (light.mean() + 0.02) - gain) if number else 0.3 / light.mean() - gain
-        frame = np.clip(light * gain, 0, 1) ** (1 / 2.2) * 255
+        frame = develop(light * gain)
         if rng.random() < 0.1:
             frame = cv2.blur(frame, (9, 1) if rng.random() < 0.7 else (1, 7))
         frame += rng.normal(0, 2.0, frame.shape)
@@ -212,6 +218,22 @@ def make_walk(
     return world, make_path(rng, OPEN_ROUNDS if look_alike else rounds, fps), rng
 
 
+def write_video(video: Path, frames: Iterable[UInt8], fps: float) -> None:
+    """Write BGR frames to a video file, unless the file exists."""
+    if video.is_file():
+        return
+    video.parent.mkdir(parents=True, exist_ok=True)
+    part, writer = video.with_suffix(".part.mp4"), None
+    for frame in frames:
+        if writer is None:
+            size = frame.shape[1], frame.shape[0]
+            writer = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"mp4v"), fps, size)
+        writer.write(np.ascontiguousarray(frame))
+    assert writer is not None
+    writer.release()
+    part.rename(video)
+
+
 def write_walk(
     folder: Path,
     seed: int,
@@ -223,14 +245,7 @@ def write_walk(
     """Write the video of a walk, unless the folder has the video; return video and true poses."""
     world, poses, rng = make_walk(seed, fps, rounds, look_alike=look_alike)
     video = folder / f"{'look_alike' if look_alike else 'walk'}{seed}.mp4"
-    if not video.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        part = video.with_suffix(".part.mp4")
-        writer = cv2.VideoWriter(str(part), cv2.VideoWriter_fourcc(*"mp4v"), fps, SIZE)
-        for frame in render_frames(world, poses, rng):
-            writer.write(np.ascontiguousarray(frame))
-        writer.release()
-        part.rename(video)
+    write_video(video, render_frames(world, poses, rng), fps)
     return video, poses
 
 
@@ -242,21 +257,12 @@ def write_room(folder: Path) -> tuple[Path, dict[int, Pose]]:
     """
     scene = shared_folder() / "data" / "hololens_room"
     names = sorted(path.name for path in (scene / "images").iterdir())
-    video, size = folder / "hololens_room.mp4", None
+    video = folder / "hololens_room.mp4"
     poses = reconstruction_poses(pycolmap.Reconstruction(str(scene / "gt")))
     by_stem = {Path(name).stem: pose for name, pose in poses.items()}
-    if not video.is_file():
-        folder.mkdir(parents=True, exist_ok=True)
-        writer = None
-        for name in names:
-            image = cv2.imread(str(scene / "images" / name))
-            assert image is not None
-            if writer is None:
-                size = image.shape[1], image.shape[0]
-                writer = cv2.VideoWriter(str(video), cv2.VideoWriter_fourcc(*"mp4v"), 4.0, size)
-            writer.write(image)
-        assert writer is not None
-        writer.release()
+    write_video(
+        video, (np.asarray(cv2.imread(str(scene / "images" / name))) for name in names), 4.0
+    )
     rows = {
         n: by_stem[Path(name).stem] for n, name in enumerate(names) if Path(name).stem in by_stem
     }
@@ -274,7 +280,6 @@ def localize_between_true_keyframes(
     world, poses, _ = make_walk(seed, fps, rounds)
     folder, rng = video.with_suffix("") / "frames", np.random.default_rng(seed)
     selection = read_selection(folder)
-    camera = PinholeCamera(*SIZE, FOCAL_PX, FOCAL_PX, SIZE[0] / 2, SIZE[1] / 2)
     images, problem_images = [], []
     for row, keyframe in enumerate(selection.keyframes):
         rotation, translation = poses[keyframe.number]
@@ -283,15 +288,15 @@ def localize_between_true_keyframes(
         depth = (depth * np.exp(0.02 * noise)).astype(np.float32)
         prior = DepthPrior(depth, (0.025 * depth) ** 2, kind == 1)
         flat = NormalPrior.from_arrays(normals.astype(np.float32), np.ones_like(depth))
-        problem_images.append(MappingImage(keyframe.name, camera, np.zeros((0, 2)), prior, flat))
+        problem_images.append(MappingImage(keyframe.name, CAMERA, np.zeros((0, 2)), prior, flat))
         none = np.zeros(0, np.int64)
         images.append(
-            RegisteredImage(row, keyframe.name, camera, rotation, translation, none, prior, 1.0)
+            RegisteredImage(row, keyframe.name, CAMERA, rotation, translation, none, prior, 1.0)
         )
     part = Reconstruction(tuple(images), np.zeros((0, 3)), np.zeros(0))
     names = [keyframe.name for keyframe in selection.keyframes]
     problem = MappingProblem(tuple(problem_images), ())
-    originals = OriginalImages(load_images(folder, camera, names=names), problem)
+    originals = OriginalImages(load_images(folder, CAMERA, names=names), problem)
     start = time.process_time()
     frames = localize_frames(video, selection, [part], originals)
     seconds = (time.process_time() - start) / len(frames)

@@ -170,12 +170,12 @@ class Localizer:
         return self.localize_together([image])[0]
 
     def localize_together(self, images: Sequence[int]) -> list[LocalizedImage | Reason]:
-        """Estimate the poses of images that match each other, such as images of a sequence.
+        """Estimate the poses of images that share a guessed camera, or that match each other.
 
-        An image that matches no image of the model can be registered by its matches with other
-        images. Poses that agree with the depth of the model come first; images without such a pose
-        are registered without the depth check, and :attr:`LocalizedImage.contradiction` tells what
-        the check found.
+        Images that share a guessed camera get one refined focal length. An image that matches no
+        image of the model can be registered by its matches with other images. Poses that agree with
+        the depth of the model come first; images without such a pose are registered without the
+        depth check, and :attr:`LocalizedImage.contradiction` tells what the check found.
 
         Args:
             images: Indices of the images in the mapping problem.

@@ -125,7 +125,8 @@ def localize(
     """Estimate the poses of photos in an existing model, which stays unchanged.
 
     Each photo is matched with similar images of the model. Its pose results from points that are
-    triangulated from the images of the model, or lifted from the depth of a single image.
+    triangulated from the images of the model, or lifted from the depth of a single image. Photos of
+    one camera with unknown focal length share the refined focal length.
 
     Args:
         model: COLMAP model with at least two images, or result folder.
@@ -153,7 +154,7 @@ def localize(
         database: File with the triangulated points and depth of the model, by default
             ``localization.npz`` in the folder of the model. A missing or outdated file is written.
         sequence: If true, photos with consecutive numbers in their names are matched, too, and
-            registered together. By default, each photo is localized independently.
+            registered together. By default, photos are not matched with each other.
         extend: If true, add the localized photos to a copy of the model.
         overrides: Settings such as ``"runtime.workers=2"``; not allowed with a loaded
             configuration.
@@ -324,10 +325,18 @@ class _Localization:
                 part = replace(part, images=tuple(images))
                 self._sequence = part, OriginalImages(queries, problem)
             else:
-                outcomes = []
-                for done, row in enumerate(rows):
-                    outcomes.append(localizer.localize(row))
-                    self._stages.stage_progress("localization", done + 1, len(rows))
+                by_row: dict[int, LocalizedImage | Reason] = {}
+                for group in _group_by_guessed_camera(queries):
+                    together = [rows[row] for row in group]
+                    by_row |= zip(group, localizer.localize_together(together), strict=True)
+                    self._stages.stage_progress("localization", len(by_row), len(rows))
+                outcomes = [by_row[row] for row in range(len(rows))]
+        determined = {
+            query.camera.camera_id
+            for query, outcome in zip(queries, outcomes, strict=True)
+            if isinstance(outcome, LocalizedImage)
+            and len(outcome.matches.keys() & set(self._references.names)) > 1
+        }
         for query, outcome in zip(queries, outcomes, strict=True):
             name = query.name
             if isinstance(outcome, Reason):
@@ -335,7 +344,8 @@ class _Localization:
                 yield name, outcome
             else:
                 self._stages.image_registered(name, num_references + 1, num_references + len(names))
-                yield name, self._convert(query, outcome)
+                focal_known = query.focal_known or query.camera.camera_id in determined
+                yield name, self._convert(query, outcome, focal_known=focal_known)
 
     def _extend_problem(
         self, model: FixedModel, queries: ImageSet, *, sequence: bool
@@ -367,7 +377,9 @@ class _Localization:
         max_distance_px = self._config.extraction.dense_snap_px
         return snap_to_observations(merge_matches(problem, matches), model, max_distance_px)
 
-    def _convert(self, source: SourceImage, image: LocalizedImage) -> LocalizedPhoto:
+    def _convert(
+        self, source: SourceImage, image: LocalizedImage, *, focal_known: bool
+    ) -> LocalizedPhoto:
         """Convert a localized image to camera, keypoints and names of the original images."""
         model_names = dict(zip(self._references.names, self._source.names, strict=True))
         references = {reference.name: reference for reference in self._references}
@@ -392,8 +404,17 @@ class _Localization:
             image.num_inliers,
             image.num_matches,
             matches,
-            find_pose_doubts(matches, contradiction, focal_known=source.focal_known),
+            find_pose_doubts(matches, contradiction, focal_known=focal_known),
         )
+
+
+def _group_by_guessed_camera(queries: ImageSet) -> list[list[int]]:
+    """Group photos that share a camera of unknown focal length; other photos are single groups."""
+    groups: dict[tuple[bool, int], list[int]] = {}
+    for row, query in enumerate(queries):
+        key = (True, row) if query.focal_known else (False, query.camera.camera_id)
+        groups.setdefault(key, []).append(row)
+    return list(groups.values())
 
 
 def _query_image(image: SourceImage, depth: Any, normals: Any) -> MappingImage:

@@ -86,6 +86,20 @@ def test_photo_of_another_place_gets_a_reason(result: mpsfm_core.LocalizationRes
     assert result.reasons["view_5.jpg"].code in ImageReason
 
 
+def test_photos_of_an_unknown_camera_share_the_refined_focal_length(
+    folder: Path, arguments: dict[str, Any], tmp_path: Path
+) -> None:
+    names = (QUERY, "view_4.jpg")
+    for name in names:
+        shutil.copy(SAMPLE / "images" / name, tmp_path)
+    unknown = {key: value for key, value in arguments.items() if key != "intrinsics"}
+    result = mpsfm_core.localize(folder / "model", tmp_path, **unknown)
+    assert set(result.photos) == set(names)
+    (focal_px,) = {photo.camera.params[0] for photo in result.photos.values()}
+    (true_camera,) = pycolmap.Reconstruction(str(SAMPLE / "gt")).cameras.values()
+    assert focal_px == pytest.approx(true_camera.mean_focal_length(), rel=0.03)
+
+
 def test_focal_length_from_one_image_makes_the_pose_doubtful(
     result: mpsfm_core.LocalizationResult,
 ) -> None:
