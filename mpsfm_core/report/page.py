@@ -16,6 +16,7 @@ from urllib.parse import quote
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import Float64
 from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel, IntrinsicParameter
@@ -41,6 +42,8 @@ MAX_EMBEDDED = 700
 ``MAX_PICTURE_BYTES``. Other images are loaded from the result folder when they are shown."""
 MAX_LINE_BYTES = 9_000_000
 """Maximum size in bytes of all match lines in the page; with many pairs each pair has fewer."""
+MAX_VIDEO_FRAMES = 2000
+"""Maximum number of frames of a video whose poses are in the page, about 100 bytes each."""
 _PHOTO_SIDE = (192, 800)
 """Minimum and maximum of the longer side in pixels of an embedded image."""
 _MAP_SIDE = (128, 360)
@@ -134,6 +137,9 @@ def _payload(result: ResultFolder, max_embedded: int) -> dict[str, Any]:
             "dense": _points(dense_points(result.dense_cloud(), refined_maps, MAX_DENSE_POINTS)),
         },
         "frames": _describe_frames(result.model, ids),
+        "trajectories": [
+            _describe_trajectory(name, rows) for name, rows in result.trajectories().items()
+        ],
         "up": _estimate_up(refined_maps),
         "reconstructions": summary["reconstructions"],
         "scales": [describe_scale(summary, i) for i in range(len(summary["reconstructions"]))],
@@ -163,6 +169,23 @@ def _describe_frames(
             name = names[0].split("/", 1)[-1]
             described.append({"name": name, "photos": rows, "pose": _rounded(pose.ravel())})
     return sorted(described, key=lambda entry: str(entry["name"]))
+
+
+def _describe_trajectory(name: str, rows: Float64) -> dict[str, Any]:
+    """Return name, times and poses ``world_from_cam`` (3 x 4, row-major) of the frames of a video.
+
+    Args:
+        name: Name of the video.
+        rows: (n, 8) time stamps, camera centers and quaternions of the frames.
+    """
+    rows = rows[_space_evenly(len(rows), MAX_VIDEO_FRAMES)]
+    rotations = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    poses = np.concatenate([rotations, rows[:, 1:4, None]], axis=2).reshape(-1, 12)
+    return {
+        "name": name,
+        "times": _rounded(rows[:, 0]),
+        "poses": [_rounded(pose) for pose in poses],
+    }
 
 
 class _ImageEntries:

@@ -19,6 +19,7 @@ from mpsfm_core.inputs.models import read_model
 from mpsfm_core.results.depth_maps import load_depth_map
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.summary import read_summary
+from mpsfm_core.results.trajectory import read_trajectory_rows
 from mpsfm_core.results.views import MATCHES
 from mpsfm_core.support.npz import read_npz
 
@@ -105,6 +106,15 @@ class ResultFolder:
         if self.failed:
             return pycolmap.Reconstruction()
         return read_model(self.path / "sparse")
+
+    def trajectories(self) -> dict[str, Float64]:
+        """Read the poses of all frames of each video, see :func:`read_trajectory_rows`."""
+        rows = {}
+        for video in [] if self.failed else self.summary.get("videos", []):
+            if video.get("trajectory"):
+                file = self.path / video["trajectory"]["file"]
+                rows[Path(video["file"]).name] = read_trajectory_rows(file)
+        return rows
 
     def dense_cloud(self) -> tuple[Float64, UInt8]:
         """Read points (n, 3) and RGB colors (n, 3) of ``dense.ply``, empty without this file."""

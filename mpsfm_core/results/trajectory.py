@@ -73,6 +73,18 @@ def write_trajectory(folder: Path, frames: Sequence[TrajectoryFrame], video: str
     table.write_text("\n".join([_COLUMNS, *rows]) + "\n", encoding="utf-8")
 
 
+def read_trajectory_rows(path: Path) -> Float64:
+    """Read time stamp, camera center and quaternion ``x, y, z, w`` (n, 8) of all poses of a file.
+
+    Raises:
+        OSError: the file cannot be read.
+        ValueError: a line of the file is not a pose.
+    """
+    lines = path.read_text(encoding="utf-8").splitlines()
+    rows = [line.split() for line in lines if not line.startswith("#")]
+    return np.array(rows, dtype=np.float64).reshape(-1, 8)
+
+
 def describe_trajectory(frames: Sequence[TrajectoryFrame], video: str = "") -> dict[str, Any]:
     """Describe the frames of a video for ``summary.json``."""
     sources = [frame.source for frame in frames]

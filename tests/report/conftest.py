@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import mpsfm_core
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.errors import ReconstructionError
+from mpsfm_core.report.page import write_report
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(320, 240, 280.0, 280.0, 160.0, 120.0)
@@ -44,6 +46,20 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
         _write_depth(depth / name, rendering.depth)
     _write_noise(photos / "noise.png", depth)
     return _run(folder)
+
+
+@pytest.fixture
+def walked(finished: Path, tmp_path: Path) -> Path:
+    """Return a copy of the finished folder with the trajectory of a video of three frames."""
+    folder = Path(shutil.copytree(finished, tmp_path / "walked"))
+    half = np.sqrt(0.5)
+    rows = ["# timestamp", "0 0 0 0 0 0 0 1", "0.5 0.2 0 0 0 0 0 1", f"1 0.4 0 0 0 0 {half} {half}"]
+    (folder / "trajectory.txt").write_text("\n".join(rows) + "\n")
+    summary = json.loads((folder / "summary.json").read_text())
+    summary["videos"] = [{"file": "walk.mp4", "trajectory": {"file": "trajectory.txt"}}]
+    (folder / "summary.json").write_text(json.dumps(summary))
+    write_report(folder)
+    return folder
 
 
 @pytest.fixture(scope="session")

@@ -154,6 +154,22 @@ def test_report_shows_maps_matches_and_table(opened: Open, finished: Path) -> No
     assert [line for line in browser.get_log("browser") if line["level"] == "SEVERE"] == []
 
 
+def test_slider_moves_the_camera_of_a_video(opened: Open, walked: Path) -> None:
+    browser = opened(walked)
+    wait_for(browser, "window.report !== undefined")
+    shown_time = "document.querySelector('.tools output').innerText"
+    assert browser.execute_script(f"return {shown_time}") == "0.0 s"
+    picture = "document.getElementById('scene').toDataURL()"
+    before = wait_for(browser, picture)
+    browser.execute_script(
+        "const slider = document.querySelector('input.video'); slider.value = 2;"
+        "slider.dispatchEvent(new Event('input'))"
+    )
+    assert browser.execute_script(f"return {shown_time}") == "1.0 s"
+    wait_for(browser, f"{picture} !== arguments[0]", before)
+    assert [line for line in browser.get_log("browser") if line["level"] == "SEVERE"] == []
+
+
 def test_first_screen_of_failed_run_shows_remedy(opened: Open, failed: Path) -> None:
     browser = opened(failed)
     assert wait_for(browser, "document.getElementById('badge').innerText").lower() == "failed"

@@ -437,6 +437,7 @@
   const css = (rgb) => `rgb(${rgb.map(Math.round).join(" ")})`;
 
   // ---------------------------------------------------------------- 3D
+  const VIDEO_COLOR = "#c2479f";
   const COLORS = [["photo", "photo"], ["error", "error"], ["std", "std of depth"], ["views", "number of views"]];
 
   function view3d() {
@@ -502,20 +503,22 @@
     camera.near = radius / 500;
     camera.far = radius * 100;
 
+    const geometryOf = (positions) => {
+      const geometry = new THREE.BufferGeometry();
+      geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(positions.flat()), 3));
+      return geometry;
+    };
+    const pyramid = (corners) => geometryOf(corners.flatMap((corner, i) => [[0, 0, 0], corner, corner, corners[(i + 1) % 4]]));
+    const cornersOf = ({ edges: [l, t, r, b] }) => [[l, t, 1], [r, t, 1], [r, b, 1], [l, b, 1]];
+
     // Cameras: a pyramid of lines and the photo on its base.
     const loader = new THREE.TextureLoader();
     const cameras = placed.map(({ photo, row }) => {
-      const { pose, edges: [l, t, r, b] } = photo;
+      const { pose } = photo;
       const group = new THREE.Group();
-      const toWorld = (x, y, z) => [0, 4, 8].map((i) => pose[i] * x + pose[i + 1] * y + pose[i + 2] * z);
-      const corners = [[l, t], [r, t], [r, b], [l, b]].map(([x, y]) => toWorld(x, y, 1));
-      const ends = [];
-      corners.forEach((corner, i) => ends.push([0, 0, 0], corner, corner, corners[(i + 1) % 4]));
-      const wire = new THREE.BufferGeometry();
-      wire.setAttribute("position", new THREE.BufferAttribute(new Float32Array(ends.flat()), 3));
-      const lines = new THREE.LineSegments(wire, new THREE.LineBasicMaterial());
-      const face = new THREE.BufferGeometry();
-      face.setAttribute("position", new THREE.BufferAttribute(new Float32Array([0, 1, 2, 0, 2, 3].map((i) => corners[i]).flat()), 3));
+      const corners = cornersOf(photo).map(([x, y, z]) => [0, 4, 8].map((i) => pose[i] * x + pose[i + 1] * y + pose[i + 2] * z));
+      const lines = new THREE.LineSegments(pyramid(corners), new THREE.LineBasicMaterial());
+      const face = geometryOf([0, 1, 2, 0, 2, 3].map((i) => corners[i]));
       face.setAttribute("uv", new THREE.BufferAttribute(new Float32Array([0, 1, 1, 1, 1, 0, 0, 1, 1, 0, 0, 0]), 2));
       const material = new THREE.MeshBasicMaterial({ side: THREE.DoubleSide, transparent: true, opacity: 0.85 });
       if (photo.pictures.photo && !photo.pictures.photo.linked) {
@@ -532,15 +535,33 @@
 
     // Frames of rigs: an octahedron around the origin of the rig, for a panorama its center.
     const tips = [[1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]].map((tip) => tip.map((x) => 0.3 * x));
-    const diamond = new THREE.BufferGeometry();
-    const ends = tips.flatMap((tip, i) => [tip, tips[(i + 1) % 4], tip, [0, 0, 0.3], tip, [0, 0, -0.3]]);
-    diamond.setAttribute("position", new THREE.BufferAttribute(new Float32Array(ends.flat()), 3));
+    const diamond = geometryOf(tips.flatMap((tip, i) => [tip, tips[(i + 1) % 4], tip, [0, 0, 0.3], tip, [0, 0, -0.3]]));
     const diamonds = data.frames.map(({ pose }) => {
       const lines = new THREE.LineSegments(diamond, new THREE.LineBasicMaterial({ color: "#4a7fd4" }));
       lines.position.set(pose[3], pose[7], pose[11]);
       scene.add(lines);
       return lines;
     });
+
+    // Videos: the path of the camera without gaps, and the camera at the time of a slider.
+    const videos = data.trajectories.filter(({ times }) => times.length > 1).map((video) => {
+      const { name, times, poses } = video;
+      const step = median(times.slice(1).map((end, i) => end - times[i]));
+      const centerAt = (i) => [3, 7, 11].map((k) => poses[i][k]);
+      const path = times.slice(1).flatMap((end, i) => (end - times[i] > 5 * step ? [] : [centerAt(i), centerAt(i + 1)]));
+      scene.add(new THREE.LineSegments(geometryOf(path), new THREE.LineBasicMaterial({ color: VIDEO_COLOR })));
+      const folder = name.replace(/\.[^.]*$/, "/");
+      const { photo } = placed.find(({ photo }) => photo.name.startsWith(folder)) ?? placed[0];
+      const lines = new THREE.LineSegments(pyramid(cornersOf(photo)), new THREE.LineBasicMaterial({ color: VIDEO_COLOR }));
+      lines.matrixAutoUpdate = false;
+      scene.add(lines);
+      return { ...video, lines, shown: 0 };
+    });
+    const moveVideo = ({ lines, poses, shown }) => {
+      const size = 1.5 * frustum * state.camera;
+      lines.matrix.set(...poses[shown].map((value, i) => (i % 4 === 3 ? value : size * value)), 0, 0, 0, 1);
+      lines.matrixWorldNeedsUpdate = true;
+    };
 
     // To the photos that the selected one matches.
     const links = new THREE.LineSegments(new THREE.BufferGeometry(), new THREE.LineBasicMaterial({ color: "#e8833a", transparent: true, opacity: 0.7 }));
@@ -551,8 +572,7 @@
       const from = centerOf.get(row);
       const ends = from ? partners[row].map(({ other }) => centerOf.get(other)).filter(Boolean).flatMap((to) => [...from.toArray(), ...to.toArray()]) : [];
       links.geometry.dispose();
-      links.geometry = new THREE.BufferGeometry();
-      links.geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(ends), 3));
+      links.geometry = geometryOf(ends);
       draw();
     });
 
@@ -586,6 +606,7 @@
         group.scale.setScalar(frustum * state.camera);
         mesh.visible = state.photos;
       }
+      videos.forEach(moveVideo);
       for (const lines of diamonds) lines.scale.setScalar(frustum * state.camera);
       draw();
     };
@@ -638,13 +659,23 @@
         state[key] = 10 ** (Number(event.target.value) / 2);
         paint();
       } })));
+    const timeline = (video) => {
+      const { name, times } = video;
+      const shownTime = el("output", {}, time(times[0]));
+      return el("div", {}, el("label", {}, `${shorten(name)} `, el("input", { type: "range", class: "video", min: 0, max: times.length - 1, value: 0, oninput: (event) => {
+        video.shown = Number(event.target.value);
+        shownTime.textContent = time(times[video.shown]);
+        moveVideo(video);
+        draw();
+      } }), shownTime));
+    };
     const colour = el("select", { id: "colour", onchange: (event) => { state.colour = event.target.value; paint(); } }, ...COLORS.map(([value, label]) => el("option", { value }, label)));
     const through = el("button", { disabled: "", onclick: () => lookThrough(selected) }, "look through");
     listeners.push((row) => { through.disabled = !centerOf.has(row); });
     byId("tools").append(
       objects.dense && objects.sparse ? choice(["dense", "sparse", "both"], "shown") : "",
       el("div", {}, el("label", { for: "colour" }, "colour by"), colour),
-      slider("points", "point"), slider("cameras", "camera"),
+      slider("points", "point"), slider("cameras", "camera"), ...videos.map(timeline),
       el("div", {}, el("button", { "aria-pressed": "true", onclick: (event) => {
         state.photos = !state.photos;
         event.currentTarget.setAttribute("aria-pressed", String(state.photos));

@@ -27,6 +27,7 @@ from mpsfm_core.results.gravity import Gravity, estimate_gravity, rotation_to_z
 from mpsfm_core.results.original_images import export_view, exported_image_name
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.summary import read_summary
+from mpsfm_core.results.trajectory import read_trajectory_rows
 
 _NORMALS_AN_IMAGE = 2000
 """Maximum number of surface normals per image in the estimation of gravity."""
@@ -218,7 +219,7 @@ class ExportSource:
         path = self.folder / TRAJECTORY
         if not path.is_file():
             return None
-        table = np.loadtxt(path, ndmin=2).reshape(-1, 8)
+        table = read_trajectory_rows(path)
         centers: Float64 = self.world_from_model * table[:, 1:4]
         turn = self.world_from_model.rotation.matrix()
         rotations = turn @ Rotation.from_quat(table[:, 4:]).as_matrix()
