@@ -155,7 +155,10 @@ def localize_with_hloc(
     database = folder / "database.db"
     write_match_database(database, references, graph)
     triangulated = pycolmap.triangulate_points(
-        _model_for_database(references, model), database, images, folder / "triangulated"
+        build_model(references, reconstruction_poses(model)),
+        database,
+        images,
+        folder / "triangulated",
     )
     queries = folder / "queries"
     listed = sorted(path.name for path in queries.iterdir())
@@ -171,13 +174,10 @@ def localize_with_hloc(
     return poses
 
 
-def _model_for_database(
-    references: ImageSet, model: pycolmap.Reconstruction
-) -> pycolmap.Reconstruction:
-    """Build a model with the poses of a model, and with the ids and cameras of the database."""
-    poses = reconstruction_poses(model)
+def build_model(images: ImageSet, poses: Mapping[str, Pose]) -> pycolmap.Reconstruction:
+    """Build a COLMAP model with the poses and cameras of images, and with the ids of a database."""
     built = pycolmap.Reconstruction()
-    for number, image in enumerate(references, start=1):
+    for number, image in enumerate(images, start=1):
         if image.camera.camera_id not in built.cameras:
             built.add_camera_with_trivial_rig(image.camera)
         row = pycolmap.Image(name=image.name, camera_id=image.camera.camera_id, image_id=number)

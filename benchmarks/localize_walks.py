@@ -4,10 +4,10 @@
 
 Rooms and videos are those of ``benchmarks.walks``. Another camera takes photos with other exposure
 and colors, up to 0.5 m and 60 degrees off the walk. Twenty photos are localized in the model of the
-video. In the other direction, 64 photos are reconstructed, and a video of a second walk is
-localized in their model. The focal lengths of the models are unknown. Queries have their true
-camera or an unknown focal length. Models are aligned with the true camera positions of their
-images. Reconstructions and results of earlier calls in DIR are not computed again.
+video, whose focal length is unknown. In the other direction, a video of a second walk is localized
+in a COLMAP model of 64 photos with true poses. Queries have their true camera or an unknown focal
+length. Models are aligned with the true camera positions of their images. Reconstructions and
+results of earlier calls in DIR are not computed again.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ import pycolmap
 
 import mpsfm_core as mpsfm
 from benchmarks._scenes import MPSFM
-from benchmarks.localize import Record, format_median, format_recall, measure
+from benchmarks.localize import Record, build_model, format_median, format_recall, measure
 from benchmarks.walks import (
     CAMERA,
     camera_pose,
@@ -45,7 +45,8 @@ from mpsfm_core.evaluation.alignment import trajectory_errors
 from mpsfm_core.evaluation.trajectories import read_trajectory
 from mpsfm_core.geometry import camera_center
 from mpsfm_core.geometry.similarity import SimilarityTransform
-from mpsfm_core.inputs.models import reconstruction_poses
+from mpsfm_core.inputs.images import load_images
+from mpsfm_core.inputs.models import find_model_folder, reconstruction_poses
 
 SECOND_FPS = 10.0
 PHOTO_CAMERA = PinholeCamera(640, 480, 620.0, 620.0, 320.0, 240.0)
@@ -59,10 +60,10 @@ MAX_OFFSET_M, MAX_TURN_DEG = 0.5, 60.0
 class Case(NamedTuple):
     """Input and true poses of one localization."""
 
-    images: Path
-    """Video or folder of photos that are reconstructed."""
     model: Path
-    """Result folder of the reconstruction."""
+    """Result folder of a video, or COLMAP model of photos."""
+    images: Path
+    """Folder of the images of the model."""
     image_poses: Mapping[str, Pose]
     """True poses ``cam_from_world`` by name of the image."""
     queries: Path
@@ -85,29 +86,35 @@ def main() -> None:
             path = folder / f"{make_case.__name__}{seed}-{arguments.config}.json"
             if not path.is_file():
                 setting = {"direction": make_case.__name__, "walk": seed}
-                case = make_case(folder, seed)
+                case = make_case(folder, seed, arguments.config)
                 rows = [setting | row for row in localize(case, arguments.config)]
                 path.write_text(json.dumps(rows))
             records += json.loads(path.read_text())
     print(make_table(records))
 
 
-def photos_in_video(folder: Path, seed: int) -> Case:
-    """Write a video, and photos of its rooms as queries."""
+def photos_in_video(folder: Path, seed: int, config: str) -> Case:
+    """Reconstruct a video, and write photos of its rooms as queries."""
     video, walk = write_walk(folder, seed)
+    model = video.with_suffix("")
+    if not (model / "sparse").is_dir():
+        settings = ["--set", "inputs.video.max_frames=70", "--set", "dense.enabled=false"]
+        run_command("reconstruct", video, "-o", model, "--config", config, *settings)
     photos, poses = write_photos(folder / f"query_photos{seed}", seed, NUM_QUERIES)
-    return Case(video, video.with_suffix(""), name_frames(walk), photos, poses, PHOTO_CAMERA)
+    return Case(model, model / "frames", name_frames(walk), photos, poses, PHOTO_CAMERA)
 
 
-def video_in_photos(folder: Path, seed: int) -> Case:
-    """Write photos of rooms, and a video of a second walk through the rooms as query."""
+def video_in_photos(folder: Path, seed: int, config: str) -> Case:
+    """Write photos of rooms with their model, and a video of a second walk as query."""
     photos, poses = write_photos(folder / f"photos{seed}", seed, NUM_MODEL_PHOTOS)
+    model = folder / f"photos{seed}_model"
+    model.mkdir(exist_ok=True)
+    build_model(load_images(photos, PHOTO_CAMERA), poses).write(str(model))
     world, _, rng = make_walk(seed)
     walk = make_path(np.random.default_rng([seed, 52]), SECOND_ROUNDS, SECOND_FPS)
     video = folder / f"second_walk{seed}.mp4"
     write_video(video, render_frames(world, walk, rng), SECOND_FPS)
-    model = photos.with_name(f"{photos.name}_model")
-    return Case(photos, model, poses, video, name_frames(walk), CAMERA)
+    return Case(model, photos, poses, video, name_frames(walk), CAMERA)
 
 
 def name_frames(poses: Sequence[Pose]) -> dict[str, Pose]:
@@ -137,26 +144,22 @@ def write_photos(folder: Path, seed: int, count: int) -> tuple[Path, dict[str, P
 
 
 def localize(case: Case, config: str) -> Iterator[Record]:
-    """Reconstruct the images, localize the queries with both commands, and yield the errors."""
-    if not (case.model / "sparse").is_dir():
-        settings = ["--set", "inputs.video.max_frames=70", "--set", "dense.enabled=false"]
-        run_command("reconstruct", case.images, "-o", case.model, "--config", config, *settings)
-    found = reconstruction_poses(pycolmap.Reconstruction(str(case.model / "sparse")))
+    """Localize the queries with true and unknown focal length, and yield the errors."""
+    model = pycolmap.Reconstruction(str(find_model_folder(case.model)))
+    found = reconstruction_poses(model)
     errors = trajectory_errors(found, case.image_poses)
     assert errors is not None
     setting = {"registered": len(found), "ate": errors.ate_rmse}
+    arguments = [case.model, case.queries, "--config", config, "--images", case.images]
     # The first call stores the triangulated points of the model, which belong to no query.
-    frames = case.model / "frames"
-    photo = next((frames if frames.is_dir() else case.images).glob("*.*g"))
-    mpsfm.localize(case.model, photo, config=config)
+    photo = case.images / next(iter(found))
+    mpsfm.localize(case.model, photo, config=config, images=case.images)
     cameras = case.queries.with_suffix(".yaml")
     cameras.write_text(f"1: {{params: {case.query_camera.params.tolist()}, images: all}}\n")
     for known in (True, False):
         output = case.queries.with_name(f"{case.queries.stem}_{'known' if known else 'unknown'}")
         intrinsics = ["--intrinsics", cameras] if known else []
-        seconds = run_command(
-            "localize", case.model, case.queries, "-o", output, "--config", config, *intrinsics
-        )
+        seconds = run_command("localize", *arguments, "-o", output, *intrinsics)
         located = read_poses(output)
         for name, true_pose in case.query_poses.items():
             pose = located.get(name)

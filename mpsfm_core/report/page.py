@@ -172,11 +172,14 @@ def _describe_frames(
 
 
 def _describe_trajectory(name: str, rows: Float64) -> dict[str, Any]:
-    """Return name, times and poses ``world_from_cam`` (3 x 4, row-major) of the frames of a video.
+    """Describe the frames of a video, or evenly spaced frames of a long video.
 
     Args:
         name: Name of the video.
         rows: (n, 8) time stamps, camera centers and quaternions of the frames.
+
+    Returns:
+        Name, time stamps, and poses ``world_from_cam`` (3 x 4, row-major).
     """
     rows = rows[_space_evenly(len(rows), MAX_VIDEO_FRAMES)]
     rotations = Rotation.from_quat(rows[:, 4:]).as_matrix()

@@ -74,7 +74,10 @@ def write_trajectory(folder: Path, frames: Sequence[TrajectoryFrame], video: str
 
 
 def read_trajectory_rows(path: Path) -> Float64:
-    """Read time stamp, camera center and quaternion ``x, y, z, w`` (n, 8) of all poses of a file.
+    """Read the poses of a trajectory file.
+
+    Returns:
+        (n, 8) float64 time stamps, camera centers, and quaternions x, y, z, w of the camera.
 
     Raises:
         OSError: the file cannot be read.
