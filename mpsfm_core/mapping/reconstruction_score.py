@@ -21,23 +21,20 @@ match and a depth are random. An image that is left out therefore adds nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import Bool, DepthPrior, Float64, MappingImage, MappingProblem, VerifiedPair
-from mpsfm_core.geometry import (
-    pixel_centers,
-    project,
-    sample_bilinear,
-    scale_pixels,
-    transform,
-    unproject,
-)
+from mpsfm_core.data import Bool, Float32, Float64, Int64, MappingProblem, PinholeCamera
+from mpsfm_core.geometry import pixel_centers, project, transform, unproject
 from mpsfm_core.mapping.consistency.depth_consistency import count_visible_points
 from mpsfm_core.mapping.refinement.depth_noise import CELLS
-from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.mapping.scene.depth_map import DepthMap
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, subsample_camera
 
 INLIER_RATIO = 0.9
 """Prior probability that a verified match of a correct pair is an inlier. [ours]"""
@@ -56,6 +53,8 @@ OCCAM_FACTOR = 6 * math.log(1000)
 freedom. [ours]"""
 GRID = 24
 """Columns and rows of the pixel grid whose depth is compared with other images. [ours]"""
+MAP_WIDTH = 160
+"""Width in pixels to which depth maps are subsampled. [ours]"""
 DEPTH_RANGE = 4.0
 """Range of the log depth of the reference. [ours]"""
 DEPTH_OUTCOMES = (0.70, 0.25, 0.05)
@@ -76,128 +75,157 @@ class ReconstructionScore(NamedTuple):
         return self.matches + self.depth
 
 
+class PairScores(NamedTuple):
+    """Log likelihood ratios of the matches of registered images, each pair once."""
+
+    a: Int64
+    """(p,) index of the first image of each pair."""
+    b: Int64
+    """(p,) index of the second image of each pair, larger than ``a``."""
+    score: Float64
+    """(p,) log likelihood ratio."""
+
+
 def score_reconstruction(model: Reconstruction, problem: MappingProblem) -> ReconstructionScore:
     """Compute the log likelihood ratio of the matches and depth maps of a reconstruction."""
-    images = {image.index: image for image in model.images if image.confirmed}
-    matches = 0.0
-    for pair in problem.pairs_between_frames():
-        if pair.image_a in images and pair.image_b in images:
-            matches += score_pair(images[pair.image_a], images[pair.image_b], pair, problem)
-    depth = float(sum(_score_depth(list(images.values()))))
-    return ReconstructionScore(matches, depth)
+    scene = Scene(problem)
+    confirmed = tuple(image for image in model.images if image.confirmed)
+    scene.resume(replace(model, images=confirmed), refined_map_width=MAP_WIDTH)
+    return score_scene(scene)
 
 
-def score_pair(
-    a: RegisteredImage, b: RegisteredImage, pair: VerifiedPair, problem: MappingProblem
-) -> float:
-    """Compute the log likelihood ratio of the matches of two registered images."""
-    given_a, given_b = problem.images[pair.image_a], problem.images[pair.image_b]
-    xy_a, xy_b = given_a.keypoints[pair.matches[:, 0]], given_b.keypoints[pair.matches[:, 1]]
-    forward, best_forward = _compare_projections(a, b, xy_a, xy_b, given_a)
-    backward, best_backward = _compare_projections(b, a, xy_b, xy_a, given_b)
-    losses = (best_forward - forward + best_backward - backward) / 2
-    loss = float(losses @ pair.scores) / max(float(pair.scores.sum()), 1e-12)
+def score_scene(scene: Scene) -> ReconstructionScore:
+    """Compute the log likelihood ratio of the matches and depth maps of registered images."""
+    matches, depth = score_pairs(scene).score.sum(), sum(_score_depth(scene))
+    return ReconstructionScore(float(matches), float(depth))
+
+
+def score_pairs(scene: Scene) -> PairScores:
+    """Compute the log likelihood ratio of the matches of each two registered images.
+
+    Images of the same frame are not compared.
+    """
+    graph, registered, frame_of = scene.graph, scene.registered, scene.rigs.frame_of
+    a, b = graph.image_of[graph.source], graph.image_of[graph.target]
+    edges = np.flatnonzero(registered[a] & registered[b] & (frame_of[a] != frame_of[b]))
+    a, b, num_images = a[edges], b[edges], scene.num_images
+    keys = np.minimum(a, b) * num_images + np.maximum(a, b)
+    keys, pair_of = np.unique(keys, return_inverse=True)
+    loss = np.zeros(len(keys))
+    np.add.at(loss, pair_of, graph.score[edges] * _compute_losses(scene, edges))
+    loss /= np.bincount(pair_of, graph.score[edges], len(keys))
     connects = math.log(1 - FALSE_PAIR_RATIO) + OCCAM_FACTOR - NUM_INDEPENDENT * loss
-    return float(np.logaddexp(connects, math.log(FALSE_PAIR_RATIO)))
+    score = np.logaddexp(connects, math.log(FALSE_PAIR_RATIO))
+    return PairScores(keys // num_images, keys % num_images, score)
 
 
-def _compare_projections(
-    source: RegisteredImage,
-    target: RegisteredImage,
-    xy: Float64,
-    target_xy: Float64,
-    given: MappingImage,
-) -> tuple[Float64, Float64]:
-    """Compare keypoints (m, 2) with the projections of their matched keypoints.
+def _compute_losses(scene: Scene, edges: Int64) -> Float64:
+    """Compare the projections of keypoints with their matched keypoints.
+
+    Args:
+        scene: The scene.
+        edges: (m,) matches in the correspondence graph.
 
     Returns:
-        Log likelihood ratios (m,) of the keypoint errors and of errors of zero.
+        (m,) log likelihood ratios of errors of zero, minus those of the observed errors.
     """
-    size = given.camera.size
-    depth, log_std, known = _sample_depth(source.depth, xy, size)
-    points = unproject(source.camera, xy, np.where(known, depth, 1.0))
-    rotation = target.rotation @ source.rotation.T
-    local = transform(rotation, target.translation - rotation @ source.translation, points)
-    z = np.maximum(local[:, 2], 1e-9)
-    projected = project(target.camera, np.where(local[:, 2:] > 1e-9, local, [0.0, 0.0, 1.0]))
-    change = points @ rotation.T
-    slope = change[:, :2] / z[:, None] - local[:, :2] * (change[:, 2] / z**2)[:, None]
-    slope *= [target.camera.fx, target.camera.fy]
+    source, target = scene.graph.source[edges], scene.graph.target[edges]
+    a, b = scene.graph.image_of[source], scene.graph.image_of[target]
+    depth, known = scene.depth_at(source)
+    points = scene.rays(source) * np.where(known, depth, 1.0)[:, None]
+    rotations = scene.rotations[b] @ scene.rotations[a].swapaxes(1, 2)
+    change = np.einsum("nij,nj->ni", rotations, points)
+    local = change + scene.translations[b]
+    local -= np.einsum("nij,nj->ni", rotations, scene.translations[a])
+    in_front = local[:, 2] > 1e-9
+    z = np.where(in_front, local[:, 2], 1.0)
+    focal_px = scene.intrinsics[b, :2]
+    projected = focal_px * local[:, :2] / z[:, None] + scene.intrinsics[b, 2:]
+    # derivative of the projection by log depth
+    slope = focal_px * (change[:, :2] - local[:, :2] * (change[:, 2] / z)[:, None]) / z[:, None]
     length = np.maximum(np.linalg.norm(slope, axis=1), 1e-9)
-    error, direction = target_xy - projected, slope / length[:, None]
+    error, direction = scene.keypoints[target] - projected, slope / length[:, None]
     along = (error * direction).sum(axis=1)
     across = error[:, 0] * direction[:, 1] - error[:, 1] * direction[:, 0]
-    log_std = np.maximum(log_std, MIN_DEPTH_STD)
+    log_std = np.maximum(scene.keypoint_log_std[source], MIN_DEPTH_STD)
     std = np.hypot(KEYPOINT_STD_PX, log_std * length)
     # the expected error must not grow without bound as a wrong pose moves a point to the camera
-    best_std = np.minimum(std, np.hypot(KEYPOINT_STD_PX, log_std * target.camera.fx))
-    area, diagonal = float(size[0] * size[1]), float(np.hypot(*size))
-    scale = area / (np.pi * KEYPOINT_STD_PX)
-    best = scale * np.where(known, 1 / (np.pi * best_std), 1 / diagonal)
-    density = scale * np.where(known, 1 / (np.pi * std * (1 + (along / std) ** 2)), 1 / diagonal)
-    density /= 1 + (across / KEYPOINT_STD_PX) ** 2
-    density = np.where(local[:, 2] > 1e-9, density, 0.0)
+    best_std = np.minimum(std, np.hypot(KEYPOINT_STD_PX, log_std * focal_px[:, 0]))
+    width, height = scene.image_sizes[b].T
+    scale = width * height / (np.pi * KEYPOINT_STD_PX)
+    uniform = 1 / np.hypot(width, height)
+    best = scale * np.where(known, 1 / (np.pi * best_std), uniform)
+    density = scale * np.where(known, 1 / (np.pi * std * (1 + (along / std) ** 2)), uniform)
+    density = np.where(in_front, density / (1 + (across / KEYPOINT_STD_PX) ** 2), 0.0)
     outlier = 1 - INLIER_RATIO
-    return np.log(INLIER_RATIO * density + outlier), np.log(INLIER_RATIO * best + outlier)
+    losses: Float64 = np.log(INLIER_RATIO * best + outlier)
+    losses -= np.log(INLIER_RATIO * density + outlier)
+    return losses
 
 
-def _sample_depth(
-    depth: DepthPrior, xy: Float64, size: tuple[int, int]
-) -> tuple[Float64, Float64, Bool]:
-    """Return depth (m,), its log std (m,) and a mask (m,) of known depth at keypoints (m, 2)."""
-    assert depth.variance is not None  # all refined depth maps contain a variance of depth
-    at = scale_pixels(xy, size, (depth.shape[1], depth.shape[0]))
-    z, known = sample_bilinear(depth.depth, depth.valid, at)
-    variance, _ = sample_bilinear(depth.variance, depth.valid, at)
-    return z, np.sqrt(np.maximum(variance, 0)) / np.maximum(z, 1e-12), known
+class _DepthGrid(NamedTuple):
+    """Subsampled depth map of one image."""
+
+    depth: Float32
+    """(h, w) depth in world units."""
+    log_std: Float32
+    """(h, w) standard deviation of the log depth."""
+    valid: Bool
+    """(h, w) bool mask of the pixels with known depth."""
+    camera: PinholeCamera
+    """Intrinsics in pixels of the grid."""
 
 
-def _score_depth(images: Sequence[RegisteredImage]) -> Iterator[float]:
+def _make_grid(depth_map: DepthMap) -> _DepthGrid:
+    step = compute_subsampling_step(depth_map.valid.shape[1], MAP_WIDTH)
+    return _DepthGrid(
+        subsample(depth_map.depth, step),
+        subsample(depth_map.log_std, step),
+        subsample(depth_map.valid, step),
+        subsample_camera(depth_map.camera, step),
+    )
+
+
+def _score_depth(scene: Scene) -> Iterator[float]:
     """Yield the log likelihood ratio of the depth of each ordered pair of overlapping images."""
-    rotations = np.array([image.rotation for image in images]).reshape(-1, 3, 3)
-    translations = np.array([image.translation for image in images]).reshape(-1, 3)
-    intrinsics = np.array([image.camera.params for image in images]).reshape(-1, 4)
-    sizes = np.array([image.camera.size for image in images], np.float64).reshape(-1, 2)
-    for row, image in enumerate(images):
-        points, log_std = _sample_points(image)
+    registered = scene.registered_images().tolist()
+    images = np.array([i for i in registered if scene.maps[i].active], dtype=np.int64)
+    grids = [_make_grid(scene.maps[image]) for image in images.tolist()]
+    rotations, translations = scene.rotations[images], scene.translations[images]
+    intrinsics, sizes = scene.intrinsics[images], scene.image_sizes[images]
+    for row, grid in enumerate(grids):
+        local, log_std = _sample_points(grid)
+        points = (local - translations[row]) @ rotations[row]
         counts = count_visible_points(points, rotations, translations, intrinsics, sizes)
         for other in map(int, np.flatnonzero(counts)):
             if other != row:
-                ratios = _compare_depth(points, log_std, images[other])
+                seen = transform(rotations[other], translations[other], points)
+                ratios = _compare_depth(seen, log_std, grids[other])
                 yield NUM_INDEPENDENT / GRID**2 * float(ratios.sum())
 
 
-def _sample_points(image: RegisteredImage) -> tuple[Float64, Float64]:
-    """Return the world points (n, 3) of a depth map, and the standard deviation of log depth."""
-    depth = image.depth
-    rows, columns = depth.shape
+def _sample_points(grid: _DepthGrid) -> tuple[Float64, Float64]:
+    """Return points (n, 3) of a depth map in the camera frame, and their std (n,) of log depth."""
+    rows, columns = grid.depth.shape
     xy = pixel_centers(GRID, GRID).reshape(-1, 2) * [columns, rows] / GRID
     column, row = np.floor(xy).astype(np.int64).T
-    known = depth.valid[row, column]
-    z = depth.depth[row, column].astype(np.float64)
-    assert depth.variance is not None  # all refined depth maps contain a variance of depth
-    log_std = np.sqrt(depth.variance[row, column]) / np.where(known, z, 1.0)
-    points = unproject(image.camera.resized(columns, rows), xy[known], z[known])
-    return (points - image.translation) @ image.rotation, log_std[known]
+    known = grid.valid[row, column]
+    z = grid.depth[row, column].astype(np.float64)
+    points = unproject(grid.camera, xy[known], z[known])
+    return points, grid.log_std[row, column][known].astype(np.float64)
 
 
-def _compare_depth(points: Float64, log_std: Float64, image: RegisteredImage) -> Float64:
-    """Return the log likelihood ratios of the world points that project into an image."""
-    depth = image.depth
-    rows, columns = depth.shape
-    local = transform(image.rotation, image.translation, points)
-    in_front = local[:, 2] > 1e-9
-    local, log_std = local[in_front], log_std[in_front]
-    xy = project(image.camera.resized(columns, rows), local)
-    column, row = np.floor(xy).astype(np.int64).T
+def _compare_depth(points: Float64, log_std: Float64, grid: _DepthGrid) -> Float64:
+    """Return the log likelihood ratios of points (n, 3) that a camera sees, in its frame."""
+    rows, columns = grid.depth.shape
+    in_front = points[:, 2] > 1e-9
+    points, log_std = points[in_front], log_std[in_front]
+    column, row = np.floor(project(grid.camera, points)).astype(np.int64).T
     inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    inside[inside] = depth.valid[row[inside], column[inside]]
-    column, row, z, log_std = column[inside], row[inside], local[inside, 2], log_std[inside]
-    surface = depth.depth[row, column].astype(np.float64)
-    assert depth.variance is not None
-    std = np.hypot(log_std, np.sqrt(depth.variance[row, column]) / surface)
-    std = np.maximum(std, MIN_DEPTH_STD)
-    behind = np.log(z / surface)
+    inside[inside] = grid.valid[row[inside], column[inside]]
+    column, row, z, log_std = column[inside], row[inside], points[inside, 2], log_std[inside]
+    std = np.maximum(np.hypot(log_std, grid.log_std[row, column]), MIN_DEPTH_STD)
+    behind = np.log(z / grid.depth[row, column])
     agrees, occluded, seen_through = DEPTH_OUTCOMES
     density = agrees / (np.pi * std * (1 + (behind / std) ** 2))
     density += np.where(behind > 0, occluded, seen_through) / (DEPTH_RANGE / 2)
