@@ -26,7 +26,7 @@ larger depth std [twice the std of the weaker networks in paper C]."""
 _MAX_DIFFERENCE_STDS = 3.0
 """Depth difference in standard deviations from which the depth map of another image contradicts a
 pixel [ours]."""
-_MAX_NEIGHBORS = 8
+_MAX_VOTERS = 8
 """Maximum number of overlapping images whose depth confirms or contradicts an image's points."""
 _MIN_PIXEL_RATIO = 0.25
 """Minimum ratio of an image's pixels with a relative depth std low enough for fusion [ours]."""
@@ -85,12 +85,13 @@ def fuse_depth_maps(
         seed: Random seed of the subsampling of depth maps.
     """
     images = reconstruction.dense_images
+    voters = select_voters(images)
 
     def select_unique(_: int, pixels: Int64, votes: _ConsistencyVotes) -> tuple[Int64, UInt8]:
         mask = votes.consistent & ~votes.duplicate
         return pixels[mask], votes.views[mask]
 
-    selected = _vote_on_images(images, select_unique)
+    selected = _vote_on_images(images, voters, select_unique)
     total = sum(len(pixels) for pixels, _ in selected)
     ratio = min(1.0, max_points / max(1, total))
     rng = np.random.default_rng(seed)
@@ -109,11 +110,23 @@ def fuse_depth_maps(
     return FusedPointCloud(*map(np.concatenate, zip(*parts, strict=True)))
 
 
-def count_consistent_views(images: Sequence[RegisteredImage]) -> list[UInt8]:
+def select_voters(images: Sequence[RegisteredImage]) -> list[list[int]]:
+    """Select the overlapping images whose depth confirms or contradicts each image's points."""
+    return select_source_views(images, _MAX_VOTERS)
+
+
+def count_consistent_views(
+    images: Sequence[RegisteredImage], voters: Sequence[Sequence[int]]
+) -> list[UInt8]:
     """Count for each pixel the images whose depth agrees with it, including its own image.
 
-    Returns one count map (h, w) per image. The count is 0 at pixels with large depth std and at
-    inconsistent pixels, which the cloud omits.
+    Args:
+        images: Images with confirmed poses.
+        voters: Indices of the voting images of each image, from :func:`select_voters`.
+
+    Returns:
+        One count map (h, w) per image. The count is 0 at pixels with large depth std and at
+        inconsistent pixels, which the cloud omits.
     """
 
     def build_counts(row: int, pixels: Int64, votes: _ConsistencyVotes) -> UInt8:
@@ -121,11 +134,12 @@ def count_consistent_views(images: Sequence[RegisteredImage]) -> list[UInt8]:
         counts.ravel()[pixels[votes.consistent]] = votes.views[votes.consistent]
         return counts
 
-    return _vote_on_images(images, build_counts)
+    return _vote_on_images(images, voters, build_counts)
 
 
 def find_seen_through(
     images: Sequence[RegisteredImage],
+    voters: Sequence[Sequence[int]],
     measured: Sequence[Bool],
     pixels: Sequence[Bool],
     max_relative_std: float,
@@ -134,11 +148,11 @@ def find_seen_through(
 
     Args:
         images: Images with confirmed poses.
+        voters: Indices of the voting images of each image, from :func:`select_voters`.
         measured: Mask (h, w) of the pixels of each image that vote.
         pixels: Mask (h, w) of the tested pixels of each image.
         max_relative_std: Maximum relative depth std of the tested pixels; larger stds are reduced.
     """
-    neighbors = select_source_views(images, _MAX_NEIGHBORS)
     voting = [
         replace(image, depth=replace(image.depth, valid=mask))
         for image, mask in zip(images, measured, strict=True)
@@ -150,8 +164,8 @@ def find_seen_through(
         variance = np.minimum(
             variance, (max_relative_std * images[row].depth.depth.ravel()[tested]) ** 2
         )
-        voters = [(voting[j], measured[j], False) for j in neighbors[row]]
-        votes = _vote_on_points(points, variance, voters, _MAX_DIFFERENCE_STDS)
+        maps = [(voting[j], measured[j], False) for j in voters[row]]
+        votes = _vote_on_points(points, variance, maps, _MAX_DIFFERENCE_STDS)
         seen_through = np.zeros(pixels[row].shape, np.bool_)
         seen_through.ravel()[tested[~votes.consistent]] = True
         return seen_through
@@ -161,24 +175,25 @@ def find_seen_through(
 
 def _vote_on_images(
     images: Sequence[RegisteredImage],
+    voters: Sequence[Sequence[int]],
     select: Callable[[int, Int64, _ConsistencyVotes], _T],
 ) -> list[_T]:
     """Compute the consistency votes on each image's points, and apply a selection function.
 
     Args:
         images: Images with confirmed poses.
+        voters: Indices of the voting images of each image.
         select: Function that receives an image index, the flat indices of its pixels with low depth
             std, and the votes on these pixels.
     """
     max_relative_std = max(_MAX_RELATIVE_STD, _relative_std_of_best_pixels(images))
     usable = [_certain_pixels(image, max_relative_std) for image in images]
-    neighbors = select_source_views(images, _MAX_NEIGHBORS)
 
     def vote_on_image(row: int) -> _T:
         pixels = np.flatnonzero(usable[row])
         points, variance = _unproject_pixels(images[row], pixels)
-        voters = [(images[j], usable[j], j < row) for j in neighbors[row]]
-        votes = _vote_on_points(points, variance, voters, _MAX_DIFFERENCE_STDS)
+        maps = [(images[j], usable[j], j < row) for j in voters[row]]
+        votes = _vote_on_points(points, variance, maps, _MAX_DIFFERENCE_STDS)
         return select(row, pixels, votes)
 
     return parallel_map(vote_on_image, range(len(images)))

@@ -5,7 +5,8 @@ weights [Curless and Levoy, SIGGRAPH 1996]. Distances along z are converted to d
 surface normal, so that surfaces at grazing angles have no holes. Pixels in closed holes
 (:mod:`~mpsfm_core.dense.hole_filling`) only have an effect where nothing is measured and no other
 image sees through them. TSDF blocks exist only around surfaces, so that memory does not grow with
-the volume. Marching cubes of scikit-image extracts the triangles.
+the volume. The voxels of large scenes are larger, so that the number of triangles that marching
+cubes of scikit-image extracts is bounded.
 """
 # mypy: allow-untyped-decorators
 
@@ -22,7 +23,7 @@ from scipy.sparse.csgraph import connected_components
 from mpsfm_core.data import Bool, Float32, Float64, Int64, UInt8, View
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.dense.depth_sampling import compute_slant, interpolate_depth, sample_depth
-from mpsfm_core.dense.fusion import count_consistent_views, find_seen_through
+from mpsfm_core.dense.fusion import count_consistent_views, find_seen_through, select_voters
 from mpsfm_core.dense.hole_filling import MAX_STEP, find_closable_holes
 from mpsfm_core.dense.mesh_visibility import find_observed_triangles
 from mpsfm_core.dense.options import MeshOptions
@@ -38,10 +39,22 @@ from mpsfm_core.geometry import (
 )
 from mpsfm_core.geometry.statistics import unique_rows
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.support.disk_arrays import ArrayStore, store_in_memory
 from mpsfm_core.support.jit import kernel
+from mpsfm_core.support.threads import parallel_map
 
 _BLOCK_SIZE = 64
 """Number of voxels along each side of a TSDF block."""
+_MAX_CELLS_PER_TRIANGLE = 2.0
+"""Maximum number of voxels with points per triangle of the simplified mesh, above which voxels are
+larger."""
+_CELL_EXPONENT = 0.6
+"""Exponent of the ratio of numbers of voxels by which voxels are larger: above 0.5, the exponent of
+smooth surfaces, as the depth maps of a noisy surface fill more voxels."""
+_CELL_SAMPLING = 64
+"""Number of voxels with points per voxel that the estimate of their number counts."""
+_HASH_FACTORS = np.array([73856093, 19349663, 83492791])
+"""Factors of the spatial hash [Teschner et al. 2003]."""
 _TRUNCATION_VOXELS = 3.0
 """Minimum truncation distance of the TSDF in voxels."""
 _TRUNCATION_STDS = 3.0
@@ -141,7 +154,10 @@ class _WeightedDepth(NamedTuple):
 
 
 def mesh_depth_maps(
-    reconstruction: Reconstruction, view_of: Callable[[str], View], options: MeshOptions
+    reconstruction: Reconstruction,
+    view_of: Callable[[str], View],
+    options: MeshOptions,
+    store_array: ArrayStore = store_in_memory,
 ) -> TriangleMesh:
     """Extract a triangle mesh from all depth maps, without triangles that no image observes.
 
@@ -151,24 +167,14 @@ def mesh_depth_maps(
         reconstruction: Posed images with depth maps.
         view_of: Function that returns the undistorted view of an image name, for the colors.
         options: Options of mesh extraction.
+        store_array: Storage of the weighted depth maps, by default in memory.
 
     Raises:
         InputError: scikit-image is missing, no pixel has consistent depth, or no surface is found.
     """
     marching_cubes, simplify = _import_libraries()
     images = reconstruction.dense_images
-    counts = count_consistent_views(images)
-    confirmed = [views > 1 for views in counts]
-    holes = [
-        find_closable_holes(image.depth, mask, options.max_hole_px) & (views == 0)
-        for image, mask, views in zip(images, confirmed, counts, strict=True)
-    ]
-    seen_through = find_seen_through(images, confirmed, holes, MAX_STEP)
-    maps = [
-        _weight_depth(image, views > 0, hole & ~open_space)
-        for image, views, hole, open_space in zip(images, counts, holes, seen_through, strict=True)
-        if views.any()
-    ]
+    maps = _weight_depth_maps(images, options.max_hole_px, store_array)
     if not maps:
         raise InputError(
             "cannot build a mesh: no pixel of the depth maps is certain and consistent; "
@@ -176,17 +182,16 @@ def mesh_depth_maps(
         )
     pixel_size = np.median([np.median(m.depth[m.depth > 0]) / m.intrinsics[0] for m in maps])
     std = np.median([np.median(m.weight[(m.depth > 0) & ~m.filled] ** -0.5) for m in maps])
-    voxel = float(options.voxel_px * pixel_size)
+    voxel = _bound_resolution(
+        maps, float(options.voxel_px * pixel_size), _MAX_CELLS_PER_TRIANGLE * options.max_triangles
+    )
     truncation = max(_TRUNCATION_VOXELS * voxel, _TRUNCATION_STDS * float(std))
-    surfaces = [
-        _extract_block_surface(maps, block, voxel, truncation, marching_cubes)
-        for block in _find_surface_blocks(maps, voxel)
-    ]
+    surfaces = parallel_map(
+        lambda block: _extract_block_surface(maps, block, voxel, truncation, marching_cubes),
+        _find_surface_blocks(maps, voxel),
+    )
     vertices, triangles = _merge_surfaces([s for s in surfaces if s is not None], voxel)
-    visible = np.zeros(len(vertices), np.bool_)
-    for map_ in maps:
-        visible[map_.find_visible(vertices, voxel)[0]] = True
-    triangles = triangles[visible[triangles].all(axis=1)]
+    triangles = triangles[_find_visible_vertices(vertices, maps, voxel)[triangles].all(axis=1)]
     vertices, triangles = _remove_unused_vertices(vertices, triangles)
     # Noisy depth maps have hidden layers of surface behind or in front of each other.
     triangles = triangles[find_observed_triangles(vertices, triangles, images)]
@@ -221,7 +226,28 @@ def _import_libraries() -> tuple[Any, Any]:
     return marching_cubes, simplify
 
 
-def _weight_depth(image: RegisteredImage, mask: Bool, filled: Bool) -> _WeightedDepth:
+def _weight_depth_maps(
+    images: Sequence[RegisteredImage], max_hole_px: float, store_array: ArrayStore
+) -> list[_WeightedDepth]:
+    """Weight the consistent pixels and the pixels in closed holes of all images that have any."""
+    voters = select_voters(images)
+    counts = count_consistent_views(images, voters)
+    confirmed = [views > 1 for views in counts]
+    holes = [
+        find_closable_holes(image.depth, mask, max_hole_px) & (views == 0)
+        for image, mask, views in zip(images, confirmed, counts, strict=True)
+    ]
+    seen_through = find_seen_through(images, voters, confirmed, holes, MAX_STEP)
+    return [
+        _weight_depth(image, views > 0, hole & ~open_space, store_array)
+        for image, views, hole, open_space in zip(images, counts, holes, seen_through, strict=True)
+        if views.any()
+    ]
+
+
+def _weight_depth(
+    image: RegisteredImage, mask: Bool, filled: Bool, store_array: ArrayStore
+) -> _WeightedDepth:
     """Weight the pixels of a mask by their variance, and add the pixels in closed holes."""
     height, width = image.depth.shape
     variance = image.depth.variance
@@ -232,7 +258,25 @@ def _weight_depth(image: RegisteredImage, mask: Bool, filled: Bool) -> _Weighted
     depth = np.where(mask | filled, image.depth.depth, 0).astype(np.float32)
     intrinsics = image.camera.resized(width, height).params
     slant = compute_slant(image.depth.depth, intrinsics)
-    return _WeightedDepth(image, intrinsics, depth, weight, slant, filled)
+    maps = (store_array(depth), store_array(weight), store_array(slant), store_array(filled))
+    return _WeightedDepth(image, intrinsics, *maps)
+
+
+def _bound_resolution(maps: Sequence[_WeightedDepth], voxel: float, max_cells: float) -> float:
+    """Enlarge the side length of voxels until at most `max_cells` of them contain points."""
+    while (ratio := _estimate_num_cells(maps, voxel) / max_cells) > 1:
+        voxel *= ratio**_CELL_EXPONENT
+    return voxel
+
+
+def _estimate_num_cells(maps: Sequence[_WeightedDepth], voxel: float) -> int:
+    """Estimate the number of voxels with points from the voxels with few of all hash values."""
+    sampled = [np.zeros((0, 3), np.int64)]
+    for map_ in maps:
+        cells = np.floor(map_.points / voxel).astype(np.int64)
+        hashes = np.bitwise_xor.reduce(cells * _HASH_FACTORS, axis=1)
+        sampled.append(cells[hashes % _CELL_SAMPLING == 0])
+    return _CELL_SAMPLING * len(unique_rows(np.concatenate(sampled))[0])
 
 
 def _find_surface_blocks(maps: Sequence[_WeightedDepth], voxel: float) -> Int64:
@@ -242,8 +286,12 @@ def _find_surface_blocks(maps: Sequence[_WeightedDepth], voxel: float) -> Int64:
         # A point near a face between two TSDF blocks belongs to both, because the surface may be on
         # either side.
         points = map_.points / (voxel * _BLOCK_SIZE)
-        shifted = [np.floor(points + (corner - 0.5) / _BLOCK_SIZE) for corner in _CORNERS]
-        blocks = np.concatenate(shifted).astype(np.int64)
+        low, high = (
+            np.floor(points + shift / _BLOCK_SIZE).astype(np.int64) for shift in (-0.5, 0.5)
+        )
+        near_face = (low != high).any(axis=1)
+        shifted = [np.where(corner > 0, high[near_face], low[near_face]) for corner in _CORNERS]
+        blocks = np.concatenate([low[~near_face], *shifted])
         blocks_per_map.append(blocks[unique_rows(blocks)[0]])
     blocks = np.concatenate(blocks_per_map)
     return blocks[unique_rows(blocks)[0]]
@@ -353,6 +401,19 @@ def _merge_surfaces(
     triangles = vertex_ids[triangles]
     degenerate = (triangles == np.roll(triangles, 1, axis=1)).any(axis=1)
     return vertices[first], triangles[~degenerate]
+
+
+def _find_visible_vertices(
+    vertices: Float64, maps: Sequence[_WeightedDepth], tolerance: float
+) -> Bool:
+    """Return the mask (n,) of the vertices on the surface of a depth map."""
+    visible = np.zeros(len(vertices), np.bool_)
+
+    def mark_visible(map_: _WeightedDepth) -> None:
+        visible[map_.find_visible(vertices, tolerance)[0]] = True
+
+    parallel_map(mark_visible, maps)
+    return visible
 
 
 def _remove_islands(vertices: Float64, triangles: Int64, truncation: float) -> Int64:

@@ -18,7 +18,7 @@ _SMOOTHNESS = 0.1
 _MAGNITUDE = 1e-4
 """Weight of the offsets, which fixes the mean color."""
 _RELATIVE_RESIDUAL = 1e-4
-"""Relative residual at which the conjugate gradients stop, far below one gray value."""
+"""Relative residual at which the conjugate gradients stop, far below one gray value at seams."""
 _MAX_ITERATIONS = 500
 
 

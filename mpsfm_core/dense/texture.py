@@ -234,6 +234,8 @@ def _level_texture(charts: _Charts, colors: Float64, positions: Float64, texture
     # Pixels around a chart get the mean offset of the chart's pixels nearby.
     side = 2 * _PADDING + 1
     weight = cv2.blur(inside.astype(np.float32), (side, side))[..., None]
-    nearby = cv2.blur(values, (side, side)) / np.maximum(weight, np.float32(1e-6))
-    values = np.where(inside[..., None], values, nearby)
-    np.copyto(texture, np.clip(np.round(texture + values), 0, 255).astype(np.uint8))
+    leveled = cv2.blur(values, (side, side))
+    leveled /= np.maximum(weight, np.float32(1e-6))
+    np.copyto(leveled, values, where=inside[..., None])
+    leveled += texture
+    texture[...] = np.clip(np.round(leveled, out=leveled), 0, 255, out=leveled)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mpsfm_core.data import Float32, Float64, Int64
-from mpsfm_core.dense.mesh_visibility import projected_areas
+from mpsfm_core.dense.mesh_visibility import map_projected_areas
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 from mpsfm_core.support.jit import kernel
 
@@ -99,13 +99,15 @@ def find_neighbors(triangles: Int64) -> Int64:
 def _find_candidates(
     vertices: Float64, triangles: Int64, images: Sequence[RegisteredImage]
 ) -> _Candidates:
-    faces, views, areas = [], [], []
-    for index, projected in enumerate(projected_areas(vertices, triangles, images, _MIN_COSINE)):
-        seen = np.flatnonzero(projected > 0)
-        faces.append(seen)
-        views.append(np.full(len(seen), index))
-        areas.append(projected[seen])
-    face, view, area = (np.concatenate(parts) for parts in (faces, views, areas))
+    def select_seen(areas: Float64) -> tuple[Int64, Float64]:
+        seen = np.flatnonzero(areas > 0)
+        return seen, areas[seen]
+
+    faces, areas = zip(
+        *map_projected_areas(select_seen, vertices, triangles, images, _MIN_COSINE), strict=True
+    )
+    face, area = np.concatenate(faces), np.concatenate(areas)
+    view = np.repeat(np.arange(len(images)), [len(seen) for seen in faces])
     order = np.argsort(face, kind="stable")
     face, view, area = face[order], view[order], area[order]
     largest = np.zeros(len(triangles))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
+from threadpoolctl import threadpool_limits
 
 from mpsfm_core.data import DepthPrior, Float64, Pose, View
 from mpsfm_core.data.errors import InputError
@@ -28,7 +29,7 @@ from mpsfm_core.results.depth_maps import read_depth_map, write_depth_maps
 from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.results.mesh import write_mesh
 from mpsfm_core.results.ply import write_cloud
-from mpsfm_core.support.disk_arrays import DiskArrays
+from mpsfm_core.support.disk_arrays import DiskArrays, store_fields
 from mpsfm_core.support.files import lock_output_folder, replace_entries
 from mpsfm_core.support.threads import limit_threads
 
@@ -161,12 +162,20 @@ def mesh_model(
         InputError: folder or photos cannot be read, depth maps are missing or give no surface, or
             the libraries for meshes are not installed.
     """
-    with lock_output_folder(Path(folder)):
+    with (
+        lock_output_folder(Path(folder)),
+        limit_threads(None),
+        # The threads of this package use all cores, and more threads of BLAS wait for a core.
+        threadpool_limits(1, user_api="blas"),
+    ):
         source = ExportSource.read(Path(folder), None if photos is None else Path(photos))
         poses = reconstruction_poses(source.model)
         files = [source.folder / DEPTH / f"{name}.npz" for name in source.names]
+        disk = DiskArrays(cache_folder())
         depths = [
-            read_depth_map(file)[1] if file.is_file() and name not in source.held_out else None
+            store_fields(read_depth_map(file)[1], disk.store)
+            if file.is_file() and name not in source.held_out
+            else None
             for name, file in zip(source.names, files, strict=True)
         ]
         posed = _reconstruction_of_maps(
@@ -178,7 +187,7 @@ def mesh_model(
             )
         options = options or MeshOptions()
         view_of = _view_of(source.images)
-        mesh = mesh_depth_maps(posed, view_of, options)
+        mesh = mesh_depth_maps(posed, view_of, options, disk.store)
         textured = None
         if options.max_texture_size:
             textured = build_texture(mesh, posed, view_of, options.max_texture_size)

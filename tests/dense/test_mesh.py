@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 from mpsfm_core.cli import build_app
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.dense.fusion import find_seen_through
+from mpsfm_core.dense.fusion import find_seen_through, select_voters
 from mpsfm_core.dense.mesh import TriangleMesh, mesh_depth_maps
 from mpsfm_core.dense.mesh_visibility import find_observed_triangles
 from mpsfm_core.dense.options import MeshOptions
@@ -29,6 +29,7 @@ from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.results.colmap_model import build_model, write_model
 from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.obj import read_obj
+from mpsfm_core.support.disk_arrays import DiskArrays
 
 from .conftest import CAMERA, Room
 
@@ -105,6 +106,29 @@ def test_max_triangles_limits_mesh(room: Room, mesh: TriangleMesh) -> None:
     assert np.median(cKDTree(surface(room)).query(small.vertices)[0]) < 0.05
 
 
+def test_mesh_of_scene_with_many_voxels_has_larger_voxels(
+    room: Room, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sizes = []
+
+    def simplify(points: np.ndarray, faces: np.ndarray, target_count: int) -> tuple[Any, Any]:
+        sizes.append(len(faces))
+        return points, faces
+
+    monkeypatch.setattr("fast_simplification.simplify", simplify)
+    for limit in (4000, 1000):
+        options = MeshOptions(max_triangles=limit)
+        mesh_depth_maps(measured(room, std=0.0), room.views.__getitem__, options)
+    assert limit < sizes[1] < 0.5 * sizes[0] and sizes[1] < 8 * limit
+
+
+def test_mesh_from_stored_maps_is_equal(room: Room, mesh: TriangleMesh, tmp_path: Path) -> None:
+    disk = DiskArrays(tmp_path, in_memory=0)
+    again = mesh_depth_maps(measured(room), room.views.__getitem__, MeshOptions(), disk.store)
+    for expected, actual in zip(mesh, again, strict=True):
+        np.testing.assert_array_equal(actual, expected)
+
+
 def test_mesh_ignores_uncertain_wrong_map(room: Room) -> None:
     exact = measured(room)
     wrong = exact.images[1].depth
@@ -160,11 +184,12 @@ def test_mesh_does_not_close_wide_hole_or_hole_with_step(
 def test_find_seen_through_nearer_pixels_than_surface_excluded(room: Room) -> None:
     images = list(measured(room, std=0.0).images)
     masks = [np.ones(image.depth.shape, np.bool_) for image in images]
-    assert np.mean(find_seen_through(images, masks, masks, 0.02)[0]) < 0.1
+    voters = select_voters(images)
+    assert np.mean(find_seen_through(images, voters, masks, masks, 0.02)[0]) < 0.1
     near = images[0].depth.depth.copy()
     near[10:20, 40:60] *= 0.8
     images[0] = replace(images[0], depth=DepthPrior.from_arrays(near, (0.3 * near) ** 2))
-    seen_through = find_seen_through(images, masks, masks, 0.02)[0]
+    seen_through = find_seen_through(images, select_voters(images), masks, masks, 0.02)[0]
     assert seen_through[10:20, 40:60].mean() > 0.9
 
 
