@@ -54,7 +54,7 @@ def map_projected_areas(
     images: Sequence[RegisteredImage],
     min_cosine: float,
 ) -> list[Result]:
-    """Call a function on the projected areas of all triangles in each image, in parallel threads.
+    """Call a function on the projected areas of the triangles in each image, in threads.
 
     Args:
         function: Function of the area (m,) of each triangle in pixels of an image, 0 if the

@@ -28,8 +28,6 @@ _MIN_COSINE = 0.1
 photos stretch steeper surfaces."""
 _SMOOTHNESS_STEPS = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 1.0, 1.0, 1.0)
 """Weight of the smoothness term in each pass of the label optimization."""
-
-
 _NUM_DIFFUSIONS = 10
 """Number of averages of the data term with the neighboring triangles."""
 

@@ -99,6 +99,19 @@ def read_ply(path: Path) -> tuple[Float64, UInt8]:
     return _read_vertices(path, _parse_ply(path))
 
 
+def read_normals(path: Path) -> Float32 | None:
+    """Read the normals (n, 3) of the points of a PLY file, None if the file has none.
+
+    Raises:
+        InputError: as :func:`read_ply`.
+    """
+    vertices = _read_vertex_table(path, _parse_ply(path))
+    axes = ("nx", "ny", "nz")
+    if not set(axes) <= set(vertices.dtype.names or ()):
+        return None
+    return np.stack([vertices[axis] for axis in axes], axis=1).astype(np.float32)
+
+
 def read_mesh(path: Path) -> tuple[Float64, UInt8, Int64]:
     """Read the vertices and triangles of a text or binary PLY file.
 
@@ -114,20 +127,24 @@ def read_mesh(path: Path) -> tuple[Float64, UInt8, Int64]:
     return *_read_vertices(path, file), _read_triangles(path, file)
 
 
-def _read_vertices(path: Path, file: _PlyFile) -> tuple[Float64, UInt8]:
+def _read_vertex_table(path: Path, file: _PlyFile) -> NDArray[Any]:
+    """Return the vertices (n,) as a structured array."""
     encoding, _, vertex, count, body = file
     if encoding == "ascii":
-        vertices = _read_text(path, body, vertex, count)
-    elif len(body) < count * vertex.itemsize:
+        return _read_text(path, body, vertex, count)
+    if len(body) < count * vertex.itemsize:
         raise InputError(f"PLY file {path} is cut off: the header has {count} points")
-    else:
-        vertices = np.frombuffer(body, vertex, count)
+    return np.frombuffer(body, vertex, count)
+
+
+def _read_vertices(path: Path, file: _PlyFile) -> tuple[Float64, UInt8]:
+    vertices = _read_vertex_table(path, file)
     points = np.stack([vertices[axis] for axis in "xyz"], axis=1).astype(np.float64)
     if not np.isfinite(points).all():
         raise InputError(f"PLY file {path} has points that are not finite")
     rgb = ("red", "green", "blue")
-    if not set(rgb) <= set(vertex.names or ()):
-        return points, np.full((count, 3), 128, np.uint8)
+    if not set(rgb) <= set(vertices.dtype.names or ()):
+        return points, np.full((len(points), 3), 128, np.uint8)
     return points, np.stack([vertices[color] for color in rgb], axis=1).astype(np.uint8)
 
 

@@ -4,8 +4,12 @@
 
     images/NAME          undistorted images
     sparse/0/            their COLMAP model: pinhole cameras, colored points
-    gaussians.ply        one Gaussian for each point: center, color and size
+    sparse/0/points3D.ply  dense points with normals, for Inria's code
+    gaussians.ply        one Gaussian for each dense point: center, color and size
     maps/NAME.npz        refined depth and normals with their std
+
+The dense points are in the COLMAP model too, without tracks, because gsplat and OpenSplat start
+from all points of the model.
 """
 
 from __future__ import annotations
@@ -13,11 +17,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 from scipy.spatial import cKDTree
 
-from mpsfm_core.data import Float64, UInt8
+from mpsfm_core.data import Float32, Float64, UInt8
 from mpsfm_core.results.colmap_model import write_model
 from mpsfm_core.results.exports.source import ExportSource
+from mpsfm_core.results.ply import write_ply
 from mpsfm_core.support.npz import write_npz
 
 ENTRIES = ("images", "sparse", "gaussians.ply", "maps")
@@ -34,23 +40,31 @@ _SH_0 = 0.28209479177387814
 def write(source: ExportSource, folder: Path) -> None:
     """Write a Gaussian splatting folder; raise ``InputError`` if image files are missing."""
     source.write_photos(folder / "images")
-    write_model(folder / "sparse" / "0", source.undistorted())
     write_maps(source, folder / "maps")
-    points, colors = initial_points(source)
+    points, colors, normals = initial_points(source)
+    model = source.undistorted()
+    if source.has_dense_points:
+        for point, color in zip(points, colors, strict=True):
+            model.add_point3D(point, pycolmap.Track(), color)
+    write_model(folder / "sparse" / "0", model)
+    if source.has_dense_points:
+        write_ply(folder / "sparse" / "0" / "points3D.ply", points, colors, normals)
     if len(points) > _NEIGHBOURS:
         write_gaussians(folder / "gaussians.ply", points, colors)
 
 
-def initial_points(source: ExportSource) -> tuple[Float64, UInt8]:
-    """Return positions and colors of the points from which splatting starts.
+def initial_points(source: ExportSource) -> tuple[Float64, UInt8, Float32]:
+    """Return positions, colors and normals of the points from which splatting starts.
 
     The points are a random subset of the fused depth maps, or of the 3D points without depth maps.
+    Unknown normals are zero.
     """
     points, colors = source.dense_points()
+    normals = source.dense_normals()
     if len(points) <= _MAX_GAUSSIANS:
-        return points, colors
+        return points, colors, normals
     chosen = np.random.default_rng(0).choice(len(points), _MAX_GAUSSIANS, replace=False)
-    return points[chosen], colors[chosen]
+    return points[chosen], colors[chosen], normals[chosen]
 
 
 def write_maps(source: ExportSource, folder: Path) -> None:

@@ -6,7 +6,7 @@
     images/NAME          undistorted images
     depths/NAME.npy      refined depth, (h, w) float32, thousandths of a unit, 0 where unknown
     maps/NAME.npz        depth and normals with std, as for gsplat
-    sparse_pc.ply        colored points of the fused depth maps, from which splatting starts
+    sparse_pc.ply        colored points of the fused depth maps with normals, to start splatting
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ import numpy as np
 import pycolmap
 from scipy.spatial.transform import Rotation
 
-from mpsfm_core.data import DepthPrior, Float64, NormalPrior, PinholeCamera, UInt8
+from mpsfm_core.data import DepthPrior, Float32, Float64, NormalPrior, PinholeCamera, UInt8
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.data.result_layout import DENSE, DEPTH, SUMMARY, TRAJECTORY
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
@@ -25,7 +25,7 @@ from mpsfm_core.providers.builtin.options import NormalsFromDepthOptions
 from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.gravity import Gravity, estimate_gravity, rotation_to_z
 from mpsfm_core.results.original_images import export_view, exported_image_name
-from mpsfm_core.results.ply import read_ply
+from mpsfm_core.results.ply import read_normals, read_ply
 from mpsfm_core.results.summary import read_summary
 from mpsfm_core.results.trajectory import read_trajectory_rows
 
@@ -200,14 +200,27 @@ class ExportSource:
         xyz = np.array([point.xyz for point in points], dtype=np.float64).reshape(-1, 3)
         return xyz, np.array([point.color for point in points], dtype=np.uint8).reshape(-1, 3)
 
+    @property
+    def has_dense_points(self) -> bool:
+        """True if the folder has a cloud of fused depth maps."""
+        return (self.folder / DENSE).is_file()
+
     def dense_points(self) -> tuple[Float64, UInt8]:
         """Return positions and colors of the fused depth maps, else of the 3D points."""
-        path = self.folder / DENSE
-        if not path.is_file():
+        if not self.has_dense_points:
             return self.points()
-        points, colors = read_ply(path)
+        points, colors = read_ply(self.folder / DENSE)
         moved: Float64 = self.world_from_model * points
         return moved, colors
+
+    def dense_normals(self) -> Float32:
+        """Return the unit normals (n, 3) of :meth:`dense_points`, zero if they are unknown."""
+        normals = read_normals(self.folder / DENSE) if self.has_dense_points else None
+        if normals is None:
+            return np.zeros((len(self.dense_points()[0]), 3), np.float32)
+        turn = self.world_from_model.rotation.matrix()
+        turned: Float32 = (normals @ turn.T).astype(np.float32)
+        return turned
 
     def trajectory(self) -> tuple[Float64, Float64, Float64] | None:
         """Read the poses of the frames of a video, None if the folder has no trajectory.

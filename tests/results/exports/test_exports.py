@@ -18,7 +18,7 @@ from mpsfm_core.inputs.nerfstudio import read_transforms
 from mpsfm_core.providers import ExportFormat
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.results.exports.formats import FORMATS, export
-from mpsfm_core.results.ply import read_ply
+from mpsfm_core.results.ply import read_normals, read_ply
 
 REGISTERED = ["2.webp.jpg", "a/0.png", "a/1.jpg"]
 """Names of the undistorted photos; the fourth photo is only tentatively registered."""
@@ -77,6 +77,11 @@ def test_plugins_add_formats(result: Path, tmp_path: Path, install_plugin) -> No
         export(result, "rerun", tmp_path / "out", registry=Registry())
 
 
+def tracked_points(model: pycolmap.Reconstruction) -> list[pycolmap.Point3D]:
+    """Return the points with observations, sorted by id."""
+    return [point for _, point in sorted(model.points3D.items()) if point.track.length()]
+
+
 @pytest.mark.parametrize("turn", [True, False])
 def test_gsplat_reads_the_folder(result: Path, tmp_path: Path, turn: bool) -> None:
     """Read the folder step by step like gsplat's examples/datasets/colmap.py."""
@@ -91,10 +96,34 @@ def test_gsplat_reads_the_folder(result: Path, tmp_path: Path, turn: bool) -> No
     for image in model.images.values():
         camera = model.cameras[image.camera_id]
         assert cv2.imread(str(folder / image.name)).shape == (camera.height, camera.width, 3)
-    assert model.num_points3D() == 60
-    assert model.compute_mean_reprojection_error() < 1e-3
+    tracked = tracked_points(model)
+    assert len(tracked) == 60
+    assert max(point.error for point in tracked) < 1e-3
+    ids = sorted(i for i in model.points3D if not model.points3D[i].track.length())
+    dense = np.array([model.points3D[i].xyz for i in ids])
+    points, _ = read_ply(tmp_path / "sparse" / "0" / "points3D.ply")
+    np.testing.assert_allclose(dense, points, atol=1e-5)
+    assert len(dense) == len(read_ply(result / "dense.ply")[0])
     colors = np.array([point.color for point in model.points3D.values()])
     assert colors.std(axis=0).min() > 1
+
+
+@pytest.mark.parametrize(
+    ("format_name", "file"), [("gsplat", "sparse/0/points3D.ply"), ("nerfstudio", "sparse_pc.ply")]
+)
+def test_initial_points_have_normals_in_the_exported_world(
+    result: Path, tmp_path: Path, format_name: str, file: str
+) -> None:
+    """The order of the properties is the one that OpenSplat requires."""
+    described = export(result, format_name, tmp_path, turn=True)
+    header = (tmp_path / file).read_bytes().partition(b"end_header")[0].decode().splitlines()
+    names = [line.split()[-1] for line in header if line.startswith("property")]
+    assert names == ["x", "y", "z", "nx", "ny", "nz", "red", "green", "blue"]
+    matrix = np.array(described["world_from_model"])[:3, :3]
+    rotation = matrix / np.cbrt(np.linalg.det(matrix))
+    expected = read_normals(result / "dense.ply") @ rotation.T
+    np.testing.assert_allclose(read_normals(tmp_path / file), expected, atol=1e-5)
+    assert np.linalg.norm(expected, axis=1).mean() > 0.8
 
 
 def test_gaussians_have_position_color_and_size(result: Path, tmp_path: Path) -> None:
@@ -154,12 +183,12 @@ def test_nerfstudio_has_depth_of_every_frame_and_keeps_gravity(
 def test_nerfstudio_points_have_the_layout_that_opensplat_reads(
     result: Path, tmp_path: Path
 ) -> None:
-    """OpenSplat reads three floats and three bytes per point, and ignores other properties."""
+    """OpenSplat reads positions, normals if the header has them, and then three colors."""
     export(result, "nerfstudio", tmp_path, turn=False)
     data = (tmp_path / "sparse_pc.ply").read_bytes()
     header, _, body = data.partition(b"end_header\n")
     assert header.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex")
-    rows = np.frombuffer(body, [("xyz", "<f4", 3), ("rgb", "u1", 3)])
+    rows = np.frombuffer(body, [("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
     points, colors = read_ply(result / "dense.ply")
     np.testing.assert_allclose(rows["xyz"], points, atol=1e-6)
     np.testing.assert_array_equal(rows["rgb"], colors)
@@ -220,7 +249,7 @@ def test_aligned_exports_have_gravity_down_and_a_centered_origin(
     truth = np.array([0.0, 0.0, 1.0])  # z is up in the synthetic room
     assert angle_between_deg(turned[:, :3] @ truth, np.array([0, 0, 1.0])) < 0.5
     model = pycolmap.Reconstruction(str(tmp_path / "sparse" / "0"))
-    middle = np.median([point.xyz for point in model.points3D.values()], axis=0)
+    middle = np.median([point.xyz for point in tracked_points(model)], axis=0)
     np.testing.assert_allclose(middle, 0, atol=1e-9)
 
 
@@ -238,7 +267,7 @@ def test_aligned_export_is_in_meters_if_the_scale_is_known(result: Path, tmp_pat
     assert described["scale_spread"] == 0.4
     exported = folder / "exports" / "gsplat"
     model = pycolmap.Reconstruction(str(exported / "sparse" / "0"))
-    points = np.array([model.points3D[i].xyz for i in sorted(model.points3D)])
+    points = np.array([point.xyz for point in tracked_points(model)])
     before = np.array([p.xyz for _, p in sorted(model_of(result).points3D.items())])
     lengths = [np.linalg.norm(cloud[1:] - cloud[0], axis=1) for cloud in (points, before)]
     np.testing.assert_allclose(lengths[0], 2 * lengths[1], rtol=1e-6)
