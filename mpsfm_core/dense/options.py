@@ -36,7 +36,8 @@ class MeshOptions(Options):
     voxel_px: float = Field(2.0, gt=0)
     """Voxel size in pixels of the depth maps at their median depth.
 
-    Smaller voxels reproduce noise of the depth maps and need more memory."""
+    Smaller voxels reproduce noise of the depth maps and need more memory. Large scenes get larger
+    voxels, so that memory is bounded by ``max_triangles``."""
     max_hole_px: float = Field(32.0, ge=0)
     """Maximum width of a closed part of a hole in pixels of the depth maps; 0 closes no holes.
 

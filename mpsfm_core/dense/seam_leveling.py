@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.linalg import cg
+from threadpoolctl import threadpool_limits
 
 from mpsfm_core.data import Float32, Float64, Int64
 
@@ -47,16 +48,18 @@ def level_seams(colors: Float64, vertices: Int64, triangles: Int64) -> Float32:
     difference = colors[first] - colors[second]
     offsets = np.zeros((count, 3), np.float32)
     preconditioner = diags_array(1 / matrix.diagonal())
-    for channel in range(3):
-        right = np.bincount(second, difference[:, channel], count)
-        right -= np.bincount(first, difference[:, channel], count)
-        offsets[:, channel], _ = cg(
-            matrix,
-            right,
-            rtol=_RELATIVE_RESIDUAL,
-            maxiter=_MAX_ITERATIONS,
-            M=preconditioner,
-        )
+    # The dot products of conjugate gradients are so short that threads of BLAS mostly wait.
+    with threadpool_limits(1, user_api="blas"):
+        for channel in range(3):
+            right = np.bincount(second, difference[:, channel], count)
+            right -= np.bincount(first, difference[:, channel], count)
+            offsets[:, channel], _ = cg(
+                matrix,
+                right,
+                rtol=_RELATIVE_RESIDUAL,
+                maxiter=_MAX_ITERATIONS,
+                M=preconditioner,
+            )
     return offsets
 
 

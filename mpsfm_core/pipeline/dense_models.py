@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from threadpoolctl import threadpool_limits
 
 from mpsfm_core.data import DepthPrior, Float64, Pose, View
 from mpsfm_core.data.errors import InputError
@@ -162,12 +161,7 @@ def mesh_model(
         InputError: folder or photos cannot be read, depth maps are missing or give no surface, or
             the libraries for meshes are not installed.
     """
-    with (
-        lock_output_folder(Path(folder)),
-        limit_threads(None),
-        # The threads of this package use all cores, and more threads of BLAS wait for a core.
-        threadpool_limits(1, user_api="blas"),
-    ):
+    with lock_output_folder(Path(folder)), limit_threads(None):
         source = ExportSource.read(Path(folder), None if photos is None else Path(photos))
         poses = reconstruction_poses(source.model)
         files = [source.folder / DEPTH / f"{name}.npz" for name in source.names]
