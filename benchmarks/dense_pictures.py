@@ -27,8 +27,8 @@ from mpsfm_core.dense.mesh import mesh_depth_maps
 from mpsfm_core.dense.options import DenseOptions, MeshOptions
 from mpsfm_core.dense.stereo import StereoDepth
 from mpsfm_core.dense.texture import build_texture
-from mpsfm_core.evaluation.rendering import Geometry, render
 from mpsfm_core.geometry import camera_center
+from mpsfm_core.geometry.rendering import Geometry, render
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.testing.synthetic.scenes import look_at

@@ -23,8 +23,8 @@ import mpsfm_core as mpsfm
 from benchmarks._scenes import shared_folder
 from mpsfm_core.config.model import Config
 from mpsfm_core.data.result_layout import DENSE, MESH_GLB, SUMMARY
-from mpsfm_core.evaluation.held_out import evaluate_held_out
 from mpsfm_core.pipeline.dense_models import mesh_model
+from mpsfm_core.results.held_out import evaluate_held_out
 
 SETS = {
     "lund_door": "photos/lund_door",

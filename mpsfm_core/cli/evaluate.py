@@ -97,7 +97,7 @@ def evaluate(
     names = _select_names(images, image_list)
     report: dict[str, Any] = {}
     if held_out:
-        from mpsfm_core.evaluation.held_out import evaluate_held_out
+        from mpsfm_core.results.held_out import evaluate_held_out
 
         report["held_out"] = evaluate_held_out(model, photos, names, geometry)
     elif geometry is not None:

@@ -202,6 +202,7 @@ class _ImageEntries:
     def __init__(self, result: ResultFolder, maps: Mapping[str, RefinedMap | None]) -> None:
         self._result = result
         self._maps = maps
+        self._renderings = result.held_out_renderings()
         self._images = {image.name: image for image in result.model.images.values()}
         self._partners = partner_counts(result.summary)
         self._matched = Counter(
@@ -242,6 +243,7 @@ class _ImageEntries:
             "partners": self._partners[name] if explained is None else self._matched[name],
             "depth_std": details["median_relative_depth_std"],
             "valid_depth": details["valid_depth"],
+            "rendering": self._renderings.get(name),
             "focal": details["focal_length_px"],
             "focal_from": details["focal_length_from"],
             "refined_focal": details.get("refined_focal_length_px"),

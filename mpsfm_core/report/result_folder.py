@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,15 +15,17 @@ import pycolmap
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.data.result_layout import DENSE, DEPTH, SUMMARY, VIEWS
+from mpsfm_core.data.result_layout import DENSE, DEPTH, MESH_OBJ, MESH_PLY, SUMMARY, VIEWS
 from mpsfm_core.inputs.models import read_model
 from mpsfm_core.results.depth_maps import load_depth_map
+from mpsfm_core.results.held_out import evaluate_held_out
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.summary import read_summary
 from mpsfm_core.results.trajectory import read_trajectory_rows
 from mpsfm_core.results.views import MATCHES
 from mpsfm_core.support.npz import read_npz
 
+_log = logging.getLogger(__name__)
 _UNREADABLE = (ValueError, KeyError, TypeError, IndexError)
 
 
@@ -122,6 +125,28 @@ class ResultFolder:
         if self.failed or not file.is_file():
             return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
         return read_ply(file)
+
+    def held_out_renderings(self) -> dict[str, dict[str, Any]]:
+        """Compare renderings of the best geometry with the held-out photos.
+
+        Returns:
+            Name of the rendered file (``geometry``), ratio of covered pixels (``covered``),
+            ``psnr`` in dB and ``ssim`` by image name; empty without held-out photos, photo files or
+            geometry.
+        """
+        if self.failed or not self.summary["images"].get("held_out"):
+            return {}
+        try:
+            geometries = evaluate_held_out(self.path)["geometries"]
+        except InputError as error:
+            _log.info("%s", error)
+            return {}
+        best = next(file for file in (MESH_OBJ, MESH_PLY, DENSE) if file in geometries)
+        metrics = ("covered", "psnr", "ssim")
+        return {
+            name: {"geometry": best, **{metric: image[metric] for metric in metrics}}
+            for name, image in geometries[best]["per_image"].items()
+        }
 
     def refined(self, name: str) -> RefinedMap | None:
         """Read the refined depth of an image, None if the run wrote no depth map."""

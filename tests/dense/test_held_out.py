@@ -14,13 +14,13 @@ from typer.testing import CliRunner
 from mpsfm_core.cli import build_app
 from mpsfm_core.data import DepthPrior, PinholeCamera, View
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.evaluation.held_out import compare_rendering, evaluate_held_out
-from mpsfm_core.evaluation.rendering import Geometry, Rendering, render
 from mpsfm_core.geometry import pixel_centers, rays, unproject
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
+from mpsfm_core.geometry.rendering import Geometry, Rendering, render
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, MappingResult, hold_out
 from mpsfm_core.results.colmap_model import build_model, write_model
 from mpsfm_core.results.depth_maps import write_depth_maps
+from mpsfm_core.results.held_out import compare_rendering, evaluate_held_out
 from mpsfm_core.results.ply import read_ply, write_ply
 
 from .conftest import CAMERA, Room

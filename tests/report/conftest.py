@@ -62,6 +62,17 @@ def walked(finished: Path, tmp_path: Path) -> Path:
     return folder
 
 
+@pytest.fixture
+def held_out(finished: Path, tmp_path: Path) -> Path:
+    """Return a copy of the finished folder, as if the dense stage had ignored the photo 1.png."""
+    folder = Path(shutil.copytree(finished, tmp_path / "held_out"))
+    summary = json.loads((folder / "summary.json").read_text())
+    summary["images"]["held_out"] = ["1.png"]
+    (folder / "summary.json").write_text(json.dumps(summary))
+    write_report(folder)
+    return folder
+
+
 @pytest.fixture(scope="session")
 def failed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the result folder of a failed run with three photos of noise."""

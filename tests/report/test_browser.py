@@ -179,3 +179,17 @@ def test_first_screen_of_failed_run_shows_remedy(opened: Open, failed: Path) -> 
     )
     wait_for(browser, "document.querySelector('#photo img.main').naturalWidth > 0")
     assert [line for line in browser.get_log("browser") if line["level"] == "SEVERE"] == []
+
+
+def test_photo_panel_shows_the_prediction_of_a_held_out_photo(opened: Open, held_out: Path) -> None:
+    browser = opened(held_out)
+    wait_for(browser, "window.report !== undefined")
+    for name, shown in (("1.png", True), ("2.png", False)):
+        browser.execute_script(
+            "[...document.querySelectorAll('#table tbody tr')]"
+            ".find((row) => row.cells[0].innerText.includes(arguments[0])).click()",
+            name,
+        )
+        wait_for(browser, "document.querySelector('#photo h3').innerText === arguments[0]", name)
+        text = browser.execute_script("return document.getElementById('photo').innerText")
+        assert ("dense.ply" in text) == ("PSNR" in text) == shown

@@ -17,6 +17,7 @@ from mpsfm_core.data.errors import InputError
 from mpsfm_core.data.result_layout import REPORT
 from mpsfm_core.report.page import render, write_report
 from mpsfm_core.report.result_folder import ResultFolder
+from mpsfm_core.results.held_out import evaluate_held_out
 
 
 def data_of(page: str) -> dict[str, Any]:
@@ -89,6 +90,15 @@ def test_report_lists_refined_lens_parameters_of_a_photo(finished: Path, tmp_pat
     first, *others = data["photos"]
     assert first["lens"] == [["k3", 0.02, 0.001, 3]]
     assert all(photo["lens"] == [] for photo in others)
+
+
+def test_report_states_how_well_held_out_photos_are_predicted(held_out: Path) -> None:
+    photos = data_of((held_out / REPORT).read_text(encoding="utf-8"))["photos"]
+    renderings = {photo["name"]: photo["rendering"] for photo in photos if photo["rendering"]}
+    expected = evaluate_held_out(held_out)["geometries"]["dense.ply"]["per_image"]
+    metrics = {name: expected["1.png"][name] for name in ("covered", "psnr", "ssim")}
+    assert renderings == {"1.png": {"geometry": "dense.ply", **metrics}}
+    assert metrics["covered"] > 0.5 and metrics["psnr"] > 10
 
 
 def test_report_has_the_poses_of_the_frames_of_a_video(walked: Path) -> None:

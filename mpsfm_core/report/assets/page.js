@@ -129,6 +129,7 @@
     ];
     const frame = data.frames.find(({ photos: rows }) => rows.includes(photos.indexOf(photo)));
     if (frame) facts.push(["Frame", frame.name], ["Frame position", [3, 7, 11].map((i) => number(frame.pose[i], 2)).join(", ")]);
+    if (photo.rendering) facts.push(...renderingFacts(photo.rendering));
     for (const [name, value, std, digits] of photo.lens) facts.push([name, `${number(value, digits)} ± ${number(std, digits)}`]);
     know.append(el("dl", { class: "small" }, ...facts.map(([k, v]) => el("div", {}, el("dt", {}, k), el("dd", {}, v)))));
     know.append(el("h4", {}, partners[row].length ? `Matches with ${plural(partners[row].length, "photo")}` : "Matches no other photo"));
@@ -220,6 +221,12 @@
     listeners.push((row) => {
       for (const button of byId("strip").children) button.classList.toggle("on", Number(button.dataset.row) === row);
     });
+  }
+
+  // How well would a held-out photo have been predicted? Uncovered photos have no PSNR.
+  function renderingFacts({ geometry, covered, psnr, ssim }) {
+    const value = psnr === null ? "–" : `${number(psnr, 1)} dB, SSIM ${number(ssim, 2)}`;
+    return [["Held out, predicted by", geometry], ["Covered", percent(covered)], ["PSNR of the prediction", value]];
   }
 
   // ---------------------------------------------------------------- table

@@ -15,8 +15,8 @@ import numpy as np
 from mpsfm_core.data import Bool, DepthPrior, Float32, Pose, View
 from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.data.result_layout import DENSE, DEPTH, MESH_OBJ, MESH_PLY
-from mpsfm_core.evaluation.rendering import Geometry, Rendering, render, splat_radii
 from mpsfm_core.geometry import resize_map
+from mpsfm_core.geometry.rendering import Geometry, Rendering, render, splat_radii
 from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.results.depth_maps import read_depth_map
 from mpsfm_core.results.exports.source import ExportSource
@@ -70,7 +70,8 @@ def evaluate_held_out(
         )
     independent = set(names) <= set(recorded) if recorded and geometry is None else None
     poses = reconstruction_poses(source.model)
-    views = dict(zip(names, map(_resized, _views(source, names)), strict=True))
+    rows = {name: row for row, name in enumerate(source.names)}
+    views = {name: _resized(source.images.view(rows[name])) for name in names}
     depths = {name: _read_depth(source.folder, name) for name in names}
     return {
         "images": list(names),
@@ -151,11 +152,6 @@ def _select_names(
     return list(names or [name for name in recorded if name in known] or known)
 
 
-def _views(source: ExportSource, names: Sequence[str]) -> list[View]:
-    rows = {name: row for row, name in enumerate(source.names)}
-    return [source.images.view(rows[name]) for name in names]
-
-
 def _resized(view: View) -> View:
     """Reduce a view to at most :data:`_MAX_SIZE` pixels."""
     width, height = view.camera.size
@@ -201,8 +197,8 @@ def _correct_colors(rendered: Float32, photo: Float32, covered: Bool) -> Float32
     return corrected
 
 
-def _ssim(rendered: Float32, photo: Float32, covered: Bool) -> float:
-    """Compute the mean structural similarity over covered pixels [Wang et al. 2004]."""
+def _ssim(rendered: Float32, photo: Float32, covered: Bool) -> float | None:
+    """Compute the mean SSIM [Wang et al. 2004] over covered pixels, None for tiny images."""
     try:
         from skimage.metrics import structural_similarity
     except ImportError as error:
@@ -213,7 +209,7 @@ def _ssim(rendered: Float32, photo: Float32, covered: Bool) -> float:
     filled = np.where(covered[..., None], rendered, photo)
     window = 2 * round(3.5 * _SSIM_STD_PX) + 1
     if min(covered.shape) < window:
-        return float("nan")
+        return None
     _, similarity = structural_similarity(
         filled,
         photo,
