@@ -33,7 +33,7 @@ from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.options import InputOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.pipeline.stages import peak_memory_mb
-from mpsfm_core.support.disk_arrays import DiskArrays
+from mpsfm_core.support.disk_arrays import store_on_disk
 
 _STD = 0.05
 """Relative std that is declared for the true depth maps."""
@@ -91,13 +91,8 @@ def measured(count: int) -> dict[str, float | None]:
     few = Reconstruction(tuple(images[:3]), model.points, model.errors_px)
     densify(few, lambda name: photo_of(original[name]), DenseOptions())  # compiles the kernels
     before, started = peak_memory_mb(), time.process_time()
-    with tempfile.TemporaryDirectory() as folder:
-        densify(
-            model,
-            lambda name: photo_of(original[name]),
-            DenseOptions(),
-            store_array=DiskArrays(Path(folder)).store,
-        )
+    with tempfile.TemporaryDirectory() as folder, store_on_disk(Path(folder)):
+        densify(model, lambda name: photo_of(original[name]), DenseOptions())
     return {
         "before_mb": before,
         "peak_mb": peak_memory_mb(),

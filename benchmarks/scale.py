@@ -52,7 +52,7 @@ from mpsfm_core.mapping.state import flatten_state, unflatten_state
 from mpsfm_core.pipeline.parts import PartMapper
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.support.disk_arrays import DiskArrays, store_fields
+from mpsfm_core.support.disk_arrays import current_store, store_fields, store_on_disk
 from mpsfm_core.support.npz import read_npz
 from mpsfm_core.support.threads import limit_threads
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors
@@ -153,20 +153,20 @@ def _run(hall: Path, method: str, part_images: int, path: Path) -> None:
     problem = problem_from_state(state["problem"])
     truth = {name: (rotation, shift) for name, (rotation, shift) in state["truth"].items()}
     del state
-    disk = DiskArrays(path.parent)
-    images = (
-        replace(
-            image,
-            depth=store_fields(image.depth, disk.store),
-            normals=store_fields(image.normals, disk.store),
+    with limit_threads(1), store_on_disk(path.parent):
+        images = (
+            replace(
+                image,
+                depth=store_fields(image.depth, current_store()),
+                normals=store_fields(image.normals, current_store()),
+            )
+            for image in problem.images
         )
-        for image in problem.images
-    )
-    problem = replace(problem, images=tuple(images))
-    initialize_process()
-    started, cpu_started = time.perf_counter(), _cpu_seconds()
-    with limit_threads(1), _watch_memory() as peaks_mib:
-        models = list(_map(problem, method, part_images, disk))
+        problem = replace(problem, images=tuple(images))
+        initialize_process()
+        started, cpu_started = time.perf_counter(), _cpu_seconds()
+        with _watch_memory() as peaks_mib:
+            models = list(_map(problem, method, part_images))
     seconds, cpu_seconds = time.perf_counter() - started, _cpu_seconds() - cpu_started
     largest = models[0] if models else {}
     errors = pose_errors_deg(largest, truth, CONVENTION)
@@ -202,9 +202,7 @@ def _watch_memory() -> Iterator[list[float]]:
         thread.join()
 
 
-def _map(
-    problem: MappingProblem, method: str, part_images: int, disk: DiskArrays
-) -> Iterator[Mapping[str, Pose]]:
+def _map(problem: MappingProblem, method: str, part_images: int) -> Iterator[Mapping[str, Pose]]:
     """Return the poses of each model, the largest first."""
     if method in PEERS:
         yield from run_peer(method, problem)
@@ -221,7 +219,7 @@ def _map(
             )
             part_mapper = PartMapper(runtime, Registry.discover(), Stages(Registry()))
         result = part_mapping.reconstruct(problem, options, map_parts=part_mapper)
-        models = compute_depth_maps(result.reconstructions, disk.store)
+        models = compute_depth_maps(result.reconstructions)
     for model in models:
         yield model.poses
 

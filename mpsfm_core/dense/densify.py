@@ -55,7 +55,7 @@ from mpsfm_core.dense.stereo import (
 from mpsfm_core.dense.view_selection import select_source_views
 from mpsfm_core.geometry import resize_map
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.support.disk_arrays import ArrayStore, store_fields, store_in_memory
+from mpsfm_core.support.disk_arrays import ArrayStore, current_store, store_fields
 from mpsfm_core.support.threads import thread_limit
 
 _NUM_SOURCES = 5
@@ -119,13 +119,13 @@ def densify(
     workers: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     checkpoints: StereoCheckpoints | None = None,
-    store_array: ArrayStore = store_in_memory,
     poses_use_depth: bool = True,
 ) -> tuple[Reconstruction, DenseReport]:
     """Refine the depth maps of a reconstruction by multi-view stereo.
 
     Images without confirmed pose, held-out images and images without overlap keep their depth
-    maps. The densified depth maps do not depend on the number of threads.
+    maps. The densified depth maps do not depend on the number of threads. Large arrays are stored
+    by :func:`~mpsfm_core.support.disk_arrays.current_store`.
 
     Args:
         reconstruction: Posed images with refined depth maps.
@@ -135,8 +135,6 @@ def densify(
         progress: Callback that receives the number of finished images and the number of all images.
         checkpoints: Storage of stereo depth, so that an interrupted run can resume (None stores
             nothing).
-        store_array: Thread-safe function that stores large arrays, including the returned depth
-            maps.
         poses_use_depth: True if depth priors constrained the poses. With depth priors, the scale of
             an image pair may depend on the priors alone, so a scale variance is added to the depth
             variance.
@@ -146,7 +144,7 @@ def densify(
         pixels.
     """
     images = reconstruction.dense_images
-    steps = _DensifySteps(images, view_of, options, checkpoints, store_array, poses_use_depth)
+    steps = _DensifySteps(images, view_of, options, checkpoints, poses_use_depth)
     rows = [row for row, views in enumerate(steps.sources) if views]
     with ThreadPoolExecutor(workers or thread_limit()) as pool:
         for row, image in zip(rows, pool.map(steps.match_image, rows), strict=True):
@@ -182,11 +180,10 @@ class _DensifySteps:
         view_of: Callable[[str], View],
         options: DenseOptions,
         checkpoints: StereoCheckpoints | None,
-        store_array: ArrayStore,
         poses_use_depth: bool,
     ) -> None:
         self._images, self._options, self._checkpoints = images, options, checkpoints
-        self._store_array, self._poses_use_depth = store_array, poses_use_depth
+        self._store_array, self._poses_use_depth = current_store(), poses_use_depth
         self._neighbors = select_source_views(images, max(_NUM_SOURCES, _MAX_SPLAT_VIEWS))
         self.sources = [views[:_NUM_SOURCES] for views in self._neighbors]
         self._compared_views = _symmetric_neighbors(self.sources)

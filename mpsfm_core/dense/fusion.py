@@ -87,24 +87,26 @@ def fuse_depth_maps(
     images = reconstruction.dense_images
     voters = select_voters(images)
 
-    def select_unique(_: int, pixels: Int64, votes: _ConsistencyVotes) -> tuple[Int64, UInt8]:
-        mask = votes.consistent & ~votes.duplicate
-        return pixels[mask], votes.views[mask]
+    def count_unique(row: int, pixels: Int64, votes: _ConsistencyVotes) -> UInt8:
+        return _map_views(images[row], pixels, votes, votes.consistent & ~votes.duplicate)
 
-    selected = _vote_on_images(images, voters, select_unique)
-    total = sum(len(pixels) for pixels, _ in selected)
+    counts = _vote_on_images(images, voters, count_unique)
+    total = sum(np.count_nonzero(of_image) for of_image in counts)
     ratio = min(1.0, max_points / max(1, total))
     rng = np.random.default_rng(seed)
-    for row, (pixels, views) in enumerate(selected):
-        sampled = np.sort(rng.choice(len(pixels), int(ratio * len(pixels)), replace=False))
-        selected[row] = pixels[sampled], views[sampled]
+    selected = []
+    for of_image in counts:
+        pixels = np.flatnonzero(of_image)
+        sampled = rng.choice(len(pixels), int(ratio * len(pixels)), replace=False)
+        selected.append(pixels[np.sort(sampled)])
 
     def build_cloud(row: int) -> FusedPointCloud:
-        image, (pixels, views) = images[row], selected[row]
+        image, pixels = images[row], selected[row]
         points, variance = _unproject_pixels(image, pixels)
         colors = _sample_colors(view_of(image.name), image, pixels)
         normals = _compute_normals(image).reshape(-1, 3)[pixels]
-        return FusedPointCloud(points, colors, normals, np.sqrt(variance).astype(np.float32), views)
+        std, views = np.sqrt(variance).astype(np.float32), counts[row].ravel()[pixels]
+        return FusedPointCloud(points, colors, normals, std, views)
 
     parts = [_EMPTY, *parallel_map(build_cloud, range(len(images)))]
     return FusedPointCloud(*map(np.concatenate, zip(*parts, strict=True)))
@@ -130,9 +132,7 @@ def count_consistent_views(
     """
 
     def build_counts(row: int, pixels: Int64, votes: _ConsistencyVotes) -> UInt8:
-        counts = np.zeros(images[row].depth.shape, np.uint8)
-        counts.ravel()[pixels[votes.consistent]] = votes.views[votes.consistent]
-        return counts
+        return _map_views(images[row], pixels, votes, votes.consistent)
 
     return _vote_on_images(images, voters, build_counts)
 
@@ -197,6 +197,15 @@ def _vote_on_images(
         return select(row, pixels, votes)
 
     return parallel_map(vote_on_image, range(len(images)))
+
+
+def _map_views(
+    image: RegisteredImage, pixels: Int64, votes: _ConsistencyVotes, selected: Bool
+) -> UInt8:
+    """Return the number of consistent images of each selected pixel as map (h, w), else 0."""
+    counts = np.zeros(image.depth.shape, np.uint8)
+    counts.ravel()[pixels[selected]] = votes.views[selected]
+    return counts
 
 
 _EMPTY = FusedPointCloud(

@@ -39,7 +39,7 @@ from mpsfm_core.geometry import (
 )
 from mpsfm_core.geometry.statistics import unique_rows
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.support.disk_arrays import ArrayStore, store_in_memory
+from mpsfm_core.support.disk_arrays import ArrayStore, current_store
 from mpsfm_core.support.jit import kernel
 from mpsfm_core.support.threads import parallel_map
 
@@ -157,7 +157,6 @@ def mesh_depth_maps(
     reconstruction: Reconstruction,
     view_of: Callable[[str], View],
     options: MeshOptions,
-    store_array: ArrayStore = store_in_memory,
 ) -> TriangleMesh:
     """Extract a triangle mesh from all depth maps, without triangles that no image observes.
 
@@ -167,14 +166,13 @@ def mesh_depth_maps(
         reconstruction: Posed images with depth maps.
         view_of: Function that returns the undistorted view of an image name, for the colors.
         options: Options of mesh extraction.
-        store_array: Storage of the weighted depth maps, by default in memory.
 
     Raises:
         InputError: scikit-image is missing, no pixel has consistent depth, or no surface is found.
     """
     marching_cubes, simplify = _import_libraries()
     images = reconstruction.dense_images
-    maps = _weight_depth_maps(images, options.max_hole_px, store_array)
+    maps = _weight_depth_maps(images, options.max_hole_px, current_store())
     if not maps:
         raise InputError(
             "cannot build a mesh: no pixel of the depth maps is certain and consistent; "

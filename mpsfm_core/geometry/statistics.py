@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+
 import numpy as np
 
-from mpsfm_core.data import Float64, Int64
+from mpsfm_core.data import Float32, Float64, Int64
 
 MAD_TO_STD = 1.4826
 """Ratio of std to median absolute value of a normal distribution with zero mean."""
@@ -40,6 +42,40 @@ def group_medians(values: Float64, groups: Int64, count: int) -> Float64:
     ordered = values[order]
     medians[nonempty] = (ordered[low[nonempty]] + ordered[high[nonempty]]) / 2
     return medians
+
+
+def pooled_median(read: Callable[[], Iterable[Float32]]) -> float | None:
+    """Compute the median of the values of all arrays without concatenating the arrays.
+
+    Non-negative floats have the order of their bit patterns. The first pass counts the values by
+    their upper 16 bits, and the second pass sorts the values whose upper bits are those of the
+    median.
+
+    Args:
+        read: Function that returns the same float32 arrays of non-negative values at each call.
+
+    Returns:
+        The median, or None without values.
+    """
+    counts = np.zeros(1 << 16, np.int64)
+    for values in read():
+        counts += np.bincount(_upper_bits(values), minlength=len(counts))
+    num_values = int(counts.sum())
+    if not num_values:
+        return None
+    middle = np.array([(num_values - 1) // 2, num_values // 2])
+    ends = np.cumsum(counts)
+    low, high = np.searchsorted(ends, middle, side="right")
+    near = []
+    for values in read():
+        upper = _upper_bits(values)
+        near.append(values[(upper >= low) & (upper <= high)])
+    ordered = np.sort(np.concatenate(near))
+    return float(ordered[middle - (ends[low] - counts[low])].mean())
+
+
+def _upper_bits(values: Float32) -> Int64:
+    return (values.view(np.uint32) >> 16).astype(np.int64)
 
 
 def unique_rows(rows: Int64) -> tuple[Int64, Int64]:

@@ -25,7 +25,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import lapack
-from scipy.sparse import bsr_array
+from scipy.sparse import bsr_array, csc_array
 from scipy.sparse.linalg import splu
 from threadpoolctl import ThreadpoolController
 
@@ -512,22 +512,11 @@ class SchurComplementSolver:
         The fill-reducing order is minimum degree (SuperLU). The intrinsic parameters are eliminated
         last, because they have dense rows. The solutions of a singular system are NaN.
         """
-        total, pairs = self.total, self.p.pairs
+        total = self.total
         num_poses, border = total.border.shape[1], total.border.copy()
-        is_diagonal = pairs[:, 0] == pairs[:, 1]
-        off_diagonal = total.blocks[~is_diagonal]
-        rows, columns = np.concatenate(
-            [pairs[is_diagonal], pairs[~is_diagonal], pairs[~is_diagonal, ::-1]]
-        ).T
-        blocks = np.concatenate(
-            [self._damped_diagonal(boost), off_diagonal, off_diagonal.transpose(0, 2, 1)]
-        )
-        order = np.lexsort((columns, rows))
-        starts = np.searchsorted(rows[order], np.arange(len(self.p.bundle.layout.pair) + 1))
-        matrix = bsr_array((blocks[order], columns[order], starts), shape=(num_poses, num_poses))
         try:
             factor = splu(
-                matrix.tocsc(),
+                self._assemble_poses(boost),
                 permc_spec="MMD_AT_PLUS_A",
                 diag_pivot_thresh=0.0,
                 options={"SymmetricMode": True},
@@ -543,6 +532,23 @@ class SchurComplementSolver:
             return np.concatenate([of_poses - by_border @ of_intrinsics, of_intrinsics])
 
         return solve
+
+    def _assemble_poses(self, boost: Float64) -> csc_array:
+        """Return the part of the damped reduced camera system that contains only poses."""
+        total, pairs = self.total, self.p.pairs
+        num_poses, is_diagonal = total.border.shape[1], pairs[:, 0] == pairs[:, 1]
+        off_diagonal = total.blocks[~is_diagonal]
+        rows, columns = np.concatenate(
+            [pairs[is_diagonal], pairs[~is_diagonal], pairs[~is_diagonal, ::-1]], dtype=np.intc
+        ).T  # SuperLU copies indices of another type
+        blocks = np.concatenate(
+            [self._damped_diagonal(boost), off_diagonal, off_diagonal.transpose(0, 2, 1)]
+        )
+        order = np.lexsort((columns, rows))
+        starts = np.searchsorted(rows[order], np.arange(len(self.p.bundle.layout.pair) + 1))
+        starts = starts.astype(np.intc)
+        matrix = bsr_array((blocks[order], columns[order], starts), shape=(num_poses, num_poses))
+        return matrix.tocsr().T  # the matrix is symmetric, and transposing copies nothing
 
     def _iterate(self, boost: Float64, rhs: Float64, can_factorize: bool) -> tuple[Float64, bool]:
         """Solve the reduced camera system by preconditioned conjugate gradients.

@@ -28,7 +28,7 @@ from mpsfm_core.results.depth_maps import read_depth_map, write_depth_maps
 from mpsfm_core.results.exports.source import ExportSource
 from mpsfm_core.results.mesh import write_mesh
 from mpsfm_core.results.ply import write_cloud
-from mpsfm_core.support.disk_arrays import DiskArrays, store_fields
+from mpsfm_core.support.disk_arrays import current_store, store_fields, store_on_disk
 from mpsfm_core.support.files import lock_output_folder, replace_entries
 from mpsfm_core.support.threads import limit_threads
 
@@ -60,7 +60,7 @@ def densify_model(
         InputError: model or photos cannot be read, image names do not match, the model has no
             points, or ``output`` cannot be written.
     """
-    with lock_output_folder(Path(output)), limit_threads(None):
+    with lock_output_folder(Path(output)), limit_threads(None), store_on_disk(cache_folder()):
         return _densify_model(Path(model), Path(images), Path(output), options)
 
 
@@ -92,12 +92,10 @@ def _densify_model(
             f"{model}: the model has no points, from which the depth range is computed"
         )
     view_of = _view_of(photos)
-    disk = DiskArrays(cache_folder())
     dense, report = densify(
         posed,
         view_of,
         options or DenseOptions(),
-        store_array=disk.store,
         poses_use_depth=poses_use_depth,
     )
     with replace_entries(output, (SPARSE, DENSE, DEPTH)) as folder:
@@ -161,13 +159,12 @@ def mesh_model(
         InputError: folder or photos cannot be read, depth maps are missing or give no surface, or
             the libraries for meshes are not installed.
     """
-    with lock_output_folder(Path(folder)), limit_threads(None):
+    with lock_output_folder(Path(folder)), limit_threads(None), store_on_disk(cache_folder()):
         source = ExportSource.read(Path(folder), None if photos is None else Path(photos))
         poses = reconstruction_poses(source.model)
         files = [source.folder / DEPTH / f"{name}.npz" for name in source.names]
-        disk = DiskArrays(cache_folder())
         depths = [
-            store_fields(read_depth_map(file)[1], disk.store)
+            store_fields(read_depth_map(file)[1], current_store())
             if file.is_file() and name not in source.held_out
             else None
             for name, file in zip(source.names, files, strict=True)
@@ -181,7 +178,7 @@ def mesh_model(
             )
         options = options or MeshOptions()
         view_of = _view_of(source.images)
-        mesh = mesh_depth_maps(posed, view_of, options, disk.store)
+        mesh = mesh_depth_maps(posed, view_of, options)
         textured = None
         if options.max_texture_size:
             textured = build_texture(mesh, posed, view_of, options.max_texture_size)

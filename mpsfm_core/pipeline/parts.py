@@ -34,7 +34,7 @@ from mpsfm_core.pipeline.checkpoints import MappingCheckpoints
 from mpsfm_core.pipeline.stages import Stages, peak_memory_mb, reset_peak_memory
 from mpsfm_core.providers import Executor
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.support.disk_arrays import DiskArrays
+from mpsfm_core.support.disk_arrays import store_on_disk
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.npz import read_npz
 from mpsfm_core.support.threads import limit_threads
@@ -84,12 +84,8 @@ class PartMapper:
     def __call__(
         self, problems: Sequence[MappingProblem], options: MapperOptions
     ) -> list[MappingResult]:
-        """Map all parts, and return their results in order.
-
-        Depth maps of many images are in temporary files of the cache folder.
-        """
+        """Map all parts, and return their results in order."""
         runtime = self._runtime
-        disk = DiskArrays(cache_folder(runtime.cache_dir))
         step = MapPart(
             cache_folder(runtime.cache_dir),
             options,
@@ -109,7 +105,7 @@ class PartMapper:
             for done, part in enumerate(parts, start=1):
                 with measure_part(part.problem) as measured:
                     result = step.map(part.problem, stores=stores)
-                models = compute_depth_maps(result.reconstructions, disk.store)
+                models = compute_depth_maps(result.reconstructions)
                 results.append(replace(result, reconstructions=models))
                 self.records.append(step.read_record(part.key) or measured[0])
                 if executor is None:
@@ -187,7 +183,11 @@ class MapPart:
             ) from error
         reset_peak_memory()
         problem = problem_from_state(unflatten_state(arrays))
-        with limit_threads(self.threads), measure_part(problem) as records:
+        with (
+            limit_threads(self.threads),
+            store_on_disk(self.cache),
+            measure_part(problem) as records,
+        ):
             self.map(problem)
         if not self.record_file(key).exists():  # a repeated part only loads its checkpoint
             write_file(self.record_file(key), json.dumps(asdict(records[0])))

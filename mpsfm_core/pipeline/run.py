@@ -60,7 +60,7 @@ from mpsfm_core.results.summary import (
 )
 from mpsfm_core.results.trajectory import TrajectoryFrame, describe_trajectory
 from mpsfm_core.results.writer import ComponentResult, update_summary, write_failure, write_results
-from mpsfm_core.support.disk_arrays import DiskArrays
+from mpsfm_core.support.disk_arrays import store_on_disk
 from mpsfm_core.support.files import lock_output_folder
 from mpsfm_core.support.memory import ChildMemoryMonitor, measure_memory
 from mpsfm_core.support.threads import limit_threads, thread_limit
@@ -242,10 +242,12 @@ class _Run:
 
     @contextmanager
     def environment(self) -> Iterator[None]:
-        """Limit threads, lock the output folder, record warnings and memory of child processes."""
+        """Limit threads, lock the output folder, choose the folder of maps, and record warnings."""
+        runtime = self._config.runtime
         with ExitStack() as stack:
             stack.enter_context(self._stages.recording_logged_warnings())
-            stack.enter_context(limit_threads(self._config.runtime.workers))
+            stack.enter_context(limit_threads(runtime.workers))
+            stack.enter_context(store_on_disk(cache_folder(runtime.cache_dir)))
             if self._output is not None:
                 self._inputs.check_output_folder()
                 stack.enter_context(lock_output_folder(self._output))
@@ -279,7 +281,7 @@ class _Run:
             self._fail(images, extraction, mapping, originals)
         self._warn_of_uncalibrated_rigs(mapping.reconstructions[0])
         with self._stages.stage("mapping"):
-            computed = compute_depth_maps(mapping.reconstructions, self._disk_arrays().store)
+            computed = compute_depth_maps(mapping.reconstructions)
             mapping = replace(mapping, reconstructions=computed)
         mapping = self._georeference(images, mapping)
         mapping = self._densify(hold_out(mapping, self._config.dense.hold_out_every), originals)
@@ -385,7 +387,6 @@ class _Run:
         if not config.dense.enabled:
             return mapping
         dense_parts, self._dense_reports = [], []
-        disk = self._disk_arrays()
         with self._stages.stage("dense"):
             for part in mapping.reconstructions:
                 dense, report = densify(
@@ -395,16 +396,11 @@ class _Run:
                     config.runtime.workers,
                     partial(self._stages.stage_progress, "dense"),
                     self._dense_checkpoints(part, originals),
-                    disk.store,
                     poses_use_depth=not _has_poses(part, self._inputs.known_poses),
                 )
                 dense_parts.append(dense)
                 self._dense_reports.append(report.describe())
         return replace(mapping, reconstructions=tuple(dense_parts))
-
-    def _disk_arrays(self) -> DiskArrays:
-        """Return a storage of depth maps, in memory up to a limit and then in temporary files."""
-        return DiskArrays(cache_folder(self._config.runtime.cache_dir))
 
     def _localize_frames(self, mapping: MappingResult, originals: OriginalImages) -> None:
         """Estimate the poses of the frames of each video between its keyframes."""

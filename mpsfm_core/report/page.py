@@ -22,12 +22,14 @@ from mpsfm_core.data import Float64
 from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel, IntrinsicParameter
 from mpsfm_core.data.errors import InputError, MpsfmError
 from mpsfm_core.data.result_layout import REPORT, VIEWS
+from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.report import pictures
 from mpsfm_core.report.findings import describe_scale, findings, partner_counts
 from mpsfm_core.report.points import PointSet, dense_points, sparse_points
 from mpsfm_core.report.reasons import explain_image, explain_pair
 from mpsfm_core.report.result_folder import MatchLines, PriorMaps, RefinedMap, ResultFolder
 from mpsfm_core.report.verdict import judge
+from mpsfm_core.support.disk_arrays import DiskArrays, store_fields
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.threads import parallel_map
 from mpsfm_core.support.yaml_text import write_yaml
@@ -120,7 +122,13 @@ def _payload(result: ResultFolder, max_embedded: int) -> dict[str, Any]:
     summary = result.summary
     names = result.names
     embedded = [names[row] for row in _space_evenly(len(names), max_embedded)]
-    maps = dict(zip(embedded, parallel_map(result.refined, embedded), strict=True))
+    disk = DiskArrays(cache_folder())
+
+    def read_map(name: str) -> RefinedMap | None:
+        refined = result.refined(name)
+        return None if refined is None else store_fields(refined, disk.store)
+
+    maps = dict(zip(embedded, parallel_map(read_map, embedded), strict=True))
     refined_maps = [refined for refined in maps.values() if refined is not None]
     photos = _ImageEntries(result, maps)
     ids = {name: row for row, name in enumerate(names)}
@@ -204,6 +212,7 @@ class _ImageEntries:
         self._maps = maps
         self._renderings = result.held_out_renderings()
         self._images = {image.name: image for image in result.model.images.values()}
+        self._errors = {key: point.error for key, point in result.model.points3D.items()}
         self._partners = partner_counts(result.summary)
         self._matched = Counter(
             name
@@ -268,12 +277,7 @@ class _ImageEntries:
         image = self._images.get(name)
         if image is None:
             return {"points": 0, "error": None}
-        model = self._result.model
-        errors = [
-            model.points3D[point.point3D_id].error
-            for point in image.points2D
-            if point.has_point3D()
-        ]
+        errors = [self._errors[point.point3D_id] for point in image.get_observation_points2D()]
         return {"points": len(errors), "error": float(np.mean(errors)) if errors else None}
 
     def _camera(self, name: str, prior: PriorMaps | None) -> dict[str, Any]:

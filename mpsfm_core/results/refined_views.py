@@ -31,6 +31,7 @@ from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.mapping.depth_map_refinement import refine_depth_maps
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
+from mpsfm_core.support.disk_arrays import current_store, store_fields
 
 MIN_VALID_WEIGHT = 0.999
 """Minimum sum of interpolation weights of valid pixels for a valid resampled pixel. [ours]"""
@@ -167,8 +168,8 @@ class _ViewWarp:
             focal_guess_px=image.focal_prior_px,
             distortion=self._distortion,
             keypoints=self.move_keypoints(image.keypoints),
-            depth=self.move_depth(image.depth),
-            normals=self.move_normals(image.normals),
+            depth=store_fields(self.move_depth(image.depth), current_store()),
+            normals=store_fields(self.move_normals(image.normals), current_store()),
         )
 
     @property

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypedDict
@@ -17,11 +17,12 @@ from typing import Any, TypedDict
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import MappingProblem
+from mpsfm_core.data import Float32, MappingProblem
 from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.data.decisions import ImageReason, Value
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.extraction.report import ExtractionReport
+from mpsfm_core.geometry.statistics import pooled_median
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.mapping.scene.reconstruction import (
     MappingResult,
@@ -323,18 +324,20 @@ def describe_reconstructions(
 def _describe(
     reconstruction: Reconstruction, model: pycolmap.Reconstruction, problem: MappingProblem
 ) -> ReconstructionSummary:
-    relative_std = [
-        np.sqrt(image.depth.variance[image.depth.valid]) / image.depth.depth[image.depth.valid]
-        for image in reconstruction.images
-        if image.depth.variance is not None
-    ]
+    def read_relative_stds() -> Iterator[Float32]:
+        for image in reconstruction.images:
+            depth = image.depth
+            if depth.variance is not None:
+                std = np.sqrt(depth.variance[depth.valid])
+                yield np.asarray(std / depth.depth[depth.valid], np.float32)
+
     return {
         "images": len(reconstruction.images),
         "points": model.num_points3D(),
         "observations": model.compute_num_observations(),
         "mean_track_length": model.compute_mean_track_length() if model.num_points3D() else 0.0,
         "mean_reprojection_error_px": _mean_error(model),
-        "median_relative_depth_std": _median(relative_std),
+        "median_relative_depth_std": pooled_median(read_relative_stds),
         "metric_scale": None if reconstruction.metric is None else asdict(reconstruction.metric),
         "evidence": describe_evidence(reconstruction, problem),
     }
@@ -342,8 +345,3 @@ def _describe(
 
 def _mean_error(model: pycolmap.Reconstruction) -> float | None:
     return float(model.compute_mean_reprojection_error()) if model.num_points3D() else None
-
-
-def _median(values: Sequence[np.ndarray[Any, Any]]) -> float | None:
-    pooled = np.concatenate(values) if values else np.zeros(0)
-    return float(np.median(pooled)) if len(pooled) else None

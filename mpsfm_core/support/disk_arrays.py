@@ -1,15 +1,23 @@
-"""Storage of large arrays in memory-mapped temporary files."""
+"""Storage of large arrays in memory-mapped temporary files.
+
+A run chooses the folder of the files once with :func:`store_on_disk`, and objects that are created
+in the run keep their arrays in the storage that :func:`current_store` returns.
+"""
 
 from __future__ import annotations
 
 import logging
 import mmap
+import os
 import tempfile
 import threading
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Protocol, TypeVar
+from typing import IO, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +28,8 @@ _log = logging.getLogger(__name__)
 _T = TypeVar("_T", bound=np.generic)
 _Item = TypeVar("_Item")
 
-MEMORY_LIMIT = 2**29
-"""Maximum bytes of arrays in memory, enough for about 80 images of the dense stage [ours]."""
+MEMORY_LIMIT = 2**26
+"""Maximum bytes of arrays in memory, so that small problems need no file. [ours]"""
 _MIN_FILE_BYTES = 2**26
 """Minimum size of a temporary file in bytes, because a process may open only 1024 files."""
 _ALIGNMENT = 64
@@ -47,6 +55,24 @@ def store_fields(item: _Item, store: ArrayStore) -> _Item:
     arrays = {name: store(value) for name, value in values.items() if isinstance(value, np.ndarray)}
     copied: _Item = replace(item, **arrays)  # type: ignore[type-var]
     return copied
+
+
+_STORE: ContextVar[ArrayStore] = ContextVar("array store", default=store_in_memory)
+
+
+def current_store() -> ArrayStore:
+    """Return the storage of large arrays of the calling thread, by default memory."""
+    return _STORE.get()
+
+
+@contextmanager
+def store_on_disk(folder: Path, in_memory: int = MEMORY_LIMIT) -> Iterator[None]:
+    """Store large arrays in temporary files inside a ``with`` block, see :class:`DiskArrays`."""
+    token = _STORE.set(DiskArrays(folder, in_memory).store)
+    try:
+        yield
+    finally:
+        _STORE.reset(token)
 
 
 class DiskArrays:
@@ -105,8 +131,7 @@ class DiskArrays:
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryFile(dir=self._folder) as file:
-                file.write(bytes(size))  # reserve disk space, as writes to a sparse file could fail
-                file.flush()
+                _reserve(file, size)
                 chunk = mmap.mmap(file.fileno(), size)
         except OSError as error:
             _log.warning(
@@ -124,3 +149,12 @@ class DiskArrays:
         if hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
             for chunk in self._chunks:
                 chunk.madvise(mmap.MADV_DONTNEED)
+
+
+def _reserve(file: IO[bytes], size: int) -> None:
+    """Reserve disk space for an empty file, because writes to a mapped sparse file could fail."""
+    if hasattr(os, "posix_fallocate"):  # not on macOS and Windows
+        os.posix_fallocate(file.fileno(), 0, size)
+    else:
+        file.write(bytes(size))
+        file.flush()

@@ -20,7 +20,7 @@ from mpsfm_core.dense.stereo import StereoDepth
 from mpsfm_core.extraction.cache import Cache
 from mpsfm_core.geometry import project, transform
 from mpsfm_core.pipeline.checkpoints import DenseCheckpoints
-from mpsfm_core.support.disk_arrays import DiskArrays
+from mpsfm_core.support.disk_arrays import store_on_disk
 
 OPTIONS = DenseOptions(correlation_px=20)
 
@@ -96,8 +96,8 @@ def test_densify_is_independent_of_threads(room) -> None:
 
 def test_densify_with_arrays_on_disk_is_identical(room, tmp_path: Path) -> None:
     there, report = densify(room.reconstruction, room.views.__getitem__, OPTIONS)
-    store = DiskArrays(tmp_path, in_memory=0).store
-    here, same = densify(room.reconstruction, room.views.__getitem__, OPTIONS, store_array=store)
+    with store_on_disk(tmp_path, in_memory=0):
+        here, same = densify(room.reconstruction, room.views.__getitem__, OPTIONS)
     for a, b in zip(there.images, here.images, strict=True):
         np.testing.assert_array_equal(a.depth.depth, b.depth.depth)
         np.testing.assert_array_equal(a.depth.variance, b.depth.variance)

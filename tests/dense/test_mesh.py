@@ -29,7 +29,7 @@ from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.results.colmap_model import build_model, write_model
 from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.obj import read_obj
-from mpsfm_core.support.disk_arrays import DiskArrays
+from mpsfm_core.support.disk_arrays import store_on_disk
 
 from .conftest import CAMERA, Room
 
@@ -123,8 +123,8 @@ def test_mesh_of_scene_with_many_voxels_has_larger_voxels(
 
 
 def test_mesh_from_stored_maps_is_equal(room: Room, mesh: TriangleMesh, tmp_path: Path) -> None:
-    disk = DiskArrays(tmp_path, in_memory=0)
-    again = mesh_depth_maps(measured(room), room.views.__getitem__, MeshOptions(), disk.store)
+    with store_on_disk(tmp_path, in_memory=0):
+        again = mesh_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
     for expected, actual in zip(mesh, again, strict=True):
         np.testing.assert_array_equal(actual, expected)
 

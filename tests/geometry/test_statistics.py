@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from mpsfm_core.geometry.statistics import MAD_TO_STD, group_medians
+from mpsfm_core.geometry.statistics import MAD_TO_STD, group_medians, pooled_median
 
 
 def test_group_medians_match_numpy() -> None:
@@ -23,3 +24,15 @@ def test_group_medians_match_numpy() -> None:
 def test_mad_to_std_normal_errors_gives_std() -> None:
     errors = np.random.default_rng(0).normal(0, 2, 100_000)
     assert np.isclose(MAD_TO_STD * np.median(np.abs(errors)), 2, rtol=0.01)
+
+
+@pytest.mark.parametrize("sizes", [[1], [2], [3, 0, 4], [50_001, 1, 2999]])
+def test_pooled_median_many_arrays_equals_numpy(sizes: list[int]) -> None:
+    rng = np.random.default_rng(len(sizes))
+    arrays = [rng.exponential(0.05, size).astype(np.float32) for size in sizes]
+    arrays[0][0] = 0.0
+    assert pooled_median(lambda: arrays) == float(np.median(np.concatenate(arrays)))
+
+
+def test_pooled_median_no_values_is_none() -> None:
+    assert pooled_median(lambda: [np.zeros(0, np.float32)]) is None

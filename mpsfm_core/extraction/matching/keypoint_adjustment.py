@@ -157,6 +157,7 @@ class KeypointAdjuster:
         for key in keys or ():
             context.cache.forget(_INPUTS, key)
             context.cache.forget(_ALIGNED, key)
+        self._gray.clear()
         return adjust_keypoints(self._keypoints, self._std_px, pairs, aligned)
 
     def align_stored(self, key: str) -> None:

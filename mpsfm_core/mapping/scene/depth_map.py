@@ -12,7 +12,7 @@ from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingIm
 from mpsfm_core.geometry import sample_bilinear, scale_pixels
 from mpsfm_core.optimize.depth_integration import NO_ANCHORS, Anchors, RefinedDepth
 from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, upsample
-from mpsfm_core.support.disk_arrays import ArrayStore, store_fields, store_in_memory
+from mpsfm_core.support.disk_arrays import current_store, store_fields
 
 
 class RefinesDepth(Protocol):
@@ -45,7 +45,8 @@ class DepthRefinement:
     """Refinement of a depth map that is computed when its result is first used.
 
     The inputs are stored when the refinement is requested, so the result does not depend on when
-    it is computed.
+    it is computed. The result is stored by :func:`~mpsfm_core.support.disk_arrays.current_store`
+    of the thread that requests the refinement.
 
     Args:
         integrator: Depth integrator of the image.
@@ -65,6 +66,7 @@ class DepthRefinement:
         self._inputs: tuple[RefinesDepth, Anchors, DepthRefinement | None] | None
         self._inputs = integrator, anchors, previous
         self._result: RefinedDepth | None = None
+        self._store = current_store()
         self._lock = Lock()
 
     @classmethod
@@ -92,7 +94,8 @@ class DepthRefinement:
             if self._inputs is not None:
                 integrator, anchors, previous = self._inputs
                 start = previous._result if previous else None
-                self._result = integrator.refine(anchors, scale=self.scale, start=start)
+                result = integrator.refine(anchors, scale=self.scale, start=start)
+                self._result = store_fields(result, self._store)
                 self._inputs = None
 
     def depth(self, prior: DepthPrior) -> Float32:
@@ -118,7 +121,9 @@ class DepthRefinement:
 class LazyDepth(DepthPrior):
     """Depth map of a reconstruction, which is refined when its depth is first read.
 
-    The object then becomes an ordinary :class:`~mpsfm_core.data.DepthPrior`.
+    The object then becomes an ordinary :class:`~mpsfm_core.data.DepthPrior`, whose arrays are
+    stored by :func:`~mpsfm_core.support.disk_arrays.current_store` of the thread that made the
+    object.
 
     Args:
         prior: Unscaled depth prior, or the depth map of a reconstruction in other units.
@@ -131,7 +136,8 @@ class LazyDepth(DepthPrior):
         self, prior: DepthPrior, refinement: DepthRefinement | None, scale: float, *, metric: bool
     ) -> None:
         # the arrays of the base class stay undefined, so that reading them calls __getattr__
-        vars(self).update(metric=metric, _inputs=(prior, refinement, scale), _lock=Lock())
+        inputs = prior, refinement, scale, current_store()
+        vars(self).update(metric=metric, _inputs=inputs, _lock=Lock())
 
     def __getattr__(self, name: str) -> Any:
         """Compute depth, variance and mask at the first access."""
@@ -140,18 +146,18 @@ class LazyDepth(DepthPrior):
         self.compute()
         return vars(self)[name]
 
-    def compute(self, store: ArrayStore = store_in_memory) -> None:
+    def compute(self) -> None:
         """Compute and store depth, variance and mask, unless they are computed."""
         lock = vars(self).get("_lock")
         if lock is not None:
             with lock:
-                self._compute(store)
+                self._compute()
 
-    def _compute(self, store: ArrayStore) -> None:
+    def _compute(self) -> None:
         """Scale depth to world units, with the relative variance of the prior."""
         if "_inputs" not in vars(self):
             return
-        prior, refinement, scale = vars(self)["_inputs"]
+        prior, refinement, scale, store = vars(self)["_inputs"]
         depth = prior.depth
         if refinement is not None:
             depth, scale = refinement.depth(prior), scale / refinement.scale

@@ -27,7 +27,7 @@ from mpsfm_core.mapping.scene.estimated_intrinsics import (
     IntrinsicEstimate,
 )
 from mpsfm_core.mapping.state import StateDict, reasons_from_json, reasons_to_json
-from mpsfm_core.support.disk_arrays import ArrayStore, store_fields, store_in_memory
+from mpsfm_core.support.disk_arrays import current_store, store_fields
 from mpsfm_core.support.threads import parallel_map
 
 _NO_ROWS = np.zeros(0, np.int64)
@@ -260,21 +260,21 @@ class MappingResult:
 
 
 def compute_depth_maps(
-    reconstructions: Iterable[Reconstruction], store: ArrayStore = store_in_memory
+    reconstructions: Iterable[Reconstruction],
 ) -> tuple[Reconstruction, ...]:
-    """Compute the depth maps of reconstructions in parallel threads.
+    """Compute and store the depth maps of reconstructions in parallel threads.
 
     Args:
         reconstructions: Reconstructions, whose depth maps are computed when they are first read.
-        store: Function that stores an array in memory or on disk, and returns an equal array.
 
     Returns:
         The reconstructions with stored depth maps.
     """
+    store = current_store()
 
     def compute(image: RegisteredImage) -> RegisteredImage:
         if isinstance(image.depth, LazyDepth):
-            image.depth.compute(store)
+            image.depth.compute()
             return image
         return replace(image, depth=store_fields(image.depth, store))
 
