@@ -100,16 +100,19 @@ def fuse_depth_maps(
         sampled = rng.choice(len(pixels), int(ratio * len(pixels)), replace=False)
         selected.append(pixels[np.sort(sampled)])
 
-    def build_cloud(row: int) -> FusedPointCloud:
-        image, pixels = images[row], selected[row]
-        points, variance = _unproject_pixels(image, pixels)
-        colors = _sample_colors(view_of(image.name), image, pixels)
-        normals = _compute_normals(image).reshape(-1, 3)[pixels]
-        std, views = np.sqrt(variance).astype(np.float32), counts[row].ravel()[pixels]
-        return FusedPointCloud(points, colors, normals, std, views)
+    ends = np.cumsum([0, *map(len, selected)])
+    cloud = _allocate_cloud(int(ends[-1]))
 
-    parts = [_EMPTY, *parallel_map(build_cloud, range(len(images)))]
-    return FusedPointCloud(*map(np.concatenate, zip(*parts, strict=True)))
+    def fill_cloud(row: int) -> None:
+        image, pixels, rows = images[row], selected[row], slice(ends[row], ends[row + 1])
+        cloud.points[rows], variance = _unproject_pixels(image, pixels)
+        cloud.colors[rows] = _sample_colors(view_of(image.name), image, pixels)
+        cloud.normals[rows] = _compute_normals(image, pixels)
+        cloud.std[rows] = np.sqrt(variance)
+        cloud.views[rows] = counts[row].ravel()[pixels]
+
+    parallel_map(fill_cloud, range(len(images)))
+    return cloud
 
 
 def select_voters(images: Sequence[RegisteredImage]) -> list[list[int]]:
@@ -208,13 +211,15 @@ def _map_views(
     return counts
 
 
-_EMPTY = FusedPointCloud(
-    np.zeros((0, 3)),
-    np.zeros((0, 3), np.uint8),
-    np.zeros((0, 3), np.float32),
-    np.zeros(0, np.float32),
-    np.zeros(0, np.uint8),
-)
+def _allocate_cloud(count: int) -> FusedPointCloud:
+    """Return a point cloud whose values are not set."""
+    return FusedPointCloud(
+        np.empty((count, 3)),
+        np.empty((count, 3), np.uint8),
+        np.empty((count, 3), np.float32),
+        np.empty(count, np.float32),
+        np.empty(count, np.uint8),
+    )
 
 
 def _relative_std_of_best_pixels(images: Sequence[RegisteredImage]) -> float:
@@ -322,19 +327,30 @@ def _vote(
             duplicate[k] = True
 
 
-def _compute_normals(image: RegisteredImage) -> Float32:
-    """Compute normals (h, w, 3) of a depth map in the world frame, zero at holes and borders."""
+def _compute_normals(image: RegisteredImage, pixels: Int64) -> Float32:
+    """Compute normals (n, 3) in the world frame at pixels, zero at holes and image borders.
+
+    Args:
+        image: Image with depth map.
+        pixels: (n,) flat indices of pixels.
+    """
     height, width = image.depth.shape
     camera = image.camera.resized(width, height)
-    local = unproject(camera, pixel_centers(width, height), image.depth.depth)
-    normals = np.zeros((height, width, 3), np.float32)
-    across, down = local[1:-1, 2:] - local[1:-1, :-2], local[2:, 1:-1] - local[:-2, 1:-1]
-    normal = np.cross(down, across)  # The cross product is a surface normal that faces the camera.
-    valid = image.depth.valid
-    usable = valid[1:-1, 2:] & valid[1:-1, :-2] & valid[2:, 1:-1] & valid[:-2, 1:-1]
+    depth, valid = image.depth.depth, image.depth.valid
+    rows, columns = np.divmod(pixels, width)
+    is_inner = (rows > 0) & (rows < height - 1) & (columns > 0) & (columns < width - 1)
+    inner = np.flatnonzero(is_inner)
+    rows, columns = rows[inner], columns[inner]
+    neighbors = [(rows + y, columns + x) for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))]
+    usable = np.all([valid[neighbor] for neighbor in neighbors], axis=0)
+    right, left, below, above = (
+        unproject(camera, np.stack([x[usable], y[usable]], axis=1) + 0.5, depth[y, x][usable])
+        for y, x in neighbors
+    )
+    normal = np.cross(below - above, right - left)  # a surface normal that faces the camera
     length = np.linalg.norm(normal, axis=-1, keepdims=True)
-    unit = normal / np.where(length > 0, length, 1)
-    normals[1:-1, 1:-1] = np.where(usable[..., None], unit @ image.rotation, 0)
+    normals = np.zeros((len(pixels), 3), np.float32)
+    normals[inner[usable]] = normal / np.where(length > 0, length, 1) @ image.rotation
     return normals
 
 

@@ -25,6 +25,7 @@ from mpsfm_core.data.events import (
 )
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.report.reasons import explain
+from mpsfm_core.support.memory import release_free_memory
 
 _PROC = Path("/proc/self")
 
@@ -80,7 +81,7 @@ class Stages:
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Record a pipeline stage that runs in the ``with`` block."""
+        """Record a pipeline stage that runs in the ``with`` block, and release its memory."""
         self.stage_started(name, None)
         reset_peak_memory()
         self._running[name] = time.perf_counter()
@@ -90,6 +91,7 @@ class Stages:
             record = self._record(name)
             del self._running[name]
             self._finished[name] = record.after(self._finished.get(name))
+            release_free_memory()
             self.stage_finished(name, record.seconds)
 
     @contextmanager

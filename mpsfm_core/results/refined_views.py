@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -27,14 +28,18 @@ from mpsfm_core.data import (
 from mpsfm_core.data.camera_models import CameraModel, Distortion, to_distortion
 from mpsfm_core.geometry import pixel_centers, project, scale_pixels
 from mpsfm_core.geometry.distortion import undistort_rays
+from mpsfm_core.geometry.pycolmap_conversion import camera_key
 from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.mapping.depth_map_refinement import refine_depth_maps
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.support.disk_arrays import current_store, store_fields
+from mpsfm_core.support.lru_cache import LruCache
 
 MIN_VALID_WEIGHT = 0.999
 """Minimum sum of interpolation weights of valid pixels for a valid resampled pixel. [ours]"""
+_CACHED_WARPS = 2
+"""Number of cached maps of pixels, because images share cameras. [ours]"""
 
 
 def undistort_images(
@@ -88,8 +93,14 @@ def undistort_problem(
         problem: Mapping problem with keypoints and priors on the views of ``images``.
     """
     views = []
+    warps: LruCache[object, _ViewWarp] = LruCache(_CACHED_WARPS, lambda _: 1)
     for old, new, view in zip(images, refined, problem.images, strict=True):
-        views.append(view if new is old else _ViewWarp(old, new).move_view(view))
+        if new is old:
+            views.append(view)
+            continue
+        key = camera_key(old.camera), old.pinhole, camera_key(new.camera), new.pinhole
+        warp = warps.get(key, partial(_ViewWarp, old, new))
+        views.append(warp.move_view(view))
     return replace(problem, images=tuple(views))
 
 

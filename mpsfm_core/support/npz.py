@@ -19,20 +19,21 @@ MAX_BYTES = 4_000_000_000
 A small compressed file could expand to any size. ``MAX_BYTES`` is 16 bytes for each pixel of
 the largest supported image [ours]."""
 _COMPRESSION_LEVEL = 1
-"""Compression level of zlib; level 6 takes twice the time and makes depth maps 0.5 % smaller."""
+"""Compression level of zlib for integers and masks. Floats are not compressed, because zlib makes
+maps of depth 13 % and maps of normals 24 % smaller, and takes ten times as long as writing."""
 
 
 def write_npz(path: Path, **arrays: NDArray[Any]) -> None:
-    """Write named arrays to a compressed NPZ file and create its folder.
+    """Write named arrays to an NPZ file and create its folder; floats are not compressed.
 
     Raises:
         OSError: the file cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    with zipfile.ZipFile(
-        path, "w", zipfile.ZIP_DEFLATED, compresslevel=_COMPRESSION_LEVEL
-    ) as archive:
+    with zipfile.ZipFile(path, "w", compresslevel=_COMPRESSION_LEVEL) as archive:
         for name, array in arrays.items():
+            is_float = array.dtype.kind == "f"
+            archive.compression = zipfile.ZIP_STORED if is_float else zipfile.ZIP_DEFLATED
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, array, allow_pickle=False)
 

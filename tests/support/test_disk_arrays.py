@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mpsfm_core.support.disk_arrays
-from mpsfm_core.support.disk_arrays import DiskArrays
+from mpsfm_core.support.disk_arrays import DiskArrays, current_store, store_on_disk
 
 SIZE = 2**20
 
@@ -59,3 +59,12 @@ def test_without_a_disk_all_stay_in_memory(
     first, second = array(0), array(1)
     assert disk.store(first) is first and disk.store(second) is second
     assert caplog.text.count("depth maps stay in memory") == 1
+
+
+def test_store_on_disk_is_the_current_store_inside_the_block(tmp_path: Path) -> None:
+    values = array(0)
+    with store_on_disk(tmp_path, in_memory=0):
+        stored = current_store()(values)
+    assert stored is not values
+    np.testing.assert_array_equal(stored, values)
+    assert current_store()(values) is values

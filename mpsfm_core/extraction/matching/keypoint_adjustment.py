@@ -27,6 +27,7 @@ from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.geometry import rays
 from mpsfm_core.geometry.patch_alignment import align_patches
 from mpsfm_core.support.lru_cache import LruCache
+from mpsfm_core.support.memory import release_free_memory
 
 CACHED_BYTES = 256 << 20
 """Size limit of the in-memory cache of gray images, bytes."""
@@ -157,7 +158,10 @@ class KeypointAdjuster:
         for key in keys or ():
             context.cache.forget(_INPUTS, key)
             context.cache.forget(_ALIGNED, key)
+        # the solver needs about as much memory as the images
         self._gray.clear()
+        context.images.release_views()
+        release_free_memory()
         return adjust_keypoints(self._keypoints, self._std_px, pairs, aligned)
 
     def align_stored(self, key: str) -> None:

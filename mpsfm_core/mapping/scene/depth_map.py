@@ -73,7 +73,8 @@ class DepthRefinement:
     def from_result(cls, result: RefinedDepth) -> DepthRefinement:
         """Build a refinement from its result."""
         refinement = cls.__new__(cls)
-        refinement.scale, refinement._inputs, refinement._result = result.scale, None, result
+        refinement.scale, refinement._inputs = result.scale, None
+        refinement._result = store_fields(result, current_store())
         refinement._lock = Lock()
         return refinement
 

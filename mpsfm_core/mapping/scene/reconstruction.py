@@ -136,7 +136,7 @@ class RegisteredImage:
         """Restore a registered image from a checkpoint."""
         parts: StateDict = {
             "camera": PinholeCamera(**state["camera"]),
-            "depth": DepthPrior(**state["depth"]),
+            "depth": store_fields(DepthPrior(**state["depth"]), current_store()),
             "camera_model": CameraModel(state["camera_model"]),
         }
         calibration = {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pickle
 from dataclasses import fields, replace
+from pathlib import Path
 from unittest.mock import patch
 
 import numpy as np
@@ -14,6 +15,7 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.depth_map import DepthMap, DepthRefinement, LazyDepth
 from mpsfm_core.mapping.scene.reconstruction import compute_depth_maps
 from mpsfm_core.optimize.depth_integration import NO_ANCHORS, Anchors, DepthIntegrator
+from mpsfm_core.support.disk_arrays import store_on_disk
 from mpsfm_core.testing.synthetic.halls import CALIBRATED_PRIORS, make_hall_problem
 
 
@@ -45,6 +47,18 @@ def test_reading_the_depth_of_a_reconstruction_refines_it() -> None:
         for item in fields(DepthPrior):
             assert np.array_equal(getattr(image.depth, item.name), getattr(other.depth, item.name))
         assert not np.allclose(image.depth.depth, unrefined.depth.depth, rtol=1e-3)
+
+
+def test_reconstruct_with_maps_on_disk_is_identical(tmp_path: Path) -> None:
+    problem, options = make_problem(), MapperOptions(global_initialization=False)
+    expected = compute_depth_maps(reconstruct(problem, options).reconstructions)
+    with store_on_disk(tmp_path, in_memory=0):
+        stored = compute_depth_maps(reconstruct(problem, options).reconstructions)
+    for a, b in zip(expected[0].images, stored[0].images, strict=True):
+        assert b.depth.depth.base is not None  # mapped from a file
+        assert np.array_equal(a.depth.depth, b.depth.depth)
+        assert np.array_equal(a.depth.variance, b.depth.variance)
+        assert np.array_equal(a.translation, b.translation)
 
 
 def test_pickled_and_replaced_depth_equals_the_depth_that_is_read() -> None:
