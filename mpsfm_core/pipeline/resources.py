@@ -46,8 +46,6 @@ _PRIOR_BYTES = 106.0
 """Bytes per pixel of depth, normals, variances and derived maps in the mapper."""
 _STORED_PRIOR_BYTES = 26.0
 """Bytes per pixel of depth, normals and variances, of which ``MEMORY_LIMIT`` is in memory."""
-_LATER_PRIOR_BYTES = 10.0
-"""Bytes per pixel of refined depth for images whose priors are on disk."""
 _MATCHES_BYTES = 600_000.0
 """Bytes per image of matches and observations in the mapper, with 650 matches per image. [tuned:
 benchmarks.scale]"""
@@ -98,7 +96,7 @@ def estimate_resources(
     grids = [integration_grid(size, config.extraction.integration_size) for size in sizes]
     num_pixels = sum(map(_count_pixels, grids))
     in_memory = min(num_pixels, MEMORY_LIMIT / _STORED_PRIOR_BYTES)
-    in_mapping = _PRIOR_BYTES * in_memory + _LATER_PRIOR_BYTES * (num_pixels - in_memory)
+    in_mapping = _PRIOR_BYTES * in_memory
     in_mapping += _MATCHES_BYTES * (1 - in_memory / num_pixels) * len(sizes)
     if config.dense.enabled:
         grids = [dense_grid_size(size, config.dense.max_size) for size in sizes]

@@ -463,6 +463,7 @@ class _Run:
                     seed,
                     self._trajectories,
                 )
+            originals.release_views()
         return ReconstructionResult(models[0], models[1:], mapping, summary, self._output)
 
     def _fail(

@@ -51,6 +51,10 @@ class OriginalImages:
         """Return the undistorted view of an image by name."""
         return self._images.view(self._rows[name])
 
+    def release_views(self) -> None:
+        """Free the memory of the cached views, which are decoded again on demand."""
+        self._images.release_views()
+
     def keypoints(self, reconstruction: Reconstruction) -> list[Float64]:
         """Return keypoints (n, 2) of each registered image in pixels of the undistorted image."""
         return [self.problem.images[image.index].keypoints for image in reconstruction.images]
