@@ -6,7 +6,7 @@ pixel centers at half integers. A camera pose is a (3, 4) matrix ``cam_from_worl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple, Protocol
@@ -24,6 +24,11 @@ are on the surface at which the ray starts."""
 
 class Surface(Protocol):
     """Surface of a scene that can be intersected with rays."""
+
+    @property
+    def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:
+        """Center and radius of a sphere that contains the surface, which may be infinite."""
+        ...
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
         """Intersect rays ``origin + t * direction`` with the surface.
@@ -47,6 +52,11 @@ class Plane:
     point: tuple[float, float, float]
     normal: tuple[float, float, float]
 
+    @property
+    def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:
+        """Center and radius of a sphere that contains the surface."""
+        return self.point, np.inf
+
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
         """Intersect rays ``origin + t * direction`` with the surface."""
         normal = np.asarray(self.normal) / np.linalg.norm(self.normal)
@@ -63,15 +73,18 @@ class Box:
     half_size: tuple[float, float, float]
     yaw_deg: float = 0.0
 
+    @property
+    def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:
+        """Center and radius of a sphere that contains the surface."""
+        return self.center, float(np.linalg.norm(self.half_size))
+
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
         """Intersect rays ``origin + t * direction`` with the surface."""
         cos, sin = np.cos(np.deg2rad(self.yaw_deg)), np.sin(np.deg2rad(self.yaw_deg))
         world_from_box = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
         start = (origin - np.asarray(self.center)) @ world_from_box
-        all_rays = _away_from_zero(directions @ world_from_box)
-        near = self._may_hit(start, all_rays)
         # Each row is one component of all rays, because numpy reduces long axes faster.
-        rays = np.ascontiguousarray(all_rays[near].T)
+        rays = np.ascontiguousarray(_away_from_zero(directions @ world_from_box).T)
         half_size, start = np.asarray(self.half_size)[:, None], start[:, None]
         t_low = (-np.sign(rays) * half_size - start) / rays
         t_high = (np.sign(rays) * half_size - start) / rays
@@ -81,19 +94,7 @@ class Box:
         t = np.where(outside, t_enter, t_leave)
         t = np.where((t_leave >= t_enter) & (t > _EPSILON), t, np.inf)
         facing = -np.sign(np.take_along_axis(rays, axis[None], 0))[0][:, None]
-        found, normals = np.full(len(all_rays), np.inf), np.zeros_like(all_rays)
-        found[near], normals[near] = t, facing * world_from_box.T[axis]
-        return found, normals
-
-    def _may_hit(self, start: Float64, rays: Float64) -> Bool:
-        """Return which rays (n, 3) intersect the bounding sphere of the box.
-
-        The argument ``start`` is the origin of the rays relative to the center of the box.
-        """
-        along, length = rays @ start, np.einsum("ni,ni->n", rays, rays)
-        outside = start @ start - np.dot(self.half_size, self.half_size)
-        meets: Bool = (outside <= 0) | ((along < 0) & (along * along >= outside * length))
-        return meets
+        return t, facing * world_from_box.T[axis]
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,11 @@ class Sphere:
 
     center: tuple[float, float, float]
     radius: float
+
+    @property
+    def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:
+        """Center and radius of the sphere."""
+        return self.center, self.radius
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
         """Intersect rays ``origin + t * direction`` with the surface."""
@@ -230,12 +236,26 @@ class AnalyticScene:
         t = np.full(len(directions), np.inf)
         normals = np.zeros((len(directions), 3))
         surface = np.zeros(len(directions), np.int64)
-        for index, candidate in enumerate(self.surfaces):
-            t_new, normals_new = candidate.intersect(origin, directions)
-            nearer = t_new < t
-            t[nearer], normals[nearer] = t_new[nearer], normals_new[nearer]
-            surface[nearer] = index
+        for index, near in self._select_rays(origin, directions):
+            t_new, normals_new = self.surfaces[index].intersect(origin, directions[near])
+            nearer = t_new < t[near]
+            rows = near[nearer]
+            t[rows], normals[rows], surface[rows] = t_new[nearer], normals_new[nearer], index
         return t, normals, surface
+
+    def _select_rays(self, origin: Float64, directions: Float64) -> Iterator[tuple[int, Int64]]:
+        """Yield the surfaces, each with the rays that intersect its bounding sphere."""
+        spheres = [surface.bounding_sphere for surface in self.surfaces]
+        centers = np.array([center for center, _ in spheres]).reshape(-1, 3)
+        radii = np.array([radius for _, radius in spheres])
+        start = origin - centers
+        outside = np.einsum("mi,mi->m", start, start) - radii**2
+        length = np.einsum("ni,ni->n", directions, directions)
+        along = directions @ start.T
+        meets = (along < 0) & (along * along >= outside * length[:, None])
+        meets |= outside <= 0
+        for index in map(int, np.flatnonzero(meets.any(axis=0))):
+            yield index, np.flatnonzero(meets[:, index])
 
     def sample(
         self, camera: PinholeCamera, cam_from_world: ArrayLike, xy: ArrayLike
