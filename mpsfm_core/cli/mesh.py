@@ -31,13 +31,19 @@ def mesh(
 ) -> None:
     """Build a textured mesh from depth maps; write DIR/mesh.glb, mesh.obj and mesh.ply.
 
+    The report of the folder, if any, is written again and shows the mesh.
+
     The command needs the libraries of pip install 'mpsfm-core[mesh]'.
     """
     from mpsfm_core.data.options import parse_settings
+    from mpsfm_core.data.result_layout import REPORT
     from mpsfm_core.dense.options import MeshOptions
     from mpsfm_core.pipeline.dense_models import mesh_model
+    from mpsfm_core.report.page import write_report
 
     handle_sigterm()
     surface = mesh_model(folder, images, parse_settings(MeshOptions, parse_overrides(overrides)))
+    if (folder / REPORT).is_file():
+        write_report(folder)
     if not quiet:
         typer.echo(f"{len(surface.triangles)} triangles; written to {folder}/mesh.*")

@@ -22,6 +22,7 @@ from mpsfm_core.data import Float64
 from mpsfm_core.data.camera_models import NUM_DISTORTION, CameraModel, IntrinsicParameter
 from mpsfm_core.data.errors import InputError, MpsfmError
 from mpsfm_core.data.result_layout import REPORT, VIEWS
+from mpsfm_core.dense.texture import TexturedMesh
 from mpsfm_core.extraction.cache import cache_folder
 from mpsfm_core.report import pictures
 from mpsfm_core.report.findings import describe_scale, findings, partner_counts
@@ -37,6 +38,8 @@ from mpsfm_core.support.yaml_text import write_yaml
 MAX_DENSE_POINTS = 280_000
 MAX_SPARSE_POINTS = 40_000
 """Maximum numbers of dense and sparse points in the page, 16 bytes each in base64."""
+MAX_MESH_TRIANGLES = 600_000
+"""Maximum number of triangles of a mesh in the page, about 25 bytes each in base64."""
 MAX_PICTURE_BYTES = 9_000_000
 """Maximum size in bytes of all pictures in the page; with many images each picture is smaller."""
 MAX_EMBEDDED = 700
@@ -46,6 +49,8 @@ MAX_LINE_BYTES = 9_000_000
 """Maximum size in bytes of all match lines in the page; with many pairs each pair has fewer."""
 MAX_VIDEO_FRAMES = 2000
 """Maximum number of frames of a video whose poses are in the page, about 100 bytes each."""
+_TEXTURE_SIDE = 2048
+"""Maximum of the longer side in pixels of the texture of a mesh."""
 _PHOTO_SIDE = (192, 800)
 """Minimum and maximum of the longer side in pixels of an embedded image."""
 _MAP_SIDE = (128, 360)
@@ -144,6 +149,7 @@ def _payload(result: ResultFolder, max_embedded: int) -> dict[str, Any]:
             "sparse": _points(sparse_points(result.model, refined_maps, MAX_SPARSE_POINTS)),
             "dense": _points(dense_points(result.dense_cloud(), refined_maps, MAX_DENSE_POINTS)),
         },
+        "mesh": _encode_mesh(result.textured_mesh()),
         "frames": _describe_frames(result.model, ids),
         "trajectories": [
             _describe_trajectory(name, rows) for name, rows in result.trajectories().items()
@@ -429,23 +435,38 @@ def _why_unused(pair: Mapping[str, Any]) -> str:
 
 def _points(points: PointSet) -> dict[str, Any]:
     """Encode positions of points with 16 bits, and colors and other values with 8 bits."""
-    count = len(points.xyz)
-    low = np.zeros(3)
-    step = np.ones(3)
-    if count:
-        low = points.xyz.min(axis=0)
-        step = np.maximum(np.ptp(points.xyz, axis=0), 1e-9) / _MAX_COORDINATE
     return {
-        "count": count,
-        "low": low.tolist(),
-        "step": step.tolist(),
-        "xyz": _base64(np.round((points.xyz - low) / step).astype("<u2")),
+        "count": len(points.xyz),
+        **_encode_positions(points.xyz),
         "rgb": _base64(points.rgb),
         "values": {
             "error": _values(points.error, points.error_unit),
             "std": _values(points.std, "%"),
             "views": _values(points.views, ""),
         },
+    }
+
+
+def _encode_positions(xyz: Float64) -> dict[str, Any]:
+    """Encode positions (n, 3) with 16 bits for each coordinate."""
+    low, step = np.zeros(3), np.ones(3)
+    if len(xyz):
+        low = xyz.min(axis=0)
+        step = np.maximum(np.ptp(xyz, axis=0), 1e-9) / _MAX_COORDINATE
+    steps = np.round((xyz - low) / step).astype("<u2")
+    return {"low": low.tolist(), "step": step.tolist(), "xyz": _base64(steps)}
+
+
+def _encode_mesh(mesh: TexturedMesh | None) -> dict[str, Any] | None:
+    """Encode vertices, texture coordinates, triangles and texture; None without a mesh."""
+    if mesh is None or len(mesh.triangles) > MAX_MESH_TRIANGLES:
+        return None
+    texture = np.asarray(mesh.texture[..., ::-1], np.uint8)
+    return {
+        **_encode_positions(mesh.vertices),
+        "uv": _base64(np.round(mesh.uv * _MAX_COORDINATE).astype("<u2")),
+        "triangles": _base64(mesh.triangles.astype("<u4")),
+        "texture": pictures.photo(texture, _TEXTURE_SIDE),
     }
 
 

@@ -16,9 +16,11 @@ import pycolmap
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.data.result_layout import DENSE, DEPTH, MESH_OBJ, MESH_PLY, SUMMARY, VIEWS
+from mpsfm_core.dense.texture import TexturedMesh
 from mpsfm_core.inputs.models import read_model
 from mpsfm_core.results.depth_maps import load_depth_map
 from mpsfm_core.results.held_out import evaluate_held_out
+from mpsfm_core.results.obj import read_obj
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.summary import read_summary
 from mpsfm_core.results.trajectory import read_trajectory_rows
@@ -126,6 +128,11 @@ class ResultFolder:
             return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
         return read_ply(file)
 
+    def textured_mesh(self) -> TexturedMesh | None:
+        """Read ``mesh.obj``, None without this file."""
+        file = self.path / MESH_OBJ
+        return None if self.failed or not file.is_file() else read_obj(file)
+
     def held_out_renderings(self) -> dict[str, dict[str, Any]]:
         """Compare renderings of the best geometry with the held-out photos.
 
@@ -134,18 +141,20 @@ class ResultFolder:
             ``psnr`` in dB and ``ssim`` by image name; empty without held-out photos, photo files or
             geometry.
         """
-        if self.failed or not self.summary["images"].get("held_out"):
+        names = self.summary["images"].get("held_out")
+        files = [name for name in (MESH_OBJ, MESH_PLY, DENSE) if (self.path / name).is_file()]
+        if self.failed or not names or not files:
             return {}
+        best = files[0]
         try:
-            geometries = evaluate_held_out(self.path)["geometries"]
+            report = evaluate_held_out(self.path, names=names, geometry=self.path / best)
         except InputError as error:
             _log.info("%s", error)
             return {}
-        best = next(file for file in (MESH_OBJ, MESH_PLY, DENSE) if file in geometries)
         metrics = ("covered", "psnr", "ssim")
         return {
             name: {"geometry": best, **{metric: image[metric] for metric in metrics}}
-            for name, image in geometries[best]["per_image"].items()
+            for name, image in report["geometries"][best]["per_image"].items()
         }
 
     def refined(self, name: str) -> RefinedMap | None:

@@ -11,8 +11,10 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import mpsfm_core
+from mpsfm_core.cli import build_app
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.errors import ReconstructionError
 from mpsfm_core.report.page import write_report
@@ -70,6 +72,16 @@ def held_out(finished: Path, tmp_path: Path) -> Path:
     summary["images"]["held_out"] = ["1.png"]
     (folder / "summary.json").write_text(json.dumps(summary))
     write_report(folder)
+    return folder
+
+
+@pytest.fixture
+def meshed(finished: Path, tmp_path: Path) -> Path:
+    """Return a copy of the finished folder after ``mpsfm mesh``."""
+    folder = Path(shutil.copytree(finished, tmp_path / "meshed"))
+    command = ["mesh", str(folder), "--set", "max_triangles=2000"]
+    done = CliRunner().invoke(build_app(), command)
+    assert done.exit_code == 0, done.output
     return folder
 
 

@@ -193,3 +193,13 @@ def test_photo_panel_shows_the_prediction_of_a_held_out_photo(opened: Open, held
         wait_for(browser, "document.querySelector('#photo h3').innerText === arguments[0]", name)
         text = browser.execute_script("return document.getElementById('photo').innerText")
         assert ("dense.ply" in text) == ("PSNR" in text) == shown
+
+
+def test_report_opens_on_the_textured_mesh(opened: Open, meshed: Path) -> None:
+    browser = opened(meshed)
+    wait_for(browser, "window.report !== undefined")
+    shown = "document.querySelector('#tools [aria-pressed=true]').innerText"
+    assert browser.execute_script(f"return {shown}") == "mesh"
+    wait_for(browser, f"{COLORED} > 100")
+    faults = [line for line in browser.get_log("browser") if line["level"] == "SEVERE"]
+    assert not faults

@@ -18,6 +18,7 @@ from mpsfm_core.data.result_layout import REPORT
 from mpsfm_core.report.page import render, write_report
 from mpsfm_core.report.result_folder import ResultFolder
 from mpsfm_core.results.held_out import evaluate_held_out
+from mpsfm_core.results.obj import read_obj
 
 
 def data_of(page: str) -> dict[str, Any]:
@@ -99,6 +100,24 @@ def test_report_states_how_well_held_out_photos_are_predicted(held_out: Path) ->
     metrics = {name: expected["1.png"][name] for name in ("covered", "psnr", "ssim")}
     assert renderings == {"1.png": {"geometry": "dense.ply", **metrics}}
     assert metrics["covered"] > 0.5 and metrics["psnr"] > 10
+
+
+def test_mesh_command_adds_the_textured_mesh_to_the_report(meshed: Path) -> None:
+    encoded = data_of((meshed / REPORT).read_text(encoding="utf-8"))["mesh"]
+    mesh = read_obj(meshed / "mesh.obj")
+    arrays = {
+        key: np.frombuffer(base64.b64decode(encoded[key]), dtype).reshape(len(rows), -1)
+        for key, dtype, rows in (
+            ("xyz", "<u2", mesh.vertices),
+            ("uv", "<u2", mesh.uv),
+            ("triangles", "<u4", mesh.triangles),
+        )
+    }
+    xyz = np.array(encoded["low"]) + np.array(encoded["step"]) * arrays["xyz"]
+    np.testing.assert_allclose(xyz, mesh.vertices, atol=max(encoded["step"]))
+    np.testing.assert_allclose(arrays["uv"] / 0xFFFF, mesh.uv, atol=1e-4)
+    np.testing.assert_array_equal(arrays["triangles"], mesh.triangles)
+    assert encoded["texture"].startswith("data:image/")
 
 
 def test_report_has_the_poses_of_the_frames_of_a_video(walked: Path) -> None:

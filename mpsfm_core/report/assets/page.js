@@ -475,10 +475,9 @@
 
     // Points: positions, and one colour attribute that is filled anew for each way of colouring.
     const objects = {};
+    const positions = ({ xyz, low, step }) => Float32Array.from(new Uint16Array(bytes(xyz).buffer), (value, i) => low[i % 3] + step[i % 3] * value);
     for (const [name, cloud] of clouds) {
-      const steps = new Uint16Array(bytes(cloud.xyz).buffer);
-      const xyz = new Float32Array(steps.length);
-      for (let i = 0; i < steps.length; i++) xyz[i] = cloud.low[i % 3] + cloud.step[i % 3] * steps[i];
+      const xyz = positions(cloud);
       const geometry = new THREE.BufferGeometry();
       geometry.setAttribute("position", new THREE.BufferAttribute(xyz, 3));
       geometry.setAttribute("tint", new THREE.BufferAttribute(new Uint8Array(xyz.length), 3, true));
@@ -491,6 +490,21 @@
       points.userData = { cloud, xyz, rgb: bytes(cloud.rgb) };
       objects[name] = points;
       scene.add(points);
+    }
+
+    // The mesh with its texture, whose rows start at the top.
+    const loader = new THREE.TextureLoader();
+    let surface = null;
+    if (data.mesh) {
+      const geometry = new THREE.BufferGeometry();
+      geometry.setAttribute("position", new THREE.BufferAttribute(positions(data.mesh), 3));
+      geometry.setAttribute("uv", new THREE.BufferAttribute(new Uint16Array(bytes(data.mesh.uv).buffer), 2, true));
+      geometry.setIndex(new THREE.BufferAttribute(new Uint32Array(bytes(data.mesh.triangles).buffer), 1));
+      const map = loader.load(data.mesh.texture, draw);
+      map.flipY = false;
+      map.colorSpace = THREE.SRGBColorSpace;
+      surface = new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ map, side: THREE.DoubleSide }));
+      scene.add(surface);
     }
 
     // How large things are: cameras and points, without the outermost.
@@ -519,7 +533,6 @@
     const cornersOf = ({ edges: [l, t, r, b] }) => [[l, t, 1], [r, t, 1], [r, b, 1], [l, b, 1]];
 
     // Cameras: a pyramid of lines and the photo on its base.
-    const loader = new THREE.TextureLoader();
     const cameras = placed.map(({ photo, row }) => {
       const { pose } = photo;
       const group = new THREE.Group();
@@ -583,10 +596,11 @@
       draw();
     });
 
-    const state = { shown: objects.dense ? "dense" : "sparse", colour: "photo", point: 1, camera: 1, photos: true };
+    const state = { shown: surface ? "mesh" : objects.dense ? "dense" : "sparse", colour: "photo", point: 1, camera: 1, photos: true };
     const paint = () => {
       const legend = byId("legend");
-      legend.hidden = state.colour === "photo";
+      legend.hidden = state.colour === "photo" || state.shown === "mesh";
+      if (surface) surface.visible = state.shown === "mesh";
       for (const [name, points] of Object.entries(objects)) {
         points.visible = state.shown === "both" || state.shown === name;
         const { cloud, rgb } = points.userData;
@@ -600,7 +614,7 @@
         tint.needsUpdate = true;
         points.material.uniforms.size.value = state.point * (name === "sparse" ? 0.008 : 0.005) * radius * canvas.clientHeight;
       }
-      if (state.colour !== "photo") {
+      if (!legend.hidden) {
         const shown = objects[state.shown === "both" ? "dense" : state.shown] ?? Object.values(objects)[0];
         const { low, high, unit } = shown.userData.cloud.values[state.colour];
         const digits = state.colour === "views" ? 0 : unit === "px" ? 2 : 1;
@@ -679,8 +693,9 @@
     const colour = el("select", { id: "colour", onchange: (event) => { state.colour = event.target.value; paint(); } }, ...COLORS.map(([value, label]) => el("option", { value }, label)));
     const through = el("button", { disabled: "", onclick: () => lookThrough(selected) }, "look through");
     listeners.push((row) => { through.disabled = !centerOf.has(row); });
+    const shapes = [surface && "mesh", objects.dense && "dense", objects.sparse && "sparse", objects.dense && objects.sparse && "both"].filter(Boolean);
     byId("tools").append(
-      objects.dense && objects.sparse ? choice(["dense", "sparse", "both"], "shown") : "",
+      shapes.length > 1 ? choice(shapes, "shown") : "",
       el("div", {}, el("label", { for: "colour" }, "colour by"), colour),
       slider("points", "point"), slider("cameras", "camera"), ...videos.map(timeline),
       el("div", {}, el("button", { "aria-pressed": "true", onclick: (event) => {
