@@ -189,7 +189,7 @@ def _describe_trajectory(name: str, rows: Float64) -> dict[str, Any]:
     """Describe the frames of a video, or evenly spaced frames of a long video.
 
     Args:
-        name: Name of the video.
+        name: Name of the video, which is empty for a single video.
         rows: (n, 8) time stamps, camera centers and quaternions of the frames.
 
     Returns:

@@ -23,7 +23,7 @@ from mpsfm_core.results.held_out import evaluate_held_out
 from mpsfm_core.results.obj import read_obj
 from mpsfm_core.results.ply import read_ply
 from mpsfm_core.results.summary import read_summary
-from mpsfm_core.results.trajectory import read_trajectory_rows
+from mpsfm_core.results.trajectory import find_trajectories, read_trajectory_rows
 from mpsfm_core.results.views import MATCHES
 from mpsfm_core.support.npz import read_npz
 
@@ -114,12 +114,8 @@ class ResultFolder:
 
     def trajectories(self) -> dict[str, Float64]:
         """Read the poses of all frames of each video, see :func:`read_trajectory_rows`."""
-        rows = {}
-        for video in [] if self.failed else self.summary.get("videos", []):
-            if video.get("trajectory"):
-                file = self.path / video["trajectory"]["file"]
-                rows[Path(video["file"]).name] = read_trajectory_rows(file)
-        return rows
+        found = {} if self.failed else find_trajectories(self.path)
+        return {name: read_trajectory_rows(path) for name, path in found.items()}
 
     def dense_cloud(self) -> tuple[Float64, UInt8]:
         """Read points (n, 3) and RGB colors (n, 3) of ``dense.ply``, empty without this file."""

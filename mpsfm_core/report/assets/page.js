@@ -570,8 +570,7 @@
       const centerAt = (i) => [3, 7, 11].map((k) => poses[i][k]);
       const path = times.slice(1).flatMap((end, i) => (end - times[i] > 5 * step ? [] : [centerAt(i), centerAt(i + 1)]));
       scene.add(new THREE.LineSegments(geometryOf(path), new THREE.LineBasicMaterial({ color: VIDEO_COLOR })));
-      const folder = name.replace(/\.[^.]*$/, "/");
-      const { photo } = placed.find(({ photo }) => photo.name.startsWith(folder)) ?? placed[0];
+      const { photo } = placed.find(({ photo }) => photo.name.startsWith(`${name}/`)) ?? placed[0];
       const lines = new THREE.LineSegments(pyramid(cornersOf(photo)), new THREE.LineBasicMaterial({ color: VIDEO_COLOR }));
       lines.matrixAutoUpdate = false;
       scene.add(lines);
@@ -683,7 +682,7 @@
     const timeline = (video) => {
       const { name, times } = video;
       const shownTime = el("output", {}, time(times[0]));
-      return el("div", {}, el("label", {}, `${shorten(name)} `, el("input", { type: "range", class: "video", min: 0, max: times.length - 1, value: 0, oninput: (event) => {
+      return el("div", {}, el("label", {}, `${shorten(name || "video")} `, el("input", { type: "range", class: "video", min: 0, max: times.length - 1, value: 0, oninput: (event) => {
         video.shown = Number(event.target.value);
         shownTime.textContent = time(times[video.shown]);
         moveVideo(video);

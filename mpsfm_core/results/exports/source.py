@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import DepthPrior, Float32, Float64, NormalPrior, PinholeCamera, UInt8
 from mpsfm_core.data.errors import InputError
-from mpsfm_core.data.result_layout import DENSE, DEPTH, SUMMARY, TRAJECTORY
+from mpsfm_core.data.result_layout import DENSE, DEPTH, SUMMARY
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.inputs.image_search import find_images
 from mpsfm_core.inputs.images import ImageSet, load_images
@@ -27,7 +27,7 @@ from mpsfm_core.results.gravity import Gravity, estimate_gravity, rotation_to_z
 from mpsfm_core.results.original_images import export_view, exported_image_name
 from mpsfm_core.results.ply import read_normals, read_ply
 from mpsfm_core.results.summary import read_summary
-from mpsfm_core.results.trajectory import read_trajectory_rows
+from mpsfm_core.results.trajectory import find_trajectories, read_trajectory_rows
 
 _NORMALS_AN_IMAGE = 2000
 """Maximum number of surface normals per image in the estimation of gravity."""
@@ -222,21 +222,21 @@ class ExportSource:
         turned: Float32 = (normals @ turn.T).astype(np.float32)
         return turned
 
-    def trajectory(self) -> tuple[Float64, Float64, Float64] | None:
-        """Read the poses of the frames of a video, None if the folder has no trajectory.
+    def trajectories(self) -> dict[str, tuple[Float64, Float64, Float64]]:
+        """Read the poses of the frames of each video, by video name, empty for a single video.
 
         Returns:
             Time stamps (n,) in seconds, camera centers (n, 3) in the exported world, and rotations
             (n, 3, 3) ``world_from_cam``.
         """
-        path = self.folder / TRAJECTORY
-        if not path.is_file():
-            return None
-        table = read_trajectory_rows(path)
-        centers: Float64 = self.world_from_model * table[:, 1:4]
         turn = self.world_from_model.rotation.matrix()
-        rotations = turn @ Rotation.from_quat(table[:, 4:]).as_matrix()
-        return table[:, 0], centers, rotations
+        read = {}
+        for name, path in find_trajectories(self.folder).items():
+            table = read_trajectory_rows(path)
+            centers: Float64 = self.world_from_model * table[:, 1:4]
+            rotations = turn @ Rotation.from_quat(table[:, 4:]).as_matrix()
+            read[name] = table[:, 0], centers, rotations
+        return read
 
     def maps(self, name: str) -> ExportMaps | None:
         """Read depth and normals of an image, None if the folder has no depth map.

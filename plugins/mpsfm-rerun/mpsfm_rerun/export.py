@@ -26,9 +26,9 @@ def write(source: ExportSource, folder: Path) -> None:
         pictures = pictures_from_photos(source.photos)
     viewer = RerunViewer(folder, pictures, z_is_up=source.z_is_up)
     viewer.show(SceneState(images, scene.points), ColoredPoints(*source.dense_points()))
-    trajectory = source.trajectory()
-    if trajectory is not None and images:
-        viewer.show_trajectory(*trajectory, images[0].camera)
+    for name, trajectory in source.trajectories().items() if images else ():
+        camera = next((i.camera for i in images if i.name.startswith(f"{name}/")), images[0].camera)
+        viewer.show_trajectory(name, *trajectory, camera)
     viewer.finish()
 
 

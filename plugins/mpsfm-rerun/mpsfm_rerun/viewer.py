@@ -21,16 +21,16 @@ RECORDING = "scene.rrd"
 TIMELINE = "step"
 VIDEO_TIMELINE = "time"
 VIDEO_CAMERA = "world/video_camera"
+TRAJECTORY = "world/trajectory"
 _DEPTH = "world/depth"
 
 
 class RerunViewer:
     """Viewer that writes the recording ``OUTPUT/scene.rrd``.
 
-    Each recorded scene is a step of rerun's timeline ``step``; the camera of a video moves along
-    the timeline ``time``. If ``z_is_up`` is True, the z axis
-    of the recorded world points up. If ``z_is_up`` is False, the y axis of the recorded world
-    points down, as in the camera frame.
+    Each recorded scene is a step of rerun's timeline ``step``; the cameras of videos move along
+    the timeline ``time``. If ``z_is_up`` is True, the z axis of the recorded world points up. If
+    ``z_is_up`` is False, the y axis of the recorded world points down, as in the camera frame.
     """
 
     def __init__(self, output: Path, pictures: Pictures, z_is_up: bool = False) -> None:
@@ -78,26 +78,32 @@ class RerunViewer:
         self._shown = names
 
     def show_trajectory(
-        self, times: Float64, centers: Float64, rotations: Float64, camera: PinholeCamera
+        self,
+        video: str,
+        times: Float64,
+        centers: Float64,
+        rotations: Float64,
+        camera: PinholeCamera,
     ) -> None:
         """Record the path of a video, and its camera at each time of rerun's timeline ``time``.
 
         Args:
+            video: Name of the video, which is empty for a single video.
             times: (n,) time stamps in seconds.
             centers: (n, 3) camera centers in the world.
             rotations: (n, 3, 3) rotations ``world_from_cam``.
             camera: Camera of the video.
         """
-        path = rerun.LineStrips3D([centers])
-        self._recording.log("world/trajectory", path, static=True)
+        path, place = rerun.LineStrips3D([centers]), _child(VIDEO_CAMERA, video)
+        self._recording.log(_child(TRAJECTORY, video), path, static=True)
         pinhole = rerun.Pinhole(
             image_from_camera=camera.matrix,
             resolution=camera.size,
             camera_xyz=rerun.ViewCoordinates.RDF,
         )
-        self._recording.log(VIDEO_CAMERA, pinhole, static=True)
+        self._recording.log(place, pinhole, static=True)
         self._recording.send_columns(
-            VIDEO_CAMERA,
+            place,
             indexes=[rerun.TimeColumn(VIDEO_TIMELINE, duration=times)],
             columns=rerun.Transform3D.columns(translation=centers, mat3x3=rotations),
         )
@@ -156,6 +162,11 @@ def _depth_place(name: str) -> str:
     return f"{_DEPTH}/{_key(name)}"
 
 
+def _child(place: str, video: str) -> str:
+    """Return the entity path of a video, which is the place itself for a single video."""
+    return f"{place}/{_key(video)}" if video else place
+
+
 def _key(name: str) -> str:
-    """Convert an image name to one part of an entity path of rerun."""
+    """Convert the name of an image or video to one part of an entity path of rerun."""
     return str(rerun.escape_entity_path_part(name))

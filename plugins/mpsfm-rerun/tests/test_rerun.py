@@ -146,6 +146,8 @@ def test_exported_model_has_images_and_depth_maps(tmp_path: Path) -> None:
     (tmp_path / "trajectory.txt").write_text(
         f"# timestamp tx ty tz qx qy qz qw\n0.5 0 0 0 0 0 0 1\n1.0 1 2 3 0 0 {half} {half}\n"
     )
+    (tmp_path / "trajectories").mkdir()
+    (tmp_path / "trajectories" / "hall.txt").write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
     described = export(tmp_path, "rerun")
     assert described["orientation"].startswith("z is up")
     recording = tmp_path / "exports" / "rerun" / RECORDING
@@ -162,6 +164,7 @@ def test_exported_model_has_images_and_depth_maps(tmp_path: Path) -> None:
         if str(chunk.entity_path) == "/world/video_camera" and not chunk.is_static
     )
     assert [time.total_seconds() for time in video["time"].to_pylist()] == [0.5, 1.0]
+    assert {"/world/video_camera/hall", "/world/trajectory/hall"} <= rows.keys()
     moved = np.array([[0, 0, 0], [1, 2, 3]]) @ world_from_model[:, :3].T + world_from_model[:, 3]
     centers = np.array([c[0] for c in video["Transform3D:translation"].to_pylist()])
     np.testing.assert_allclose(centers, moved, atol=1e-5)
