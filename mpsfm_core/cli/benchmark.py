@@ -69,7 +69,7 @@ def benchmark(
     A SCENE is a folder with images/, gt/, and optionally intrinsics.yaml, gt_depth/ and
     testsets.yaml. The report is written to DIR/report.md, .json and .html. Finished runs in DIR are
     not repeated. With gt_depth/ and --set dense.enabled=true, the depth maps and dense clouds are
-    evaluated too.
+    evaluated too. With --set dense.hold_out_every=N, the clouds are rendered at every N-th image.
     """
     from mpsfm_core.data.errors import InputError
 

@@ -256,9 +256,10 @@ class _SceneRuns:
                 yield record, False
 
     def _dense_evaluation(self, prepared: PreparedSets) -> DenseEvaluation | None:
-        """Return the dense evaluation if densification is enabled and the scene has true depth."""
+        """Return the dense evaluation, None without densification or anything to compare with."""
         config = prepared.config
-        if not config.dense.enabled or self._scene.depth is None:
+        comparable = self._scene.depth is not None or config.dense.hold_out_every is not None
+        if not config.dense.enabled or not comparable:
             return None
         max_points, distances = config.results.dense_max_points, self._plan.distances
         return DenseEvaluation(prepared.images, config.dense, max_points, self._scene, distances)

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from mpsfm_core.data import Float64, MappingProblem, PinholeCamera
 from mpsfm_core.dense.densify import densify
 from mpsfm_core.dense.fusion import fuse_depth_maps
@@ -16,14 +18,23 @@ from mpsfm_core.evaluation.depth_accuracy import depth_accuracy, mean_accuracy
 from mpsfm_core.evaluation.prior_quality import read_depth
 from mpsfm_core.evaluation.scene_folder import SceneFolder
 from mpsfm_core.evaluation.true_surface import build_true_surface, true_depth_file
+from mpsfm_core.geometry.rendering import Geometry
 from mpsfm_core.inputs.images import ImageSet
-from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+from mpsfm_core.mapping.scene.reconstruction import Reconstruction, hold_out_images
+from mpsfm_core.results.held_out import evaluate_geometry, reduce_view
 from mpsfm_core.results.original_images import OriginalImages
+
+HELD_OUT_METRICS = ("covered", "psnr", "ssim")
+"""Metrics of renderings of held-out images."""
 
 
 @dataclass(frozen=True, eq=False)
 class DenseEvaluation:
-    """Settings to densify and evaluate the reconstruction of a test set."""
+    """Settings to densify and evaluate the reconstruction of a test set.
+
+    The cloud is compared with true depth, and rendered at the poses of held-out images
+    (``dense.hold_out_every``).
+    """
 
     images: ImageSet
     """Image set that contains all images of the test set."""
@@ -32,17 +43,32 @@ class DenseEvaluation:
     max_points: int
     """Maximum number of points of the fused cloud."""
     scene: SceneFolder
-    """Scene folder with true depth maps."""
+    """Scene folder, with or without true depth maps."""
     distances: tuple[float, ...]
     """Distance thresholds in meters for the accuracy of the point cloud."""
 
     def evaluate(self, model: Reconstruction, problem: MappingProblem) -> dict[str, Any] | None:
-        """Densify a reconstruction and compare the result with true depth."""
+        """Densify a reconstruction; compare with true depth and with held-out images.
+
+        Returns:
+            Result of :func:`evaluate_dense_geometry`, with the key ``held_out`` if images are held
+            out: the means of :func:`~mpsfm_core.results.held_out.evaluate_geometry`.
+        """
+        if self.dense.hold_out_every is not None:
+            model = hold_out_images(model, self.dense.hold_out_every)
         photos = OriginalImages(self.images, problem)
         dense, _ = densify(model, photos.view, self.dense)
-        cloud = fuse_depth_maps(dense, photos.view, self.max_points).points
+        cloud = fuse_depth_maps(dense, photos.view, self.max_points)
         cameras = {image.name: image.pinhole for image in self.images}
-        return evaluate_dense_geometry(dense, cloud, self.scene, cameras, self.distances)
+        found = evaluate_dense_geometry(dense, cloud.points, self.scene, cameras, self.distances)
+        held_out = {image.name: image for image in dense.images if image.held_out}
+        if not held_out:
+            return found
+        geometry = Geometry(cloud.points, cloud.colors, np.zeros((0, 3), np.int64))
+        views = {name: reduce_view(photos.view(name)) for name in held_out}
+        depths = {name: image.depth for name, image in held_out.items()}
+        rendered = evaluate_geometry(geometry, views, dense.poses, depths)
+        return {**(found or {}), "held_out": {key: rendered[key] for key in HELD_OUT_METRICS}}
 
 
 def evaluate_dense_geometry(

@@ -57,7 +57,7 @@ class BenchmarkRecord:
     """Poses ``cam_from_world`` by image name of each further model."""
     dense: Mapping[str, Any] | None = None
     """Accuracy of the dense results from
-    :func:`~mpsfm_core.evaluation.dense_geometry.evaluate_dense_geometry`, or None."""
+    :meth:`~mpsfm_core.evaluation.dense_geometry.DenseEvaluation.evaluate`, or None."""
 
     def errors_deg(self, convention: PoseConvention) -> Float64:
         """Compute the relative pose errors of all image pairs of the test set in degrees."""

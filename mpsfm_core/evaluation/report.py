@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mpsfm_core.data import Float64
+from mpsfm_core.evaluation.dense_geometry import HELD_OUT_METRICS
 from mpsfm_core.evaluation.pose_auc import (
     CONVENTIONS,
     THRESHOLDS_DEG,
@@ -36,7 +37,8 @@ _RANGE_DEG = 20
 _DENSE_NOTE = (
     "Dense geometry: AbsRel of the depth maps in the scale of the cameras; accuracy / "
     "completeness / F1 of the cloud at each distance, percent, as ETH3D defines them, with true "
-    "depth as the scan."
+    "depth as the scan; held out: pixels that the cloud covers, and PSNR and SSIM of its "
+    "renderings, at images that the dense stage did not use."
 )
 
 GroupKey = tuple[str, str, str, str]
@@ -71,8 +73,9 @@ class BenchmarkRow:
     """Number of test sets on which the method failed."""
     dense: Mapping[str, Any] | None = None
     """Mean accuracy of the dense results, or None without dense evaluation. The keys are ``sets``
-    (number of test sets), ``abs_rel`` (depth error), and the :data:`CLOUD_METRICS` with a ratio by
-    distance threshold in meters."""
+    (number of test sets), with true depth ``abs_rel`` (depth error) and the :data:`CLOUD_METRICS`
+    with a ratio by distance threshold in meters, and with held-out images
+    :data:`~mpsfm_core.evaluation.dense_geometry.HELD_OUT_METRICS`."""
 
     @property
     def group(self) -> GroupKey:
@@ -127,10 +130,17 @@ def _mean_dense(sets: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     if not sets:
         return None
     means: dict[str, Any] = {"sets": len(sets)}
-    means["abs_rel"] = float(np.mean([each["depth"]["abs_rel"] for each in sets]))
-    for key in CLOUD_METRICS:
-        distances = sets[0]["cloud"][key]
-        means[key] = {d: float(np.mean([s["cloud"][key][d] for s in sets])) for d in distances}
+    with_truth = [each for each in sets if "depth" in each]
+    if with_truth:
+        means["abs_rel"] = float(np.mean([each["depth"]["abs_rel"] for each in with_truth]))
+        for key in CLOUD_METRICS:
+            clouds = [each["cloud"][key] for each in with_truth]
+            means[key] = {d: float(np.mean([cloud[d] for cloud in clouds])) for d in clouds[0]}
+    for key in HELD_OUT_METRICS:
+        values = [each["held_out"][key] for each in sets if "held_out" in each]
+        known = [value for value in values if value is not None]
+        if known:
+            means[key] = float(np.mean(known))
     return means
 
 
@@ -181,10 +191,19 @@ def _lines(rows: Sequence[BenchmarkRow]) -> list[list[str]]:
     head = ["bucket", "sets", "method", *(f"AUC@{t}°" for t in THRESHOLDS_DEG)]
     head += ["registered", "CPU s / set", "failed"]
     dense = [row.dense for row in rows if row.dense]
-    distances = list(dict.fromkeys(d for each in dense for d in each["f1"]))
-    if dense:
+    distances = list(dict.fromkeys(d for each in dense for d in each.get("f1", ())))
+    if distances:
         head += ["AbsRel", *(f"{d} m" for d in distances)]
-    return [head, *(_cells(row) + (_dense_cells(row, distances) if dense else []) for row in rows)]
+    held_out = any("covered" in each for each in dense)
+    if held_out:
+        head += ["held out: covered", "PSNR, dB", "SSIM"]
+    lines = [head]
+    for row in rows:
+        cells = _cells(row)
+        cells += _dense_cells(row, distances) if distances else []
+        cells += _held_out_cells(row) if held_out else []
+        lines.append(cells)
+    return lines
 
 
 def _cells(row: BenchmarkRow) -> list[str]:
@@ -194,7 +213,7 @@ def _cells(row: BenchmarkRow) -> list[str]:
 
 
 def _dense_cells(row: BenchmarkRow, distances: Sequence[str]) -> list[str]:
-    if row.dense is None:
+    if row.dense is None or "abs_rel" not in row.dense:
         return [""] * (1 + len(distances))
     means = row.dense
     shares = [
@@ -202,6 +221,12 @@ def _dense_cells(row: BenchmarkRow, distances: Sequence[str]) -> list[str]:
         for d in distances
     ]
     return [f"{means['abs_rel']:.3f}", *shares]
+
+
+def _held_out_cells(row: BenchmarkRow) -> list[str]:
+    means = row.dense or {}
+    formats = zip(HELD_OUT_METRICS, (".0%", ".1f", ".2f"), strict=True)
+    return [format(means[key], spec) if key in means else "" for key, spec in formats]
 
 
 def _page(

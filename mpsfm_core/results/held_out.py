@@ -71,13 +71,13 @@ def evaluate_held_out(
     independent = set(names) <= set(recorded) if recorded and geometry is None else None
     poses = reconstruction_poses(source.model)
     rows = {name: row for row, name in enumerate(source.names)}
-    views = {name: _resized(source.images.view(rows[name])) for name in names}
+    views = {name: reduce_view(source.images.view(rows[name])) for name in names}
     depths = {name: _read_depth(source.folder, name) for name in names}
     return {
         "images": list(names),
         "independent": independent,
         "geometries": {
-            path.name: _evaluate_geometry(read_geometry(path), views, poses, depths)
+            path.name: evaluate_geometry(read_geometry(path), views, poses, depths)
             for path in files
         },
     }
@@ -152,7 +152,7 @@ def _select_names(
     return list(names or [name for name in recorded if name in known] or known)
 
 
-def _resized(view: View) -> View:
+def reduce_view(view: View) -> View:
     """Reduce a view to at most :data:`_MAX_SIZE` pixels."""
     width, height = view.camera.size
     factor = min(1.0, _MAX_SIZE / max(width, height))
@@ -167,12 +167,23 @@ def _read_depth(folder: Path, name: str) -> DepthPrior | None:
     return read_depth_map(path)[1] if path.is_file() else None
 
 
-def _evaluate_geometry(
+def evaluate_geometry(
     geometry: Geometry,
     views: Mapping[str, View],
     poses: Mapping[str, Pose],
     depths: Mapping[str, DepthPrior | None],
 ) -> dict[str, Any]:
+    """Render a geometry at the poses of photos, and compare with the photos.
+
+    Args:
+        geometry: Cloud or mesh, world frame.
+        views: Undistorted photos in the size of the renderings, by image name.
+        poses: ``cam_from_world`` by image name.
+        depths: Depth maps in world units by image name, None without depth map.
+
+    Returns:
+        The means over images and the values ``per_image`` of :func:`evaluate_held_out`.
+    """
     radii = None if len(geometry.triangles) else splat_radii(geometry.points)
     per_image = {
         name: compare_rendering(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -101,6 +102,25 @@ def test_report_dense_columns_need_true_depth(output) -> None:
     assert lines["colmap"].endswith("|  |  |  |  |")
     page = (folder / "report.html").read_text()
     assert "<th>AbsRel</th><th>0.02 m</th>" in page and f"<td>{shares}</td>" in page
+
+
+def test_benchmark_without_true_depth_renders_held_out_images(
+    scene_folder: Path, config: Path, tmp_path: Path
+) -> None:
+    scene = tmp_path / scene_folder.name
+    shutil.copytree(scene_folder, scene, ignore=shutil.ignore_patterns("gt_depth"))
+    settings = f"--config {config} --sets all --peers none -o {tmp_path / 'out'}"
+    settings += " --set dense.hold_out_every=3"
+    result = CliRunner().invoke(build_app(), ["benchmark", str(scene), *settings.split()])
+    assert result.exit_code == 0, result.stderr
+    report = json.loads((tmp_path / "out" / "report.json").read_text())["conventions"]["paper"]
+    (row,) = report["rows"]
+    found = row["dense"]
+    assert found.keys() == {"sets", "covered", "psnr", "ssim"}
+    assert found["covered"] > 0.5 and found["psnr"] > 15 and 0 < found["ssim"] <= 1
+    assert "| failed | held out: covered | PSNR, dB | SSIM |" in result.stdout
+    cells = f"| {found['covered']:.0%} | {found['psnr']:.1f} | {found['ssim']:.2f} |"
+    assert cells in result.stdout
 
 
 def test_report_recall_curves_match_errors(output) -> None:

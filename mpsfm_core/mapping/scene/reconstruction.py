@@ -292,12 +292,15 @@ def hold_out(mapping: MappingResult, every: int | None) -> MappingResult:
     """
     if every is None:
         return mapping
-    parts = []
-    for part in mapping.reconstructions:
-        names = set(sorted(image.name for image in part.confirmed_images)[::every])
-        images = tuple(replace(image, held_out=image.name in names) for image in part.images)
-        parts.append(replace(part, images=images))
-    return replace(mapping, reconstructions=tuple(parts))
+    parts = tuple(hold_out_images(part, every) for part in mapping.reconstructions)
+    return replace(mapping, reconstructions=parts)
+
+
+def hold_out_images(reconstruction: Reconstruction, every: int) -> Reconstruction:
+    """Mark every n-th registered image as held out, in alphabetical order."""
+    names = set(sorted(image.name for image in reconstruction.confirmed_images)[::every])
+    images = (replace(image, held_out=image.name in names) for image in reconstruction.images)
+    return replace(reconstruction, images=tuple(images))
 
 
 def find_explained_matches(
