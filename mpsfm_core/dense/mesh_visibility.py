@@ -39,7 +39,7 @@ def find_observed_triangles(
     """
     vertex_observed = np.zeros(len(vertices), np.bool_)
 
-    def mark_observed(areas: Float64) -> None:
+    def mark_observed(_: RegisteredImage, areas: Float64) -> None:
         vertex_observed[triangles[areas > 0]] = True
 
     map_projected_areas(mark_observed, vertices, triangles, images, min_cosine=0.0)
@@ -48,7 +48,7 @@ def find_observed_triangles(
 
 
 def map_projected_areas(
-    function: Callable[[Float64], Result],
+    function: Callable[[RegisteredImage, Float64], Result],
     vertices: Float64,
     triangles: Int64,
     images: Sequence[RegisteredImage],
@@ -57,8 +57,8 @@ def map_projected_areas(
     """Call a function on the projected areas of the triangles in each image, in threads.
 
     Args:
-        function: Function of the area (m,) of each triangle in pixels of an image, 0 if the
-            triangle is not visible.
+        function: Function of an image, and of the area (m,) of each triangle in pixels of the
+            image, 0 if the triangle is not visible.
         vertices: (n, 3) positions, world frame.
         triangles: (m, 3) vertex indices, counterclockwise as seen by the cameras.
         images: Posed images with depth maps, whose sizes are those of the occlusion test.
@@ -75,7 +75,8 @@ def map_projected_areas(
         xy = project(image.camera, local)
         visible = _find_visible(image, local, triangles, xy, edge_length)
         min_frontal_ratio = min_cosine * image.camera.fx * image.camera.fy
-        return function(_project_triangles(local, xy, visible, triangles, min_frontal_ratio))
+        areas = _project_triangles(local, xy, visible, triangles, min_frontal_ratio)
+        return function(image, areas)
 
     return parallel_map(call, images)
 

@@ -95,7 +95,7 @@ def build_texture(
         InputError: The charts do not fit into the texture.
     """
     images = reconstruction.dense_images
-    labels = select_texture_views(mesh.vertices, mesh.triangles, images)
+    labels = select_texture_views(mesh.vertices, mesh.triangles, images, view_of)
     charts = _build_charts(mesh.triangles, labels)
     xy = _project_corners(mesh.vertices, charts, images)
     layout = _lay_out(charts, xy, max_size)

@@ -1,23 +1,27 @@
 """Selection of the photo that textures each triangle of a mesh.
 
-The data term is the projected area of a triangle in pixels, and the smoothness term counts
-neighboring triangles with another photo [Waechter, Moehrle and Goesele, Let There Be Color, ECCV
-2014, whose data term also weights the image gradient]. The labels are optimized by iterated
-conditional modes, while the weight of the smoothness term increases. The data term is averaged over
-the neighborhood of a triangle first, so that the labels start with large connected regions.
+The data term is the projected area of a triangle in pixels, times the squared sharpness of the
+photo, and the smoothness term counts neighboring triangles with another photo [Waechter, Moehrle
+and Goesele, Let There Be Color, ECCV 2014, whose data term weights the image gradient of each
+triangle]. The sharpness of a photo is its image gradient relative to the other photos of the same
+triangles. The labels are optimized by iterated conditional modes, while the weight of the
+smoothness term increases. The data term is averaged over the neighborhood of a triangle first, so
+that the labels start with large connected regions.
 """
 
 # mypy: allow-untyped-decorators
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
-from mpsfm_core.data import Float32, Float64, Int64
+from mpsfm_core.data import Float32, Float64, Int64, UInt8, View
 from mpsfm_core.dense.mesh_visibility import map_projected_areas
+from mpsfm_core.geometry import project, sample_nearest, transform
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 from mpsfm_core.support.jit import kernel
 
@@ -28,6 +32,9 @@ _MIN_COSINE = 0.1
 photos stretch steeper surfaces."""
 _SMOOTHNESS_STEPS = (0.0, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0, 1.0, 1.0, 1.0)
 """Weight of the smoothness term in each pass of the label optimization."""
+_MIN_BRIGHTNESS = 16.0
+"""Gray value that is added to the brightness by which gradients are divided, because in dark pixels
+noise exceeds the gradient of the surface."""
 _NUM_DIFFUSIONS = 10
 """Number of averages of the data term with the neighboring triangles."""
 
@@ -44,7 +51,10 @@ class _Candidates(NamedTuple):
 
 
 def select_texture_views(
-    vertices: Float64, triangles: Int64, images: Sequence[RegisteredImage]
+    vertices: Float64,
+    triangles: Int64,
+    images: Sequence[RegisteredImage],
+    view_of: Callable[[str], View],
 ) -> Int64:
     """Select the photo that textures each triangle, with few seams between photos.
 
@@ -52,12 +62,13 @@ def select_texture_views(
         vertices: (n, 3) positions, world frame.
         triangles: (m, 3) vertex indices, counterclockwise as seen by the cameras.
         images: Posed images with depth maps, whose sizes are those of the occlusion test.
+        view_of: Function that returns the undistorted view of an image name.
 
     Returns:
         Index (m,) of the image of each triangle, or :data:`NO_VIEW` if no image observes it.
     """
     neighbors = find_neighbors(triangles)
-    starts, views, costs = _find_candidates(vertices, triangles, images)
+    starts, views, costs = _find_candidates(vertices, triangles, images, view_of)
     for _ in range(_NUM_DIFFUSIONS):
         costs = _diffuse_costs(starts, views, costs, neighbors)
     labels = np.full(len(triangles), NO_VIEW, np.int64)
@@ -95,23 +106,68 @@ def find_neighbors(triangles: Int64) -> Int64:
 
 
 def _find_candidates(
-    vertices: Float64, triangles: Int64, images: Sequence[RegisteredImage]
+    vertices: Float64,
+    triangles: Int64,
+    images: Sequence[RegisteredImage],
+    view_of: Callable[[str], View],
 ) -> _Candidates:
-    def select_seen(areas: Float64) -> tuple[Int64, Float64]:
-        seen = np.flatnonzero(areas > 0)
-        return seen, areas[seen]
+    centers = vertices[triangles].mean(axis=1)
 
-    faces, areas = zip(
+    def select_seen(image: RegisteredImage, areas: Float64) -> tuple[Int64, Float64, Float64]:
+        seen = np.flatnonzero(areas > 0)
+        xy = project(image.camera, transform(image.rotation, image.translation, centers[seen]))
+        gradient = sample_nearest(_relative_gradient(view_of(image.name).image), xy)
+        return seen, areas[seen], gradient
+
+    faces, areas, gradients = zip(
         *map_projected_areas(select_seen, vertices, triangles, images, _MIN_COSINE), strict=True
     )
     face, area = np.concatenate(faces), np.concatenate(areas)
     view = np.repeat(np.arange(len(images)), [len(seen) for seen in faces])
+    gradient = np.concatenate(gradients)
+    sharpness = _compare_sharpness(face, view, area, gradient, len(images))
+    area *= sharpness[view] ** 2
     order = np.argsort(face, kind="stable")
     face, view, area = face[order], view[order], area[order]
     largest = np.zeros(len(triangles))
     np.maximum.at(largest, face, area)
     starts = np.concatenate([[0], np.cumsum(np.bincount(face, minlength=len(triangles)))])
     return _Candidates(starts, view, (1 - area / largest[face]).astype(np.float32))
+
+
+def _relative_gradient(photo: UInt8) -> Float32:
+    """Return the norm (h, w) of the gradient of the brightness, relative to the brightness."""
+    gray = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY).astype(np.float32)
+    dx, dy = cv2.Scharr(gray, cv2.CV_32F, 1, 0), cv2.Scharr(gray, cv2.CV_32F, 0, 1)
+    norm: Float32 = cv2.magnitude(dx, dy) / (gray + np.float32(_MIN_BRIGHTNESS))
+    return norm
+
+
+def _compare_sharpness(
+    face: Int64, view: Int64, area: Float64, gradient: Float64, num_views: int
+) -> Float64:
+    """Return the sharpness of each photo in (0, 1], 1 for half of the photos.
+
+    Photos are compared by the gradients in common triangles. In equally sharp photos, the gradient
+    of a surface is inversely proportional to its size in pixels.
+
+    Args:
+        face: (k,) triangle of each candidate.
+        view: (k,) photo of each candidate.
+        area: (k,) projected area in pixels.
+        gradient: (k,) norm of the image gradient.
+        num_views: Number of photos.
+    """
+    log_gradient = np.log(np.maximum(gradient * np.sqrt(area), 1e-6))
+    count = np.bincount(face)
+    mean = np.bincount(face, log_gradient) / np.maximum(count, 1)
+    compared = count[face] > 1
+    difference, view = (log_gradient - mean[face])[compared], view[compared]
+    sharpness = np.ones(num_views)
+    for number in np.unique(view):
+        sharpness[number] = np.exp(np.median(difference[view == number]))
+    sharpness = np.minimum(sharpness / np.median(sharpness), 1.0)
+    return sharpness
 
 
 @kernel()
