@@ -124,9 +124,7 @@ def _find_candidates(
     )
     face, area = np.concatenate(faces), np.concatenate(areas)
     view = np.repeat(np.arange(len(images)), [len(seen) for seen in faces])
-    gradient = np.concatenate(gradients)
-    sharpness = _compare_sharpness(face, view, area, gradient, len(images))
-    area *= sharpness[view] ** 2
+    area *= _compare_sharpness(faces, areas, gradients)[view] ** 2
     order = np.argsort(face, kind="stable")
     face, view, area = face[order], view[order], area[order]
     largest = np.zeros(len(triangles))
@@ -144,7 +142,7 @@ def _relative_gradient(photo: UInt8) -> Float32:
 
 
 def _compare_sharpness(
-    face: Int64, view: Int64, area: Float64, gradient: Float64, num_views: int
+    faces: Sequence[Int64], areas: Sequence[Float64], gradients: Sequence[Float64]
 ) -> Float64:
     """Return the sharpness of each photo in (0, 1], 1 for half of the photos.
 
@@ -152,22 +150,23 @@ def _compare_sharpness(
     of a surface is inversely proportional to its size in pixels.
 
     Args:
-        face: (k,) triangle of each candidate.
-        view: (k,) photo of each candidate.
-        area: (k,) projected area in pixels.
-        gradient: (k,) norm of the image gradient.
-        num_views: Number of photos.
+        faces: Triangles (k,) that each photo observes.
+        areas: Projected areas (k,) of these triangles in pixels.
+        gradients: Norms (k,) of the image gradient at these triangles.
     """
-    log_gradient = np.log(np.maximum(gradient * np.sqrt(area), 1e-6))
+    logs = [
+        np.log(np.maximum(gradient * np.sqrt(area), 1e-6))
+        for gradient, area in zip(gradients, areas, strict=True)
+    ]
+    face = np.concatenate(faces)
     count = np.bincount(face)
-    mean = np.bincount(face, log_gradient) / np.maximum(count, 1)
-    compared = count[face] > 1
-    difference, view = (log_gradient - mean[face])[compared], view[compared]
-    sharpness = np.ones(num_views)
-    for number in np.unique(view):
-        sharpness[number] = np.exp(np.median(difference[view == number]))
-    sharpness = np.minimum(sharpness / np.median(sharpness), 1.0)
-    return sharpness
+    mean = np.bincount(face, np.concatenate(logs)) / np.maximum(count, 1)
+    sharpness = np.ones(len(faces))
+    for view, (seen, log_gradient) in enumerate(zip(faces, logs, strict=True)):
+        compared = count[seen] > 1
+        if compared.any():
+            sharpness[view] = np.exp(np.median((log_gradient - mean[seen])[compared]))
+    return np.minimum(sharpness / np.median(sharpness), 1.0)
 
 
 @kernel()
