@@ -37,6 +37,7 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.reconstruction_score import score_reconstruction
 from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors
 from mpsfm_core.testing.synthetic.halls import CALIBRATED_PRIORS, make_hall_problem
@@ -162,7 +163,7 @@ def measure(case: Case, model: Reconstruction) -> tuple[float, dict[str, float]]
     """Return pose AUC at 20 degrees, and the criteria that rank a reconstruction."""
     truth = {case.problem.images[i].name: pose for i, pose in case.truth.items()}
     auc = pose_auc(pose_errors_deg(model.poses, truth, CONVENTION), CONVENTION)[20]
-    score = score_reconstruction(model, case.problem)
+    score = score_reconstruction(model, Scene(case.problem))
     return auc, {
         "score": score.total,
         "matches": score.matches,

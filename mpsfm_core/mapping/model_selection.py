@@ -19,6 +19,7 @@ from mpsfm_core.mapping.scene.reconstruction import (
     Reconstruction,
     find_explained_matches,
 )
+from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import StateDict
 
 MAX_RATIO_DIFFERENCE = 0.01
@@ -106,9 +107,10 @@ def select_run(runs: Sequence[MapperRun], problem: MappingProblem) -> MapperRun:
     candidates = [run for run in runs if run.num_rigs == num_rigs]
     if len(candidates) == 1:
         return candidates[0]
+    scene = Scene(problem)
     return max(
         candidates,
-        key=lambda run: sum(score_reconstruction(model, problem).total for model in run.models),
+        key=lambda run: sum(score_reconstruction(model, scene).total for model in run.models),
     )
 
 

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Float32, Float64, Int64, MappingProblem, PinholeCamera
+from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera
 from mpsfm_core.geometry import pixel_centers, project, transform, unproject
 from mpsfm_core.mapping.consistency.depth_consistency import count_visible_points
 from mpsfm_core.mapping.refinement.depth_noise import CELLS
@@ -86,12 +86,19 @@ class PairScores(NamedTuple):
     """(p,) log likelihood ratio."""
 
 
-def score_reconstruction(model: Reconstruction, problem: MappingProblem) -> ReconstructionScore:
-    """Compute the log likelihood ratio of the matches and depth maps of a reconstruction."""
-    scene = Scene(problem)
+def score_reconstruction(model: Reconstruction, scene: Scene) -> ReconstructionScore:
+    """Compute the log likelihood ratio of the matches and depth maps of a reconstruction.
+
+    Args:
+        model: The reconstruction.
+        scene: Scene of its mapping problem without registered images, which is left unchanged.
+    """
+    empty = scene.snapshot()
     confirmed = tuple(image for image in model.images if image.confirmed)
     scene.resume(replace(model, images=confirmed), refined_map_width=MAP_WIDTH)
-    return score_scene(scene)
+    score = score_scene(scene)
+    scene.restore(empty)
+    return score
 
 
 def score_scene(scene: Scene) -> ReconstructionScore:

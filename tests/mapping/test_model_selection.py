@@ -21,6 +21,7 @@ from mpsfm_core.mapping.model_selection import (
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.reconstruction_score import score_reconstruction
 from mpsfm_core.mapping.scene.reconstruction import MappingReport, Reconstruction
+from mpsfm_core.mapping.scene.scene import Scene
 
 
 def with_false_matches(problem: MappingProblem, share: float) -> MappingProblem:
@@ -56,7 +57,7 @@ def test_reconstruct_stops_after_two_equal_runs(problem: MappingProblem) -> None
     assert result.report.runs == 2
     alone = [reconstruct(doubtful, MapperOptions(max_runs=1, seed=seed)) for seed in range(2)]
     assert [run.report.runs for run in alone] == [1, 1]
-    scores = [score_reconstruction(run.reconstructions[0], doubtful).total for run in alone]
+    scores = [score_reconstruction(run.reconstructions[0], Scene(doubtful)).total for run in alone]
     best = alone[int(np.argmax(scores))].reconstructions[0]
     for image, same in zip(result.reconstructions[0].images, best.images, strict=True):
         np.testing.assert_array_equal(image.rotation, same.rotation)

@@ -38,9 +38,12 @@ def rotate_last(model: Reconstruction, angle_deg: float) -> Reconstruction:
 def test_score_decreases_with_the_error_of_a_pose(
     problem: MappingProblem, model: Reconstruction
 ) -> None:
+    scene = Scene(problem)
     scores = [
-        score_reconstruction(rotate_last(model, angle), problem).total for angle in (0, 2, 8, 40)
+        score_reconstruction(rotate_last(model, angle), scene).total for angle in (0, 2, 8, 40)
     ]
+    assert score_reconstruction(model, scene).total == scores[0]
+    assert not scene.registered.any()
     assert scores == sorted(scores, reverse=True)
     assert scores[0] > scores[1] + 1
 
@@ -49,8 +52,8 @@ def test_wrong_pose_scores_no_better_than_a_missing_image(
     problem: MappingProblem, model: Reconstruction
 ) -> None:
     missing = replace(model, images=model.images[:-1])
-    right, without = (score_reconstruction(m, problem) for m in (model, missing))
-    wrong = score_reconstruction(rotate_last(model, 90.0), problem)
+    right, without = (score_reconstruction(m, Scene(problem)) for m in (model, missing))
+    wrong = score_reconstruction(rotate_last(model, 90.0), Scene(problem))
     assert right.matches > without.matches >= wrong.matches
     assert right.depth > without.depth >= wrong.depth
 
@@ -70,8 +73,8 @@ def test_score_does_not_depend_on_the_unit_of_the_world(
         )
         for image in model.images
     )
-    scaled = score_reconstruction(replace(model, images=images), problem)
-    assert scaled == pytest.approx(score_reconstruction(model, problem), rel=1e-5)
+    scaled = score_reconstruction(replace(model, images=images), Scene(problem))
+    assert scaled == pytest.approx(score_reconstruction(model, Scene(problem)), rel=1e-5)
 
 
 def test_score_of_a_pair_is_bounded_on_both_sides(
@@ -99,9 +102,9 @@ def test_keypoints_without_depth_are_scored_by_their_epipolar_lines(
         for image in problem.images
     )
     unknown = replace(problem, images=images)
-    score = score_reconstruction(model, unknown)
+    score = score_reconstruction(model, Scene(unknown))
     assert score.depth == 0
-    assert score.matches > score_reconstruction(rotate_last(model, 20.0), unknown).matches
+    assert score.matches > score_reconstruction(rotate_last(model, 20.0), Scene(unknown)).matches
 
 
 def test_keypoints_are_scored_without_the_estimated_distortion(
@@ -120,7 +123,7 @@ def test_keypoints_are_scored_without_the_estimated_distortion(
         model, images=tuple(replace(image, distortion=distortion) for image in model.images)
     )
     score, ignored, original = (
-        score_reconstruction(reconstruction, given).matches
+        score_reconstruction(reconstruction, Scene(given)).matches
         for reconstruction, given in ((estimated, distorted), (model, distorted), (model, problem))
     )
     # depth at distorted keypoints differs a little from depth at the original keypoints
