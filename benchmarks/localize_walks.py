@@ -18,7 +18,7 @@ import json
 import resource
 import subprocess
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
 from typing import NamedTuple
@@ -49,7 +49,9 @@ from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.models import find_model_folder, reconstruction_poses
 
 SECOND_FPS = 10.0
+"""Frames per second of the second walk."""
 PHOTO_CAMERA = PinholeCamera(640, 480, 620.0, 620.0, 320.0, 240.0)
+"""Camera of the photos: width, height, fx, fy, cx and cy in pixels."""
 NUM_QUERIES, NUM_MODEL_PHOTOS = 20, 64
 SECOND_ROUNDS = 0.5
 """Rounds of the second walk."""
@@ -58,19 +60,21 @@ MAX_OFFSET_M, MAX_TURN_DEG = 0.5, 60.0
 
 
 class Case(NamedTuple):
-    """Input and true poses of one localization."""
+    """Model, queries, and the true poses of both."""
 
     model: Path
     """Result folder of a video, or COLMAP model of photos."""
     images: Path
     """Folder of the images of the model."""
     image_poses: Mapping[str, Pose]
-    """True poses ``cam_from_world`` by name of the image."""
+    """True poses ``cam_from_world`` of the images of the model, by file name."""
     queries: Path
     """Folder of photos or video that is localized."""
     query_poses: Mapping[str, Pose]
-    """True poses ``cam_from_world`` by name of the photo, or by name of the video frame."""
+    """True poses ``cam_from_world`` of the queries, by the file name of a photo, or by the name
+    ``frame_000000.jpg`` of a video frame."""
     query_camera: PinholeCamera
+    """True camera of all queries."""
 
 
 def main() -> None:
@@ -101,7 +105,7 @@ def photos_in_video(folder: Path, seed: int, config: str) -> Case:
         settings = ["--set", "inputs.video.max_frames=70", "--set", "dense.enabled=false"]
         run_command("reconstruct", video, "-o", model, "--config", config, *settings)
     photos, poses = write_photos(folder / f"query_photos{seed}", seed, NUM_QUERIES)
-    return Case(model, model / "frames", name_frames(walk), photos, poses, PHOTO_CAMERA)
+    return Case(model, model / "frames", name_frames(enumerate(walk)), photos, poses, PHOTO_CAMERA)
 
 
 def video_in_photos(folder: Path, seed: int, config: str) -> Case:
@@ -114,12 +118,12 @@ def video_in_photos(folder: Path, seed: int, config: str) -> Case:
     walk = make_path(np.random.default_rng([seed, 52]), SECOND_ROUNDS, SECOND_FPS)
     video = folder / f"second_walk{seed}.mp4"
     write_video(video, render_frames(world, walk, rng), SECOND_FPS)
-    return Case(model, photos, poses, video, name_frames(walk), CAMERA)
+    return Case(model, photos, poses, video, name_frames(enumerate(walk)), CAMERA)
 
 
-def name_frames(poses: Sequence[Pose]) -> dict[str, Pose]:
-    """Return the poses of the frames of a video by the names of the frames."""
-    return {f"frame_{number:06d}.jpg": pose for number, pose in enumerate(poses)}
+def name_frames(poses: Iterable[tuple[int, Pose]]) -> dict[str, Pose]:
+    """Return the poses of numbered frames of a video by the names of the frames."""
+    return {f"frame_{number:06d}.jpg": pose for number, pose in poses}
 
 
 def write_photos(folder: Path, seed: int, count: int) -> tuple[Path, dict[str, Pose]]:
@@ -144,7 +148,11 @@ def write_photos(folder: Path, seed: int, count: int) -> tuple[Path, dict[str, P
 
 
 def localize(case: Case, config: str) -> Iterator[Record]:
-    """Localize the queries with true and unknown focal length, and yield the errors."""
+    """Localize all queries twice, with their true camera and with unknown focal length.
+
+    Yields:
+        Errors of one query, with the number of model images and their ATE.
+    """
     model = pycolmap.Reconstruction(str(find_model_folder(case.model)))
     found = reconstruction_poses(model)
     errors = trajectory_errors(found, case.image_poses)
@@ -194,13 +202,11 @@ def read_poses(output: Path) -> dict[str, Pose]:
         return reconstruction_poses(pycolmap.Reconstruction(str(output / "sparse")))
     found = read_trajectory(trajectory)
     numbers = np.rint(found.times * SECOND_FPS).astype(int)
-    return {
-        f"frame_{number:06d}.jpg": pose for number, pose in zip(numbers, found.poses, strict=True)
-    }
+    return name_frames(zip(numbers, found.poses, strict=True))
 
 
 def make_table(records: Sequence[Record]) -> str:
-    """Return a table in Markdown with one row per direction, and the errors of the models."""
+    """Format a Markdown table with one row for photos in videos, and one for videos in photos."""
     lines = [
         "| queries | models: images, ATE in cm | known: recall | median | unknown: recall | median "
         "| CPU s per query |",

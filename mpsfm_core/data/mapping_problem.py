@@ -52,8 +52,8 @@ class MappingImage:
     focal_guess_px: float | None = None
     """Prior mean of ``fx`` in pixels of the undistorted view (None means ``camera.fx``)."""
     depth_focal_px: float | None = None
-    """Focal length ``fx`` in pixels for which a depth network predicted metric depth, which is
-    proportional to it. None if predicted depth does not depend on the focal length."""
+    """Focal length ``fx`` in pixels with which a network predicted metric depth. The depth is
+    proportional to this focal length. None if depth does not depend on the focal length."""
     camera_model: CameraModel = CameraModel.SIMPLE_RADIAL
     """COLMAP camera model whose parameters self-calibration estimates for a guessed camera."""
     distortion: Distortion = NO_DISTORTION

@@ -87,7 +87,7 @@ class FineDepth(NearestDepth):
 
 
 class EnlargedDepth(NearestDepth):
-    """Legal provider that enlarges its map 1.5 times by repeating the nearest pixels."""
+    """Provider that passes all checks, with nearest-neighbor upsampling of its map by 1.5."""
 
     def size(self, view: View) -> tuple[int, int]:
         return 3 * view.camera.width // 2 + 1, 3 * view.camera.height // 2 + 1

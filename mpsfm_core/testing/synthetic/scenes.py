@@ -27,7 +27,7 @@ class Surface(Protocol):
 
     @property
     def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:
-        """Center and radius of a sphere that contains the surface, which may be infinite."""
+        """Center and radius of a sphere around the surface, ``inf`` for an infinite surface."""
         ...
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
@@ -54,7 +54,7 @@ class Plane:
 
     @property
     def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:
-        """Center and radius of a sphere that contains the surface."""
+        """A point of the plane, and the radius ``inf``."""
         return self.point, np.inf
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
@@ -75,7 +75,7 @@ class Box:
 
     @property
     def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:
-        """Center and radius of a sphere that contains the surface."""
+        """Center and radius of the smallest sphere around the box."""
         return self.center, float(np.linalg.norm(self.half_size))
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
