@@ -175,15 +175,12 @@ def make_hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], Anal
 
 def _remove_hidden_boxes(scene: AnalyticScene, pose: Float64) -> AnalyticScene:
     """Remove the boxes outside of the view frustum, which the camera cannot see."""
-    shell, *boxes = scene.surfaces
-    centers = np.array([box.center for box in boxes if isinstance(box, Box)]).reshape(-1, 3)
-    radii = np.array([np.linalg.norm(box.half_size) for box in boxes if isinstance(box, Box)])
+    centers, radii = scene.bounding_spheres
     local = centers @ pose[:, :3].T + pose[:, 3]
     slope = np.array(CAMERA.size) / (2 * np.array(CAMERA.params[:2]))
     beside = np.abs(local[:, :2]) - slope * local[:, 2:]
     outside = (beside > radii[:, None] * np.hypot(1, slope)).any(axis=1) | (local[:, 2] < -radii)
-    visible = [box for box, out in zip(boxes, outside, strict=True) if not out]
-    return AnalyticScene((shell, *visible))
+    return AnalyticScene(tuple(scene.surfaces[row] for row in np.flatnonzero(~outside)))
 
 
 def _keypoints(

@@ -6,6 +6,7 @@ pixel centers at half integers. A camera pose is a (3, 4) matrix ``cam_from_worl
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +21,8 @@ from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera, UInt8
 _EPSILON = 1e-9
 """Smallest distance in meters between the origin of a ray and an intersection. Closer intersections
 are on the surface at which the ray starts."""
+_GROUP = 16
+"""Number of surfaces that rays are tested against at the same time."""
 
 
 class Surface(Protocol):
@@ -76,7 +79,7 @@ class Box:
     @property
     def bounding_sphere(self) -> tuple[tuple[float, float, float], float]:
         """Center and radius of the smallest sphere around the box."""
-        return self.center, float(np.linalg.norm(self.half_size))
+        return self.center, math.hypot(*self.half_size)
 
     def intersect(self, origin: Float64, directions: Float64) -> tuple[Float64, Float64]:
         """Intersect rays ``origin + t * direction`` with the surface."""
@@ -236,26 +239,41 @@ class AnalyticScene:
         t = np.full(len(directions), np.inf)
         normals = np.zeros((len(directions), 3))
         surface = np.zeros(len(directions), np.int64)
-        for index, near in self._select_rays(origin, directions):
-            t_new, normals_new = self.surfaces[index].intersect(origin, directions[near])
-            nearer = t_new < t[near]
-            rows = near[nearer]
-            t[rows], normals[rows], surface[rows] = t_new[nearer], normals_new[nearer], index
+        centers, radii = self.bounding_spheres
+        distances = np.linalg.norm(origin - centers, axis=1) - radii
+        lengths = np.linalg.norm(directions, axis=1)
+        nearest_first = np.argsort(distances, kind="stable")
+        for start in range(0, len(nearest_first), _GROUP):
+            group = nearest_first[start : start + _GROUP]
+            # rays that end in front of all surfaces of the group cannot hit them first
+            rays = np.flatnonzero(t * lengths >= distances[group[0]])
+            for index, near in self._select_rays(origin, directions, rays, group):
+                t_new, normals_new = self.surfaces[index].intersect(origin, directions[near])
+                nearer = (t_new < t[near]) | ((t_new == t[near]) & (index < surface[near]))
+                rows = near[nearer]
+                t[rows], normals[rows], surface[rows] = t_new[nearer], normals_new[nearer], index
         return t, normals, surface
 
-    def _select_rays(self, origin: Float64, directions: Float64) -> Iterator[tuple[int, Int64]]:
-        """Yield the surfaces, each with the rays that intersect its bounding sphere."""
+    @cached_property
+    def bounding_spheres(self) -> tuple[Float64, Float64]:
+        """Centers (m, 3) and radii (m,) of the bounding spheres of all surfaces, in meters."""
         spheres = [surface.bounding_sphere for surface in self.surfaces]
-        centers = np.array([center for center, _ in spheres]).reshape(-1, 3)
-        radii = np.array([radius for _, radius in spheres])
-        start = origin - centers
-        outside = np.einsum("mi,mi->m", start, start) - radii**2
-        length = np.einsum("ni,ni->n", directions, directions)
-        along = directions @ start.T
+        centers = np.array([center for center, _ in spheres], np.float64).reshape(-1, 3)
+        return centers, np.array([radius for _, radius in spheres], np.float64)
+
+    def _select_rays(
+        self, origin: Float64, directions: Float64, rays: Int64, group: Int64
+    ) -> Iterator[tuple[int, Int64]]:
+        """Yield surfaces of a group, each with those of the rays that meet its bounding sphere."""
+        centers, radii = self.bounding_spheres
+        start = origin - centers[group]
+        outside = np.einsum("mi,mi->m", start, start) - radii[group] ** 2
+        length = np.einsum("ni,ni->n", directions[rays], directions[rays])
+        along = directions[rays] @ start.T
         meets = (along < 0) & (along * along >= outside * length[:, None])
         meets |= outside <= 0
-        for index in map(int, np.flatnonzero(meets.any(axis=0))):
-            yield index, np.flatnonzero(meets[:, index])
+        for column in map(int, np.flatnonzero(meets.any(axis=0))):
+            yield int(group[column]), rays[meets[:, column]]
 
     def sample(
         self, camera: PinholeCamera, cam_from_world: ArrayLike, xy: ArrayLike
