@@ -230,7 +230,7 @@ class SchurComplementSolver:
 
     def __init__(self, p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> None:
         layout = p.bundle.layout
-        poses, intrinsics = len(layout.pair), int(layout.intrinsic_slot.max(initial=-1)) + 1
+        poses, intrinsics = layout.num_poses, int(layout.intrinsic_slot.max(initial=-1)) + 1
         size = kernels.NUM_IMAGE_PARAMS * poses + intrinsics
         view = int(kernels.NUM_IMAGE_PARAMS)
         block, border = (len(p.pairs), view, view), (intrinsics, view * poses)
@@ -301,7 +301,7 @@ class SchurComplementSolver:
         """Add the prior of the depth maps' log scales to the reduced camera system."""
         prior, layout = self.p.scale_prior, self.p.bundle.layout
         rows = kernels.NUM_IMAGE_PARAMS * prior.slot + kernels.LOG_SCALE_IDX
-        block = layout.pair[prior.slot, prior.slot]
+        block = layout.first_block[prior.slot]
         self.total.blocks[block, kernels.LOG_SCALE_IDX, kernels.LOG_SCALE_IDX] += prior.weight
         self.total.diagonal[rows] += prior.weight
         residuals = state.log_scales[prior.image] - prior.log_scale
@@ -309,7 +309,7 @@ class SchurComplementSolver:
 
     def _add_intrinsic_priors(self, state: kernels.BundleParameters) -> None:
         """Add the priors of intrinsic parameters to the reduced camera system."""
-        num_poses = len(self.p.bundle.layout.pair)
+        num_poses = self.p.bundle.layout.num_poses
         for prior in self.p.intrinsic_priors:
             rows = kernels.NUM_IMAGE_PARAMS * num_poses + prior.slot
             self.total.corner[prior.slot, prior.slot] += prior.weight
@@ -336,7 +336,7 @@ class SchurComplementSolver:
         self.linearize(state, MIN_DAMPING)
         diagonal = self.total.diagonal
         boost = np.where(diagonal > 0, MIN_DAMPING * diagonal, 1.0)
-        rows = kernels.NUM_IMAGE_PARAMS * len(self.p.bundle.layout.pair) + slots[variable]
+        rows = kernels.NUM_IMAGE_PARAMS * self.p.bundle.layout.num_poses + slots[variable]
         units = np.zeros((len(diagonal), len(rows)))
         units[rows, np.arange(len(rows))] = 1.0
         solve = self._solve_dense if self.dense else self._solve_sparse
@@ -348,14 +348,14 @@ class SchurComplementSolver:
 
     def compute_rig_scale_std(self, state: kernels.BundleParameters) -> float:
         """Compute the posterior standard deviation of the scale of the rig, or infinity."""
-        basis, num_poses = self.basis, len(self.p.bundle.layout.pair)
+        basis, num_poses = self.basis, self.p.bundle.layout.num_poses
         if basis is None or basis.scale_column is None or num_poses > MAX_RIG_POSES:
             return np.inf
         self.linearize(state, MIN_DAMPING)
         diagonal = self.total.diagonal
         boost = np.where(diagonal > 0, MIN_DAMPING * diagonal, 1.0)
         matrix = np.zeros((len(boost), len(boost)))
-        kernels.assemble_reduced_matrix(self.total, boost, self.p.bundle.layout.pair, matrix)
+        kernels.assemble_reduced_matrix(self.total, boost, self.p.pairs, matrix)
         return float(np.sqrt(basis.compute_scale_variance(matrix)))
 
     def _fix_constants(self) -> None:
@@ -459,7 +459,7 @@ class SchurComplementSolver:
         if not len(boost):
             return boost
         matrix = np.zeros((len(boost), len(boost)))
-        kernels.assemble_reduced_matrix(self.total, boost, self.p.bundle.layout.pair, matrix)
+        kernels.assemble_reduced_matrix(self.total, boost, self.p.pairs, matrix)
         if self.basis is not None:
             return self.basis.solve_dense(matrix, rhs)
         # LAPACK does not copy the transposed matrix, because the transpose has Fortran's memory
@@ -483,7 +483,7 @@ class SchurComplementSolver:
             (e,) or (e, k) solutions, whose length is that of the parameters of the rig if any.
         """
         can_factorize = (
-            self.basis is None and len(self.p.bundle.layout.pair) <= MAX_FACTORIZED_POSES
+            self.basis is None and self.p.bundle.layout.num_poses <= MAX_FACTORIZED_POSES
         )
         solutions = []
         for column in rhs.reshape(len(rhs), -1).T:
@@ -545,7 +545,7 @@ class SchurComplementSolver:
             [self._damped_diagonal(boost), off_diagonal, off_diagonal.transpose(0, 2, 1)]
         )
         order = np.lexsort((columns, rows))
-        starts = np.searchsorted(rows[order], np.arange(len(self.p.bundle.layout.pair) + 1))
+        starts = np.searchsorted(rows[order], np.arange(self.p.bundle.layout.num_poses + 1))
         starts = starts.astype(np.intc)
         matrix = bsr_array((blocks[order], columns[order], starts), shape=(num_poses, num_poses))
         return matrix.tocsr().T  # the matrix is symmetric, and transposing copies nothing

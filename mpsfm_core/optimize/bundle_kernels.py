@@ -105,8 +105,13 @@ class ParameterLayout(NamedTuple):
     """(k,) bool, True for OPENCV_FISHEYE and False for OPENCV cameras."""
     variable_point: Bool
     variable_scale: Bool
-    pair: Int32
-    """(s, s) index of the 7 x 7 block of two poses in the reduced camera system, or -1."""
+    num_poses: int
+    """Number of pose slots."""
+    first_block: Int64
+    """(s + 1,) number of the first 7 x 7 block of each row of the reduced camera system, which is
+    the diagonal block, and the total number of blocks on and above the diagonal."""
+    block_column: Int32
+    """(b,) column of each block, as a pose slot, ascending in each row."""
 
 
 class RobustLosses(NamedTuple):
@@ -256,36 +261,40 @@ def counting_sort(keys: Int32, previous: Int64, start: Int64, order: Int64) -> N
 
 
 @_kernel
-def number_covisible_poses(
-    obs: BundleObservations, pose_slot: Int32, variable: Bool, pair: Int32
-) -> int:
-    """Number the blocks of the reduced camera system, one per image pair with a shared point.
+def find_covisible_poses(
+    slots: Int32, ends: Int64, order: Int64, start: Int64, last: Int64, first: Int64, columns: Int32
+) -> None:
+    """Find the blocks of the reduced camera system, one per image pair with a shared point.
 
     Args:
-        obs: Observations.
-        pose_slot: (n,) pose slot (index in the linear system) of each image.
-        variable: (p,) bool.
-        pair: (s, s) array of -1, which receives the block numbers on and above the diagonal.
-
-    Returns:
-        Number of pairs.
+        slots: (m,) pose slot (index in the linear system) of each observation, or -1. The
+            observations are sorted by point.
+        ends: (m,) end of the observations of the same point.
+        order: Observations with a pose slot, sorted by pose slot.
+        start: (s + 1,) first observation of each pose slot in ``order``.
+        last: (s,) array of -1, which receives the last row with a block in each column.
+        first: (s + 1,) receives :attr:`ParameterLayout.first_block`.
+        columns: (b,) receives :attr:`ParameterLayout.block_column`, unless it is empty.
     """
-    for p in range(len(obs.start) - 1):
-        if variable[p]:
-            for a in range(obs.start[p], obs.start[p + 1]):
-                row = pose_slot[obs.image[a]]
-                if row >= 0:
-                    for b in range(a + 1, obs.start[p + 1]):
-                        column = pose_slot[obs.image[b]]
-                        if column >= 0:
-                            pair[row, column] = 0
-    count = 0
-    for row in range(len(pair)):
-        for column in range(row, len(pair)):
-            if row == column or pair[row, column] >= 0:
-                pair[row, column] = count
-                count += 1
-    return count
+    fills, count = len(columns) > 0, np.int64(0)
+    for row in range(len(last)):
+        first[row], last[row] = count, row
+        if fills:
+            columns[count] = row
+        count += 1
+        for n in range(start[row], start[row + 1]):
+            for k in range(order[n] + 1, ends[order[n]]):
+                column = slots[k]
+                if column >= 0 and last[column] != row:
+                    last[column] = row
+                    place = count
+                    while fills and columns[place - 1] > column:  # insertion sort
+                        columns[place] = columns[place - 1]
+                        place -= 1
+                    if fills:
+                        columns[place] = column
+                    count += 1
+    first[len(last)] = count
 
 
 class DistortedRay(NamedTuple):
@@ -701,7 +710,7 @@ def _add_intrinsics(
 ) -> None:
     """Add the variable intrinsic parameters of an observation to the camera system."""
     layout = bundle.layout
-    poses = len(layout.pair)
+    poses = layout.num_poses
     _fill_effects(s, camera, layout, state, effects)
     for n in range(NUM_INTRINSICS):
         intrinsic = layout.intrinsic_slot[camera, n]
@@ -817,21 +826,24 @@ def _eliminate_from_poses(
     z0: float,
     z1: float,
     z2: float,
-    pair: Int32,
+    layout: ParameterLayout,
     system: ReducedCameraSystem,
     scratch: EliminationBuffers,
 ) -> None:
     """Subtract a point's Schur complement ``Y_i^T Y_j`` from the blocks of its images."""
     blocks, rhs, slots, y = system.blocks, system.rhs, scratch.slots, scratch.y
     for a in range(count):
-        own = pair[slots[a], slots[a]]
+        own = layout.first_block[slots[a]]
         for i in range(NUM_IMAGE_PARAMS):
             y0, y1, y2 = y[a, 0, i], y[a, 1, i], y[a, 2, i]
             rhs[NUM_IMAGE_PARAMS * slots[a] + i] -= y0 * z0 + y1 * z1 + y2 * z2
             for j in range(i, NUM_IMAGE_PARAMS):
                 blocks[own, i, j] -= y0 * y[a, 0, j] + y1 * y[a, 1, j] + y2 * y[a, 2, j]
         for b in range(a + 1, count):
-            row = pair[slots[a], slots[b]]
+            # columns ascend by at least 1, so the block is at most this far from the diagonal
+            row = min(own + slots[b] - slots[a], layout.first_block[slots[a] + 1] - 1)
+            while layout.block_column[row] > slots[b]:
+                row -= 1
             for i in range(NUM_IMAGE_PARAMS):
                 y0, y1, y2 = y[a, 0, i], y[a, 1, i], y[a, 2, i]
                 for j in range(NUM_IMAGE_PARAMS):
@@ -905,7 +917,7 @@ def eliminate_points(
     obs, layout = bundle.obs, bundle.layout
     slots, intrinsics, columns = scratch.slots, scratch.intrinsics, scratch.columns
     effects = scratch.effects
-    poses = len(layout.pair)
+    poses = layout.num_poses
     cost = 0.0
     for p in range(first, last):
         count = num_intrinsics = np.int64(0)
@@ -921,7 +933,7 @@ def eliminate_points(
             camera = layout.camera_of_image[image]
             _fill_pose_columns(s, columns)
             if slot >= 0:
-                _add_pose(s, columns, slot, layout.pair[slot, slot], system)
+                _add_pose(s, columns, slot, layout.first_block[slot], system)
             if layout.calibrated[camera]:
                 _add_intrinsics(s, camera, slot, bundle, state, columns, effects, system)
             if not layout.variable_point[p]:
@@ -959,7 +971,7 @@ def eliminate_points(
             _whiten(eliminated, p, scratch.y, a, NUM_IMAGE_PARAMS)
         for f in range(num_intrinsics):
             _whiten(eliminated, p, scratch.yf, f, _COLUMN)
-        _eliminate_from_poses(count, z0, z1, z2, layout.pair, system, scratch)
+        _eliminate_from_poses(count, z0, z1, z2, layout, system, scratch)
         _eliminate_from_intrinsics(count, num_intrinsics, z0, z1, z2, poses, system, scratch)
     return cost
 
@@ -1001,7 +1013,7 @@ def _joint_step(
             _fill_effects(s, camera, layout, state, scratch.effects)
             for n in range(NUM_INTRINSICS):
                 if layout.intrinsic_slot[camera, n] >= 0:
-                    row = NUM_IMAGE_PARAMS * len(layout.pair) + layout.intrinsic_slot[camera, n]
+                    row = NUM_IMAGE_PARAMS * layout.num_poses + layout.intrinsic_slot[camera, n]
                     m = scratch.effects[n, 0]
                     dx += (m * s.x + scratch.effects[n, 1]) * delta[row]
                     dy += (m * s.y + scratch.effects[n, 2]) * delta[row]
@@ -1142,7 +1154,7 @@ def update_cameras(
                 for c in range(3):
                     value += turn[a][c] * state.rotations[image, c, b]
                 trial.rotations[image, a, b] = value
-    first = NUM_IMAGE_PARAMS * len(layout.pair)
+    first = NUM_IMAGE_PARAMS * layout.num_poses
     for camera in range(len(layout.intrinsic_slot)):
         for n in range(NUM_INTRINSICS):
             if layout.intrinsic_slot[camera, n] < 0:
@@ -1162,18 +1174,15 @@ def update_cameras(
 
 @_kernel
 def assemble_reduced_matrix(
-    system: ReducedCameraSystem, boost: Float64, pair: Int32, out: Float64
+    system: ReducedCameraSystem, boost: Float64, pairs: Int64, out: Float64
 ) -> None:
     """Assemble the lower triangle of the reduced camera matrix with damping ``boost``."""
-    poses = len(pair)
-    for i in range(poses):
-        for j in range(i, poses):
-            if pair[i, j] >= 0:
-                for a in range(NUM_IMAGE_PARAMS):
-                    for b in range(a if i == j else 0, NUM_IMAGE_PARAMS):
-                        out[NUM_IMAGE_PARAMS * j + b, NUM_IMAGE_PARAMS * i + a] = system.blocks[
-                            pair[i, j], a, b
-                        ]
+    poses = system.border.shape[1] // NUM_IMAGE_PARAMS
+    for block in range(len(pairs)):
+        i, j = pairs[block]
+        for a in range(NUM_IMAGE_PARAMS):
+            for b in range(a if i == j else 0, NUM_IMAGE_PARAMS):
+                out[NUM_IMAGE_PARAMS * j + b, NUM_IMAGE_PARAMS * i + a] = system.blocks[block, a, b]
     for f in range(len(system.corner)):
         for a in range(NUM_IMAGE_PARAMS * poses):
             out[NUM_IMAGE_PARAMS * poses + f, a] = system.border[f, a]

@@ -200,20 +200,23 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
     fisheye = _mask(problem.fisheye, "fisheye", cameras, False)
     intrinsic_slot = np.ascontiguousarray(_slots(variable.T.ravel()).reshape(-1, cameras).T)
     moving = variable_pose | variable_scale
-    poses = np.count_nonzero(moving)
+    num_poses, pose_slot = int(np.count_nonzero(moving)), _slots(moving)
+    first_block, block_column = _find_blocks(obs, pose_slot, variable_point, num_poses)
     layout = kernels.ParameterLayout(
         _indices(problem.camera_of_image, "camera_of_image", images, cameras),
-        _slots(moving),
+        pose_slot,
         intrinsic_slot,
         np.asarray(variable.any(axis=1)),
         fisheye | (state.distortion != 0).any(axis=1) | variable[:, DISTORTION:].any(axis=1),
         fisheye,
         variable_point,
         variable_scale,
-        np.full((poses, poses), -1, dtype=np.int32),
+        num_poses,
+        first_block,
+        block_column,
     )
-    kernels.number_covisible_poses(obs, layout.pose_slot, variable_point, layout.pair)
-    pairs = np.argwhere(layout.pair >= 0)
+    rows = np.repeat(np.arange(num_poses), np.diff(first_block))
+    pairs = np.stack([rows, block_column.astype(np.int64)], axis=1)
     held = np.repeat(~variable_pose[:, None], kernels.NUM_IMAGE_PARAMS, axis=1)
     held[:, kernels.LOG_SCALE_IDX] = ~variable_scale
     rig_gauge = None
@@ -302,6 +305,27 @@ def _sorted_by_point(
     kernels.counting_sort(image, np.arange(len(image)), np.zeros(images + 2, np.int64), by_image)
     kernels.counting_sort(point, by_image, start, order)
     return start[:-1], order
+
+
+def _find_blocks(
+    obs: kernels.BundleObservations,
+    pose_slot: NDArray[np.int32],
+    variable_point: Bool,
+    num_poses: int,
+) -> tuple[Int64, NDArray[np.int32]]:
+    """Return the first block of each row of the reduced camera system, and all block columns."""
+    lengths = np.diff(obs.start)
+    slots = np.where(np.repeat(variable_point, lengths), pose_slot[obs.image], np.int32(-1))
+    rows = np.flatnonzero(slots >= 0)
+    start, order = np.zeros(num_poses + 2, np.int64), np.empty(len(rows), np.int64)
+    kernels.counting_sort(slots, rows, start, order)
+    ends, first = np.repeat(obs.start[1:], lengths), np.zeros(num_poses + 1, np.int64)
+    columns = np.empty(0, np.int32)
+    for _ in range(2):  # count the blocks, then list their columns
+        last = np.full(num_poses, -1, np.int64)
+        kernels.find_covisible_poses(slots, ends, order, start, last, first, columns)
+        columns = np.empty(first[-1], np.int32) if not len(columns) else columns
+    return first, columns
 
 
 def _numbers_or_zero(values: Float64 | None, name: str, count: int) -> Float64:

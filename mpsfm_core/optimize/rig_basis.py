@@ -255,7 +255,7 @@ class RigBasis(NamedTuple):
             gauge: Frame and pose parameter that is constant, or None.
             translations: (n, 3) translation of ``cam_from_world`` of each image.
         """
-        size, num_slots = int(kernels.NUM_IMAGE_PARAMS), len(layout.pair)
+        size, num_slots = int(kernels.NUM_IMAGE_PARAMS), layout.num_poses
         variable = rig.variable_frames()
         position = np.where(variable, np.cumsum(variable) - 1, -1)
         images = np.flatnonzero(layout.pose_slot >= 0)

@@ -113,7 +113,7 @@ def residuals(p: PreparedBundle, state: kernels.BundleParameters) -> Float64:
 
 def numeric_jacobian(p: PreparedBundle) -> Float64:
     """Jacobian (3 m + s, d + 3 v) of the residuals: camera side, then variable points."""
-    poses, focals = len(p.bundle.layout.pair), int(p.bundle.layout.intrinsic_slot.max()) + 1
+    poses, focals = p.bundle.layout.num_poses, int(p.bundle.layout.intrinsic_slot.max()) + 1
     size = kernels.NUM_IMAGE_PARAMS * poses + focals
     variable = np.flatnonzero(p.bundle.layout.variable_point)
     columns = []
