@@ -64,6 +64,7 @@ from mpsfm_core.mapping.registration.tentative_registration import register_tent
 from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.mapping.state import StateDict
+from mpsfm_core.support.memory import release_free_memory
 
 MIN_ABSORBING_RATIO = 0.25
 """Minimum size of a component, relative to the largest component, to absorb images of completed
@@ -295,6 +296,8 @@ class Mapper:
         while self._num_components < max_components:
             if not self.reconstruct_component(save_checkpoint):
                 return self.models
+            del self.component  # the next component and the final steps need its memory
+            release_free_memory()
             self._num_components += 1
         reason = ImageReason.COMPONENT_LIMIT.because(max_components=max_components)
         self._reject(self.unregistered, reason)
