@@ -49,6 +49,14 @@ def store_in_memory(array: NDArray[_T]) -> NDArray[_T]:
     return array
 
 
+def is_on_disk(array: NDArray[np.generic]) -> bool:
+    """Return whether an array is in a memory-mapped file of :class:`DiskArrays`."""
+    base: object = array
+    while isinstance(base, np.ndarray | memoryview):
+        base = base.base if isinstance(base, np.ndarray) else base.obj
+    return isinstance(base, mmap.mmap)
+
+
 def store_fields(item: _Item, store: ArrayStore) -> _Item:
     """Return a copy of a dataclass instance whose arrays are stored."""
     values = {field.name: getattr(item, field.name) for field in fields(item)}  # type: ignore[arg-type]

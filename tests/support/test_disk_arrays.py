@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import mpsfm_core.support.disk_arrays
-from mpsfm_core.support.disk_arrays import DiskArrays, current_store, store_on_disk
+from mpsfm_core.support.disk_arrays import DiskArrays, current_store, is_on_disk, store_on_disk
 
 SIZE = 2**20
 
@@ -23,6 +23,7 @@ def test_arrays_above_the_memory_limit_are_on_disk(tmp_path: Path) -> None:
     arrays = [array(seed) for seed in range(4)]
     kept = [disk.store(each) for each in arrays]
     assert [a is b for a, b in zip(arrays, kept, strict=True)] == [True, True, False, False]
+    assert [is_on_disk(each) for each in kept] == [False, False, True, True]
     # The files of the arrays are unlinked and have no name.
     assert not list((tmp_path / "made").iterdir())
     for seed, each in enumerate(kept):

@@ -56,6 +56,7 @@ from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, subsample_camera
 from mpsfm_core.support import jit
+from mpsfm_core.support.disk_arrays import ArrayStore, current_store, is_on_disk
 
 NUM_ERROR_STEPS = 4
 """Number of samples of the depth error on either side of 0, evenly spaced up to the option
@@ -66,7 +67,7 @@ MIN_SIGNIFICANCE = 3.0
 """Difference between the violation ratio of a quarter of the pixels and its limit, in standard
 deviations of the ratio, beyond which the other pixels are skipped. [ours]"""
 CACHED_BYTES = 1 << 29
-"""Size limit of the cached subsampled depth maps of all images, bytes. [ours]"""
+"""Size limit of the cached subsampled depth maps in memory, bytes. [ours]"""
 OVERLAP_GRID = 16
 """Columns and rows of the pixel grid that measures the overlap of two images. [ours]"""
 POINT_GROUP = 16
@@ -258,12 +259,13 @@ class DepthConsistencyCheck:
         cached = self._grids.get((image, refined))
         if cached is None or cached[0] != state:
             depth = depth_map.depth if refined else depth_map.scaled_prior
-            cached = state, self._make_grid(image, depth, std_factor)
+            grid = self._make_grid(image, depth, std_factor)
+            cached = state, grid.stored(current_store())
             self._add_grid((image, refined), cached)
         return cached[1]
 
     def _add_grid(self, key: tuple[int, bool], cached: tuple[_DepthMapState, _DepthGrid]) -> None:
-        """Add a subsampled depth map to the cache, and remove the oldest above a total size."""
+        """Add a subsampled depth map to the cache, and remove the oldest if memory is full."""
         replaced = self._grids.pop(key, None)
         self._num_bytes += cached[1].nbytes - (replaced[1].nbytes if replaced else 0)
         self._grids[key] = cached
@@ -273,10 +275,9 @@ class DepthConsistencyCheck:
     def _make_grid(self, image: int, depth: Float32, std_factor: float) -> _DepthGrid:
         depth_map = self._scene.maps[image]
         step = compute_subsampling_step(depth_map.valid.shape[1], self._options.map_width)
-        depth = subsample(depth, step)
-        valid = subsample(
-            depth_map.valid, step
-        ).copy()  # kernels compile again for read-only arrays
+        # kernels compile again for read-only arrays and other memory layouts
+        depth = np.ascontiguousarray(subsample(depth, step))
+        valid = subsample(depth_map.valid, step).copy()
         std = subsample(depth_map.log_std, step) * np.float32(std_factor)
         if self._options.weigh_evidence:
             constrained = find_well_constrained_keypoints(self._scene, image, self._angles_deg)
@@ -408,8 +409,13 @@ class _DepthGrid(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """Size of all arrays in bytes."""
-        return sum(array.nbytes for array in self)
+        """Size of the arrays in memory in bytes."""
+        return sum(array.nbytes for array in self if not is_on_disk(array))
+
+    def stored(self, store: ArrayStore) -> _DepthGrid:
+        """Return a copy whose arrays are stored in memory or on disk."""
+        depth, log_std, valid = store(self.depth), store(self.log_std), store(self.valid)
+        return _DepthGrid(depth, log_std, valid, store(self.nearest), store(self.intrinsics))
 
 
 class _DepthMapState(NamedTuple):
