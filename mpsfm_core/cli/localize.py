@@ -35,6 +35,14 @@ def localize(
             "transforms.json; default: EXIF, else estimated.",
         ),
     ] = None,
+    rigs: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Cameras of the photos that move as one, with known relative poses: COLMAP's "
+            "rig_config.json, model or database.",
+        ),
+    ] = None,
     config: ConfigName = "default",
     database: Annotated[
         Path | None,
@@ -79,6 +87,7 @@ def localize(
             config,
             images=images,
             intrinsics=intrinsics,
+            rigs=rigs,
             database=database,
             sequence=sequence,
             extend=extend,

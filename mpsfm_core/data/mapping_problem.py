@@ -19,7 +19,7 @@ from mpsfm_core.data.camera_models import NO_DISTORTION, CameraModel, Distortion
 from mpsfm_core.data.cameras import PinholeCamera
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.data.priors import DepthPrior, NormalPrior
-from mpsfm_core.data.rigs import Rig
+from mpsfm_core.data.rigs import Rig, find_frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,13 +248,8 @@ class MappingProblem:
         Args:
             rigs: Rigs whose frames are used, by default those of the problem.
         """
-        row_of = {image.name: row for row, image in enumerate(self.images)}
-        frame_of = np.arange(len(self.images), dtype=np.int64)
-        for rig in self.rigs if rigs is None else rigs:
-            for frame in rig.frames:
-                rows = [row_of[name] for name in frame if name in row_of]
-                frame_of[rows] = rows[:1]
-        return frame_of
+        names = [image.name for image in self.images]
+        return find_frames(names, self.rigs if rigs is None else rigs)
 
     def pairs_between_frames(self) -> tuple[VerifiedPair, ...]:
         """Return the verified pairs whose images are not of the same frame of a rig."""

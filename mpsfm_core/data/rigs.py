@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mpsfm_core.data.arrays import Float64, Pose
+from mpsfm_core.data.arrays import Float64, Int64, Pose
 from mpsfm_core.data.errors import DataError
 
 MAX_ROTATION_DEVIATION = 1e-6
@@ -91,7 +91,28 @@ class Rig:
         frames = (tuple(n if n in chosen else None for n in frame) for frame in self.frames)
         return replace(self, frames=tuple(frame for frame in frames if any(frame)))
 
+    def renamed(self, names: Mapping[str, str]) -> Rig:
+        """Return the rig with new image names; images that ``names`` lacks keep their name."""
+        frames = (tuple(n and names.get(n, n) for n in frame) for frame in self.frames)
+        return replace(self, frames=tuple(frames))
+
     def scaled(self, factor: float) -> Rig:
         """Return the rig with all translations multiplied by a factor."""
         sensors = tuple((rotation, factor * shift) for rotation, shift in self.sensor_poses)
         return replace(self, sensor_from_rig=sensors)
+
+
+def find_frames(names: Sequence[str], rigs: Iterable[Rig]) -> Int64:
+    """Return the frame (n,) of each image, as the index of the first image of the frame.
+
+    Args:
+        names: Names of the images.
+        rigs: Rigs of the images; an image without a rig is the only image of its frame.
+    """
+    row_of = {name: row for row, name in enumerate(names)}
+    frame_of = np.arange(len(names), dtype=np.int64)
+    for rig in rigs:
+        for frame in rig.frames:
+            rows = [row_of[name] for name in frame if name in row_of]
+            frame_of[rows] = rows[:1]
+    return frame_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import pycolmap
 
 from mpsfm_core.data import Pose, Rig
 from mpsfm_core.data.errors import DataError, InputError
+from mpsfm_core.inputs.images import SourceImage
 from mpsfm_core.inputs.models import describe_name_difference, match_names, read_model
 from mpsfm_core.inputs.text_files import read_text_file
 
@@ -68,6 +69,26 @@ def read_rigs(
             "their camera, or in the model"
         )
     return rigs
+
+
+def require_upright(rigs: Sequence[Rig], images: Iterable[SourceImage]) -> None:
+    """Check that no image of a rig has an EXIF orientation, which would turn its relative pose.
+
+    Raises:
+        InputError: An image of a rig has an EXIF orientation.
+    """
+    for image in find_turned(rigs, images):
+        raise InputError(
+            f"rigs: image {image.name} has EXIF orientation {image.orientation}, but the relative "
+            "poses of a rig need images without EXIF orientation; rotate the pixels and remove the "
+            "EXIF orientation"
+        )
+
+
+def find_turned(rigs: Sequence[Rig], images: Iterable[SourceImage]) -> list[SourceImage]:
+    """Return the images of rigs that have an EXIF orientation."""
+    in_rig = {name for rig in rigs for name in rig.image_names}
+    return [image for image in images if image.name in in_rig and image.orientation != 1]
 
 
 def rig_from_folders(names: Collection[str]) -> tuple[Rig, ...]:

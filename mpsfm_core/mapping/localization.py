@@ -170,12 +170,14 @@ class Localizer:
         return self.localize_together([image])[0]
 
     def localize_together(self, images: Sequence[int]) -> list[LocalizedImage | Reason]:
-        """Estimate the poses of images that share a guessed camera, or that match each other.
+        """Estimate the poses of images that share a guessed camera or a rig, or match each other.
 
-        Images that share a guessed camera get one refined focal length. An image that matches no
-        image of the model can be registered by its matches with other images. Poses that agree with
-        the depth of the model come first; images without such a pose are registered without the
-        depth check, and :attr:`LocalizedImage.contradiction` tells what the check found.
+        Images that share a guessed camera get one refined focal length. The images of a frame of a
+        rig get one pose from the matches of all of them, and the scale of the rigs is refined. An
+        image that matches no image of the model can be registered by its matches with other images.
+        Poses that agree with the depth of the model come first; images without such a pose are
+        registered without the depth check, and :attr:`LocalizedImage.contradiction` tells what the
+        check found.
 
         Args:
             images: Indices of the images in the mapping problem.
@@ -251,6 +253,9 @@ class Localizer:
         refiner = self._component.refiner
         refiner.fixed[:num_images] = True
         refiner.refine_depth([])
+        scales = [m.scale for m in scene.maps if m.active and m.prior.metric]
+        if scene.rigs.exist and scales:
+            scene.set_rig_scale(float(np.median(scales)))
         self._component.maintenance.exclude_depth(model.wrong_depth)
 
     def _refine(self, images: list[int]) -> None:

@@ -30,7 +30,7 @@ from mpsfm_core.inputs.matches import (
 )
 from mpsfm_core.inputs.models import Poses, describe_name_difference, match_names, read_poses
 from mpsfm_core.inputs.options import InputOptions
-from mpsfm_core.inputs.rigs import read_rigs
+from mpsfm_core.inputs.rigs import find_turned, read_rigs, require_upright
 from mpsfm_core.inputs.video import (
     VideoSelection,
     extract_frames,
@@ -234,15 +234,9 @@ class InputReader:
         rigs = self._read_given_rigs(images.names)
         if source.rigs is None:
             rigs = self._find_rigs(images)
-        in_rig = {name for rig in rigs for name in rig.image_names}
-        turned = [image for image in images if image.name in in_rig and image.orientation != 1]
-        if turned and source.rigs is not None:
-            raise InputError(
-                f"rigs: image {turned[0].name} has EXIF orientation {turned[0].orientation}, but "
-                "the relative poses of a rig need images without EXIF orientation; rotate the "
-                "pixels and remove the EXIF orientation"
-            )
-        return () if turned else tuple(rigs)
+        else:
+            require_upright(rigs, images)
+        return () if find_turned(rigs, images) else tuple(rigs)
 
     def _read_given_rigs(self, names: Sequence[str]) -> tuple[Rig, ...]:
         """Return the rigs that the user gave as such."""

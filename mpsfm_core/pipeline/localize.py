@@ -6,19 +6,23 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from mpsfm_core.config import Config
 from mpsfm_core.config.provider_arguments import Provider, configure
-from mpsfm_core.data import MappingImage, MappingProblem, NormalPrior
+from mpsfm_core.data import MappingImage, MappingProblem, NormalPrior, Rig
 from mpsfm_core.data.camera_models import NO_DISTORTION, CameraModel
 from mpsfm_core.data.decisions import Reason
 from mpsfm_core.data.errors import DataError, InputError
 from mpsfm_core.data.events import EventCallback
+from mpsfm_core.data.rigs import find_frames
 from mpsfm_core.extraction.cache import content_key, digest, pack, unpack
 from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.matching.pair_matching import merge_matches
@@ -34,6 +38,7 @@ from mpsfm_core.inputs.image_search import check_output_folder, find_images
 from mpsfm_core.inputs.images import ImageSet, SourceImage, load_images
 from mpsfm_core.inputs.intrinsics import Cameras, choose_cameras
 from mpsfm_core.inputs.models import reconstruction_poses
+from mpsfm_core.inputs.rigs import read_rigs, require_upright
 from mpsfm_core.inputs.video import (
     extract_frames,
     is_video,
@@ -108,6 +113,7 @@ def localize(
     images: PathLike | None = None,
     cameras: Cameras | None = None,
     intrinsics: PathLike | None = None,
+    rigs: PathLike | Sequence[Rig] | None = None,
     features: Provider | None = None,
     matcher: Provider | None = None,
     retrieval: Provider | None = None,
@@ -126,7 +132,8 @@ def localize(
 
     Each photo is matched with similar images of the model. Its pose results from points that are
     triangulated from the images of the model, or lifted from the depth of a single image. Photos of
-    one camera with unknown focal length share the refined focal length.
+    one camera with unknown focal length share the refined focal length, and photos that a rig took
+    at one moment share one pose.
 
     Args:
         model: COLMAP model with at least two images, or result folder.
@@ -142,6 +149,9 @@ def localize(
             depth provider, else set to a default, and then refined.
         intrinsics: File with the cameras, instead of ``cameras``: ``intrinsics.yaml``, a COLMAP
             model or ``transforms.json``.
+        rigs: Cameras of the photos that move as one, with known relative poses, as in
+            :func:`reconstruct`. The depth of the model gives the unit of their baselines, and the
+            photos refine it.
         features: Provider of features that replaces the configured provider, see
             :func:`reconstruct`.
         matcher: Sparse or dense matcher, which replaces all configured matchers.
@@ -202,7 +212,7 @@ def localize(
         run = _Localization(source, config, registry, stages)
         if video is not None and frames_folder is not None:
             photos, sequence = run.extract_keyframes(video, frames_folder), True
-        queries = run.load_queries(Path(photos), given_cameras)
+        queries = run.load_queries(Path(photos), given_cameras, rigs)
         if extend:
             _require_new_names(source, queries)
         fixed = run.load_model(Path(database) if database else source.folder / DATABASE)
@@ -235,6 +245,7 @@ class _Localization:
         self._source, self._config = source, config
         self._registry, self._stages = registry, stages
         self._sequence: tuple[Reconstruction, OriginalImages] | None = None
+        self._rigs: tuple[Rig, ...] = ()
         with stages.stage("inputs"):
             self._references = self._load_references()
 
@@ -245,14 +256,21 @@ class _Localization:
             raise InputError(f"{source.folder}: localization needs a model of two or more images")
         return source.load_images(self._config.inputs)
 
-    def load_queries(self, photos: Path, cameras: Path | Cameras | None) -> ImageSet:
-        """Load the photos to localize, with known or estimated focal lengths."""
+    def load_queries(
+        self,
+        photos: Path,
+        cameras: Path | Cameras | None,
+        rigs: PathLike | Sequence[Rig] | None = None,
+    ) -> ImageSet:
+        """Load the photos to localize and their rigs, with known or estimated focal lengths."""
         folder, names = (photos.parent, [photos.name]) if photos.is_file() else (photos, [])
         names = names or find_images(photos)
         if not names:
             raise InputError(f"{photos}: the folder has no photos to localize")
         with self._stages.stage("inputs"):
             queries = load_images(folder, cameras, options=self._config.inputs, names=names)
+            if rigs is not None:
+                self._rigs = _read_calibrated_rigs(rigs, queries, folder)
         return estimate_focal_lengths(queries, self._config, self._registry, self._stages)
 
     def extract_keyframes(self, video: Path, output: Path) -> Path:
@@ -273,10 +291,17 @@ class _Localization:
             return localize_frames(video, selection, [part], originals, every, progress)
 
     def split(self, queries: ImageSet, *, sequence: bool) -> Iterator[ImageSet]:
-        """Yield the photos in batches, or all photos of a sequence."""
-        size = len(queries) if sequence else BATCH_SIZE
-        for start in range(0, len(queries), size):
-            yield ImageSet(queries.images[start : start + size], self._config.inputs)
+        """Yield the photos in batches of whole frames, or all photos of a sequence."""
+        frames = find_frames(queries.names, self._rigs)
+        ordered = sorted(zip(frames, queries, strict=True), key=lambda item: item[0])
+        batch: list[SourceImage] = []
+        for _, members in groupby(ordered, key=lambda item: item[0]):
+            images = [image for _, image in members]
+            if batch and not sequence and len(batch) + len(images) > BATCH_SIZE:
+                yield ImageSet(batch, self._config.inputs)
+                batch = []
+            batch += images
+        yield ImageSet(batch, self._config.inputs)
 
     def load_model(self, path: Path) -> FixedModel:
         """Load triangulated points and depth of the model, or compute and store them."""
@@ -326,7 +351,7 @@ class _Localization:
                 self._sequence = part, OriginalImages(queries, problem)
             else:
                 by_row: dict[int, LocalizedImage | Reason] = {}
-                for group in _group_by_guessed_camera(queries):
+                for group in _group_photos(queries, self._rigs):
                     together = [rows[row] for row in group]
                     by_row |= zip(group, localizer.localize_together(together), strict=True)
                     self._stages.stage_progress("localization", len(by_row), len(rows))
@@ -373,7 +398,10 @@ class _Localization:
             _query_image(photo, priors.depth[query.name], priors.normals[query.name])
             for photo, query in zip(renamed, queries, strict=True)
         ]
-        problem = replace(model.problem, images=(*model.problem.images, *added))
+        name_of = dict(zip(queries.names, (photo.name for photo in renamed), strict=True))
+        rigs = tuple(rig.subset(name_of).renamed(name_of) for rig in self._rigs)
+        images = (*model.problem.images, *added)
+        problem = replace(model.problem, images=images, rigs=rigs)
         max_distance_px = self._config.extraction.dense_snap_px
         return snap_to_observations(merge_matches(problem, matches), model, max_distance_px)
 
@@ -408,13 +436,37 @@ class _Localization:
         )
 
 
-def _group_by_guessed_camera(queries: ImageSet) -> list[list[int]]:
-    """Group photos that share a camera of unknown focal length; other photos are single groups."""
-    groups: dict[tuple[bool, int], list[int]] = {}
+def _group_photos(queries: ImageSet, rigs: Sequence[Rig]) -> list[list[int]]:
+    """Group photos that share a camera of unknown focal length or a rig."""
+    count, rig_of = len(queries), {n: k for k, rig in enumerate(rigs) for n in rig.image_names}
+    shared: list[tuple[int, tuple[str, int]]] = []
     for row, query in enumerate(queries):
-        key = (True, row) if query.focal_known else (False, query.camera.camera_id)
-        groups.setdefault(key, []).append(row)
-    return list(groups.values())
+        if not query.focal_known:
+            shared.append((row, ("camera", query.camera.camera_id)))
+        if query.name in rig_of:
+            shared.append((row, ("rig", rig_of[query.name])))
+    nodes = {key: count + number for number, key in enumerate({key for _, key in shared})}
+    rows, columns = [row for row, _ in shared], [nodes[key] for _, key in shared]
+    size = count + len(nodes)
+    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(size, size))
+    label_of = connected_components(links, directed=False)[1][:count]
+    _, first = np.unique(label_of, return_index=True)
+    return [np.flatnonzero(label_of == label_of[row]).tolist() for row in sorted(first)]
+
+
+def _read_calibrated_rigs(
+    rigs: PathLike | Sequence[Rig], queries: ImageSet, folder: Path
+) -> tuple[Rig, ...]:
+    """Return the rigs of the photos, whose relative poses must be known."""
+    if isinstance(rigs, str | Path):
+        rigs = read_rigs(Path(rigs), queries.names, folder)
+    if not all(rig.is_calibrated for rig in rigs):
+        raise InputError(
+            "rigs: a relative pose is unknown; localization needs rigs with known sensor_from_rig, "
+            "which `mpsfm reconstruct --rigs` can estimate"
+        )
+    require_upright(rigs, queries)
+    return tuple(rigs)
 
 
 def _query_image(image: SourceImage, depth: Any, normals: Any) -> MappingImage:

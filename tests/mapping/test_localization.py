@@ -7,9 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mpsfm_core.data import Float64, MappingProblem, PinholeCamera, VerifiedPair
+from mpsfm_core.data import Float64, MappingProblem, PinholeCamera, Pose, Rig, VerifiedPair
 from mpsfm_core.data.decisions import ImageReason, Reason
-from mpsfm_core.geometry import camera_center, project, rotation_angle_deg, transform
+from mpsfm_core.geometry import (
+    camera_center,
+    compose,
+    invert,
+    project,
+    rotation_angle_deg,
+    transform,
+)
 from mpsfm_core.mapping.localization import (
     FixedModel,
     LocalizedImage,
@@ -26,6 +33,7 @@ CAMERA = PinholeCamera(640, 480, 520.0, 520.0, 320.0, 240.0)
 OPTIONS = MapperOptions()
 POSES = arc_poses(5, 14.0)
 QUERY = 4
+FRAME = QUERY - 1, QUERY
 
 
 @pytest.fixture(scope="module")
@@ -60,6 +68,11 @@ def locate(problem: MappingProblem, model: FixedModel) -> LocalizedImage:
 def reprojection(image: RegisteredImage, points: Float64) -> Float64:
     """Project points (n, 3) in the world to pixels (n, 2) of an image."""
     return project(image.camera, transform(image.rotation, image.translation, points))
+
+
+def split(pose: Float64) -> Pose:
+    """Return rotation and translation of a pose (3, 4)."""
+    return pose[:, :3].copy(), pose[:, 3].copy()
 
 
 def center_error(image: LocalizedImage) -> float:
@@ -191,3 +204,37 @@ def test_localize_together_reaches_an_image_by_another_query(problem: MappingPro
     errors = reprojection(last, part.points[last.point_ids[observed]]) - keypoints
     assert observed.sum() > 30 and np.median(np.linalg.norm(errors, axis=1)) < 2
     assert isinstance(localizer.localize(QUERY), Reason)
+
+
+def make_rig_problem(problem: MappingProblem, scale: float) -> MappingProblem:
+    """Make the last two images a frame of a rig with a baseline in units of ``scale``."""
+    images = tuple(
+        replace(image, known_pose=None if k in FRAME else image.known_pose)
+        for k, image in enumerate(problem.images)
+    )
+    first, second = (split(POSES[k]) for k in FRAME)
+    rotation, translation = compose(second, invert(*first))
+    sensors = (np.eye(3), np.zeros(3)), (rotation, translation / scale)
+    rig = Rig(sensors, (tuple(images[k].name for k in FRAME),))
+    return MappingProblem(images, problem.pairs, (rig,))
+
+
+def test_images_of_a_rig_share_the_pose_of_their_frame(problem: MappingProblem) -> None:
+    """The second image of the frame has no matches."""
+    made = make_rig_problem(problem, 1.0)
+    made = replace(made, pairs=tuple(p for p in made.pairs if p.image_b != FRAME[1]))
+    model = triangulate(made)
+    first, second = Localizer(made, model, OPTIONS).localize_together(FRAME)
+    assert isinstance(first, LocalizedImage) and isinstance(second, LocalizedImage)
+    assert second.num_inliers == 0 and center_error(second) < 0.05
+    traces = [np.trace(image.covariance) for image in (first, second)]
+    assert traces[0] == pytest.approx(traces[1]) and np.isfinite(traces[0])
+    alone = Localizer(replace(made, rigs=()), model, OPTIONS).localize_together(FRAME)
+    assert isinstance(alone[1], Reason)
+
+
+def test_matches_of_both_images_refine_the_scale_of_a_rig(problem: MappingProblem) -> None:
+    made = make_rig_problem(problem, 1.1)
+    outcomes = Localizer(made, triangulate(made), OPTIONS).localize_together(FRAME)
+    centers = [camera_center(o.rotation, o.translation) for o in outcomes]  # type: ignore[union-attr]
+    np.testing.assert_allclose(centers, [camera_center(*split(POSES[k])) for k in FRAME], atol=0.02)

@@ -20,7 +20,7 @@ from mpsfm_core import InputError
 from mpsfm_core.cli import build_app
 from mpsfm_core.data import Float64
 from mpsfm_core.data.decisions import DoubtReason, ImageReason
-from mpsfm_core.geometry import camera_center, rotation_angle_deg
+from mpsfm_core.geometry import camera_center, compose, invert, rotation_angle_deg
 from mpsfm_core.geometry.pycolmap_conversion import pose_from
 from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.report.reasons import explain
@@ -98,6 +98,31 @@ def test_photos_of_an_unknown_camera_share_the_refined_focal_length(
     (focal_px,) = {photo.camera.params[0] for photo in result.photos.values()}
     (true_camera,) = pycolmap.Reconstruction(str(SAMPLE / "gt")).cameras.values()
     assert focal_px == pytest.approx(true_camera.mean_focal_length(), rel=0.03)
+
+
+def test_photos_of_a_rig_share_the_pose_of_their_frame(
+    folder: Path, arguments: dict[str, Any], tmp_path: Path
+) -> None:
+    """The second photo of the frame shows nothing."""
+    names = QUERY, "view_4.jpg"
+    shutil.copy(SAMPLE / "images" / names[0], tmp_path)
+    cv2.imwrite(str(tmp_path / names[1]), np.full((480, 640), 128, np.uint8))
+    truth = reconstruction_poses(pycolmap.Reconstruction(str(SAMPLE / "gt")))
+    relative = compose(truth[names[1]], invert(*truth[names[0]]))
+    rig = mpsfm_core.Rig(((np.eye(3), np.zeros(3)), relative), (names,))
+    result = mpsfm_core.localize(folder / "model", tmp_path, rigs=[rig], **arguments)
+    assert not result.reasons and result.photos[names[1]].num_inliers == 0
+    for name in names:
+        error = result.photos[name].center - camera_center(*truth[name])
+        assert np.linalg.norm(error) < 0.1
+
+
+def test_rig_with_an_unknown_relative_pose_is_refused(
+    folder: Path, arguments: dict[str, Any]
+) -> None:
+    rig = mpsfm_core.Rig(((np.eye(3), np.zeros(3)), None), ((QUERY, "view_5.jpg"),))
+    with pytest.raises(InputError, match="sensor_from_rig"):
+        mpsfm_core.localize(folder / "model", folder / "photos", rigs=[rig], **arguments)
 
 
 def test_focal_length_from_one_image_makes_the_pose_doubtful(

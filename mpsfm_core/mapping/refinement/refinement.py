@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.sparse import csr_array
 
 from mpsfm_core.data import Bool, DepthPrior, Float64, Int64, NormalPrior, PinholeCamera
@@ -367,10 +368,27 @@ class Refiner:
     def compute_pose_covariance(self, image: int) -> Float64:
         """Compute the covariance (6, 6) of the pose of an image from the points that it observes.
 
-        The poses of the other images are treated as exact. The covariance of a point results from
-        the keypoints and depth of the other images. See
+        The points that other images of its frame observe determine the pose, too. The poses of
+        other frames are treated as exact. The covariance of a point results from the keypoints and
+        depth of the other images. See
         :func:`~mpsfm_core.optimize.covariance.compute_pose_covariance` for the parameters.
         """
+        members = self.scene.rigs.images_of(image)
+        covariances = [self._compute_own_covariance(member) for member in members]
+        if len(members) == 1:
+            return covariances[0]
+        information = np.zeros((6, 6))
+        for member, covariance in zip(members, covariances, strict=True):
+            if np.isfinite(covariance).all():
+                turn, _ = self.scene.rigs.relative_pose(image, member)
+                change = block_diag(turn, turn)  # both parameters are in the frame of the camera
+                information += change.T @ np.linalg.pinv(covariance) @ change
+        if np.linalg.matrix_rank(information) < len(information):
+            return np.full((6, 6), np.inf)
+        return np.asarray(np.linalg.inv(information), dtype=np.float64)
+
+    def _compute_own_covariance(self, image: int) -> Float64:
+        """Compute the covariance (6, 6) of a pose from the points that the image observes."""
         scene = self.scene
         bundle = self._collect_bundle([image])
         if bundle is None:
@@ -465,7 +483,8 @@ class Refiner:
         moving = (scene.mask(variable) & ~self.fixed)[images]
         if moving.all():
             moving[scene.rigs.frame_of[images] == scene.rigs.frame_of[images[0]]] = False
-        refines_all = not local and len(variable) == np.count_nonzero(scene.registered)
+        num_movable = np.count_nonzero(scene.registered & ~self.fixed)
+        refines_all = not local and np.count_nonzero(~self.fixed[variable]) == num_movable
         rig = scene.rigs.constrain(images, moving, refine_rigs=refines_all)
         long_track = np.bincount(point_rows) >= MAX_LOCAL_TRACK_LENGTH
         log_depth, log_std = self._depth_observations(observations)

@@ -315,9 +315,12 @@ class PoseHypothesisGenerator:
                 yield partial(half._estimate_from_essential_matrix, correspondences, frame)
 
     def _is_generalized(self, frame: int) -> bool:
-        """Return True if the new frame or a registered frame has several images."""
+        """Return True if the new frame and a registered frame have several images.
+
+        With a single image, the poses of image pairs and PnP suffice, and are faster.
+        """
         rigs = self.scene.rigs
-        return len(rigs.images_of(self.image)) > 1 or len(rigs.images_of(frame)) > 1
+        return len(rigs.images_of(self.image)) > 1 and len(rigs.images_of(frame)) > 1
 
     def _estimate_pnp(self) -> PoseHypothesis | None:
         """Estimate the pose of the image by PnP on the points of the scene."""
