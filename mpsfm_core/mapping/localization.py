@@ -253,9 +253,6 @@ class Localizer:
         refiner = self._component.refiner
         refiner.fixed[:num_images] = True
         refiner.refine_depth([])
-        scales = [m.scale for m in scene.maps if m.active and m.prior.metric]
-        if scene.rigs.exist and scales:
-            scene.set_rig_scale(float(np.median(scales)))
         self._component.maintenance.exclude_depth(model.wrong_depth)
 
     def _refine(self, images: list[int]) -> None:

@@ -149,9 +149,8 @@ def localize(
             depth provider, else set to a default, and then refined.
         intrinsics: File with the cameras, instead of ``cameras``: ``intrinsics.yaml``, a COLMAP
             model or ``transforms.json``.
-        rigs: Cameras of the photos that move as one, with known relative poses, as in
-            :func:`reconstruct`. The depth of the model gives the unit of their baselines, and the
-            photos refine it.
+        rigs: Cameras of the photos that move as one, as in :func:`reconstruct`, with known relative
+            poses and translations in units of the model.
         features: Provider of features that replaces the configured provider, see
             :func:`reconstruct`.
         matcher: Sparse or dense matcher, which replaces all configured matchers.
