@@ -39,8 +39,8 @@ def localize(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Cameras of the photos that move as one, with known relative poses in units of the "
-            "model: COLMAP's rig_config.json, model or database.",
+            help="Cameras of the photos that move as one, with known relative poses in units of "
+            "the model: COLMAP's rig_config.json, model or database.",
         ),
     ] = None,
     config: ConfigName = "default",
