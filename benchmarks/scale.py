@@ -52,7 +52,7 @@ from mpsfm_core.mapping.state import flatten_state, unflatten_state
 from mpsfm_core.pipeline.parts import PartMapper
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.support.disk_arrays import current_store, store_fields, store_on_disk
+from mpsfm_core.support.disk_arrays import store_on_disk
 from mpsfm_core.support.npz import read_npz
 from mpsfm_core.support.threads import limit_threads
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors
@@ -149,20 +149,11 @@ def _store_hall(views: int, folder: Path) -> Path:
 
 def _run(hall: Path, method: str, part_images: int, path: Path) -> None:
     """Map a hall, and write result, time and memory."""
-    state = unflatten_state(read_npz(hall))
-    problem = problem_from_state(state["problem"])
-    truth = {name: (rotation, shift) for name, (rotation, shift) in state["truth"].items()}
-    del state
     with limit_threads(1), store_on_disk(path.parent):
-        images = (
-            replace(
-                image,
-                depth=store_fields(image.depth, current_store()),
-                normals=store_fields(image.normals, current_store()),
-            )
-            for image in problem.images
-        )
-        problem = replace(problem, images=tuple(images))
+        state = unflatten_state(read_npz(hall))
+        problem = problem_from_state(state["problem"])
+        truth = {name: (rotation, shift) for name, (rotation, shift) in state["truth"].items()}
+        del state
         initialize_process()
         started, cpu_started = time.perf_counter(), _cpu_seconds()
         with _watch_memory() as peaks_mib:

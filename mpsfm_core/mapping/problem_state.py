@@ -15,6 +15,7 @@ from mpsfm_core.data import (
 )
 from mpsfm_core.data.camera_models import CameraModel
 from mpsfm_core.mapping.state import StateDict
+from mpsfm_core.support.disk_arrays import current_store, store_fields
 
 _TUPLES = ("known_pose", "proposed_pose", "distortion", "initial_distortion")
 
@@ -29,7 +30,10 @@ def problem_to_state(problem: MappingProblem) -> StateDict:
 
 
 def problem_from_state(state: StateDict) -> MappingProblem:
-    """Restore a mapping problem, identical to the stored problem."""
+    """Restore a mapping problem, identical to the stored problem.
+
+    The prior maps are stored by :func:`~mpsfm_core.support.disk_arrays.current_store`.
+    """
     return MappingProblem(
         tuple(_image_from_state(image) for image in state["images"]),
         tuple(VerifiedPair(**pair) for pair in state["pairs"]),
@@ -56,8 +60,8 @@ def _image_to_state(image: MappingImage) -> StateDict:
 def _image_from_state(state: StateDict) -> MappingImage:
     parts: dict[str, Any] = {
         "camera": PinholeCamera(**state["camera"]),
-        "depth": DepthPrior(**state["depth"]),
-        "normals": NormalPrior(**state["normals"]),
+        "depth": store_fields(DepthPrior(**state["depth"]), current_store()),
+        "normals": store_fields(NormalPrior(**state["normals"]), current_store()),
         "camera_model": CameraModel(state["camera_model"]),
     }
     tuples = {name: state[name] and tuple(state[name]) for name in _TUPLES}

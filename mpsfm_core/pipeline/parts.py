@@ -36,6 +36,7 @@ from mpsfm_core.providers import Executor
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.support.disk_arrays import store_on_disk
 from mpsfm_core.support.files import write_file
+from mpsfm_core.support.memory import release_free_memory
 from mpsfm_core.support.npz import read_npz
 from mpsfm_core.support.threads import limit_threads
 
@@ -182,13 +183,12 @@ class MapPart:
                 "run: set runtime.cache_dir to a folder that all machines share"
             ) from error
         reset_peak_memory()
-        problem = problem_from_state(unflatten_state(arrays))
-        with (
-            limit_threads(self.threads),
-            store_on_disk(self.cache),
-            measure_part(problem) as records,
-        ):
-            self.map(problem)
+        with limit_threads(self.threads), store_on_disk(self.cache):
+            problem = problem_from_state(unflatten_state(arrays))
+            del arrays  # the prior maps are on disk
+            with measure_part(problem) as records:
+                self.map(problem)
+        release_free_memory()
         if not self.record_file(key).exists():  # a repeated part only loads its checkpoint
             write_file(self.record_file(key), json.dumps(asdict(records[0])))
 
