@@ -4,8 +4,12 @@ Rooms that look alike have verified matches. If the mapper places keyframes of t
 same room, the camera jumps somewhere between the rooms, although a camera cannot jump within a
 shot. Matches between distant keyframes before and after the jump are then wrong.
 
+A fast turn looks like a cut in single frames, and then divides a shot in two. Matches between the
+keyframes on both sides show that there is no cut.
+
 Usage::
 
+    shots = join_shots(shots, problem)
     jumps = find_jumps(reconstructions, shots)
     problem = remove_matches_across(problem, jumps, shots)      # then map again
 """
@@ -15,6 +19,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import PurePosixPath
 
 import numpy as np
 
@@ -34,9 +39,37 @@ MIN_COMMON_POINTS = 15
 """Number of common points from which two keyframes have no jump in between.
 [COLMAP two-view min_num_inliers]"""
 _SPEED_QUANTILE = 0.9
+MIN_JOINING_MATCHES = 30
+"""Number of verified matches of the last keyframe of a shot and the first one of the next shot from
+which there is no cut in between. [COLMAP abs_pose_min_num_inliers]"""
 NUM_NEIGHBORS = 10
 """Number of following keyframes with which a keyframe may be matched across a jump.
 [COLMAP sequential_matching.overlap]"""
+
+
+def join_shots(shots: Sequence[Shot], problem: MappingProblem) -> list[Shot]:
+    """Join successive shots of a video if verified matches show no cut between both shots.
+
+    Args:
+        shots: Keyframes of all shots in the order of their videos, each video in its own folder.
+        problem: Mapping problem with the verified pairs.
+    """
+    names = [image.name for image in problem.images]
+    matched = {
+        frozenset((names[pair.image_a], names[pair.image_b]))
+        for pair in problem.pairs
+        if len(pair) >= MIN_JOINING_MATCHES
+    }
+    joined: list[Shot] = []
+    for shot in shots:
+        if joined:
+            last, first = list(joined[-1])[-1], next(iter(shot))
+            is_same_video = PurePosixPath(last).parent == PurePosixPath(first).parent
+            if is_same_video and {last, first} in matched:
+                joined[-1] = {**joined[-1], **shot}
+                continue
+        joined.append(shot)
+    return joined
 
 
 def find_jumps(reconstructions: Sequence[Reconstruction], shots: Sequence[Shot]) -> list[Jump]:

@@ -20,7 +20,7 @@ from mpsfm_core.config import Config
 from mpsfm_core.data import Bool, MappingProblem
 from mpsfm_core.extraction.runner import Extraction, extend_matches, predict_priors_again
 from mpsfm_core.inputs.images import ImageSet
-from mpsfm_core.mapping.camera_jumps import Jump, find_jumps, remove_matches_across
+from mpsfm_core.mapping.camera_jumps import Jump, find_jumps, join_shots, remove_matches_across
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.rig_calibration import calibrate_rigs
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
@@ -213,9 +213,10 @@ class MappingPasses:
         """
         options = options or self._config.mapper_options()
         mapping = self._map(problem, options)
-        self.jumps = find_jumps(mapping.reconstructions, self._shots)
+        shots = join_shots(self._shots, problem)
+        self.jumps = find_jumps(mapping.reconstructions, shots)
         for _ in range(_MAX_JUMP_RUNS):
-            shorter = remove_matches_across(problem, self.jumps, self._shots)
+            shorter = remove_matches_across(problem, self.jumps, shots)
             num_removed = len(problem.pairs) - len(shorter.pairs)
             if not num_removed:
                 break
@@ -224,10 +225,10 @@ class MappingPasses:
                 f"the camera jumps between the frames {first} and {second}, so the "
                 f"matches of {num_removed} pairs of distant frames across a jump are not used"
             )
-            kept = remove_matches_across(extraction.problem, self.jumps, self._shots)
+            kept = remove_matches_across(extraction.problem, self.jumps, shots)
             extraction = replace(extraction, problem=kept)
             problem, mapping = shorter, self._map(shorter, options)
-            self.jumps = find_jumps(mapping.reconstructions, self._shots)
+            self.jumps = find_jumps(mapping.reconstructions, shots)
         return MappedImages(extracted_views, extraction, mapped_views, mapping)
 
     def _map(self, problem: MappingProblem, options: MapperOptions) -> MappingResult:

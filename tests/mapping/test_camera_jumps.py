@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from mpsfm_core.data import (
     PinholeCamera,
     VerifiedPair,
 )
-from mpsfm_core.mapping.camera_jumps import find_jumps, remove_matches_across
+from mpsfm_core.mapping.camera_jumps import find_jumps, join_shots, remove_matches_across
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -76,20 +78,45 @@ def test_jump_at_a_cut_is_allowed() -> None:
     assert find_jumps([build_walk(walk(), slice(20, None))], shots) == []
 
 
-def test_remove_matches_across_keeps_neighbors_and_pairs_on_one_side() -> None:
-    none = np.zeros((0, 2), np.int64)
+def build_problem(ends: list[tuple[int, int]], num_matches: int = 0) -> MappingProblem:
+    """Return a problem with the pairs of all keyframes and of one photo, the last image."""
     normals = np.zeros((6, 8, 3), np.float32)
     normals[..., 2] = -1
     flat = NormalPrior.from_arrays(normals, np.ones((6, 8), np.float32))
-    images = tuple(
-        MappingImage(n, CAMERA, np.zeros((0, 2)), DEPTH, flat) for n in [*NAMES, "a.jpg"]
+    names = [*NAMES, "a.jpg"]
+    keypoints = np.zeros((num_matches, 2))
+    images = tuple(MappingImage(name, CAMERA, keypoints, DEPTH, flat) for name in names)
+    matches = np.tile(np.arange(num_matches)[:, None], 2)
+    scores, direction = np.ones(num_matches, np.float32), np.array([1.0, 0, 0])
+    pairs = tuple(VerifiedPair(a, b, matches, scores, np.eye(3), direction) for a, b in ends)
+    return MappingProblem(images, pairs)
+
+
+@pytest.mark.parametrize(
+    ("ends", "num_matches", "num_shots"), [((9, 10), 30, 1), ((9, 10), 29, 2), ((8, 10), 30, 2)]
+)
+def test_shots_are_joined_if_their_adjoining_keyframes_match(
+    ends: tuple[int, int], num_matches: int, num_shots: int
+) -> None:
+    shots = [dict(list(SHOT.items())[:10]), dict(list(SHOT.items())[10:])]
+    joined = join_shots(shots, build_problem([ends], num_matches))
+    assert len(joined) == num_shots
+    assert {name: time_s for shot in joined for name, time_s in shot.items()} == SHOT
+
+
+def test_shots_of_two_videos_are_not_joined() -> None:
+    shots = [{f"{folder}/{NAMES[row]}": 0.1 * row} for row, folder in enumerate("ab")]
+    problem = build_problem([(0, 1)], 30)
+    names = [name for shot in shots for name in shot]
+    renamed = tuple(
+        replace(image, name=name) for image, name in zip(problem.images, names, strict=False)
     )
+    assert join_shots(shots, replace(problem, images=renamed)) == shots
+
+
+def test_remove_matches_across_keeps_neighbors_and_pairs_on_one_side() -> None:
     ends = [(0, 12), (15, 22), (5, 25), (19, 20), (21, 29), (9, 20), (8, 20), (0, 30)]
-    pairs = tuple(
-        VerifiedPair(a, b, none, np.zeros(0, np.float32), np.eye(3), np.array([1.0, 0, 0]))
-        for a, b in ends
-    )
-    problem = MappingProblem(images, pairs)
+    problem = build_problem(ends)
     kept = remove_matches_across(problem, [(NAMES[19], NAMES[20])], [SHOT])
     assert [(p.image_a, p.image_b) for p in kept.pairs] == [
         end for end in ends if end not in [(5, 25), (9, 20), (8, 20)]
