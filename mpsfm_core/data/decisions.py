@@ -64,8 +64,8 @@ class ImageReason(ReasonCode):
     MISREGISTERED = ("misregistered", "num_matches")
     """The matches that contradict the pose outnumber the supporting matches by ``num_matches``."""
     SPLIT_OFF = ("split-off", "num_matches")
-    """Only one image pair connects the image to the model, and the matches that contradict the pair
-    outnumber its inliers by ``num_matches``."""
+    """The image is in a group whose matches with the rest of the model contradict its poses. The
+    contradicting matches outnumber the supporting ones by ``num_matches``."""
     DISCONNECTED = ("disconnected", "step")
     """No chain of shared 3D points connects the image to the largest part of the model after
     ``step``."""
@@ -162,9 +162,12 @@ class DoubtReason(ReasonCode):
 
     UNEXPLAINED_PAIRS = ("unexplained-pairs", "num_pairs", "image_a", "image_b", "num_matches")
     """Some image pairs have many verified matches but share hardly any 3D point in the model."""
+    CONTRADICTED_GROUP = ("contradicted-group", "num_images", "num_matches")
+    """More matches contradict the poses of ``num_images`` images relative to the rest of the model
+    than support these poses, by ``num_matches``."""
     DISCONNECTED = ("disconnected", "num_parts", "num_images")
-    """The model falls into parts that share no 3D points, and ``num_images`` images are outside the
-    largest part."""
+    """The model falls into parts that share few 3D points, and ``num_images`` images are outside
+    the largest part."""
     LOW_PARALLAX = ("low-parallax", "angle_deg")
     """The viewing rays of most 3D points are nearly parallel, so only the depth priors determine
     the depth of these points."""

@@ -296,14 +296,15 @@ class Component:
 
         The poses of re-registered images are kept if no image is lost and more matches observe
         common 3D points. Each set of misregistered images is re-registered at most once. If
-        re-registration fails, images are deregistered that only one image pair connects to the
-        model and several image pairs contradict. Images with a known pose stay registered, unless
-        the known poses are only initial guesses.
+        re-registration fails, contradicted groups of images are deregistered and may form another
+        component. Images with a known pose stay registered, unless the known poses are only initial
+        guesses.
 
         Args:
             candidates: (n,) bool mask of the images that may be registered.
         """
         tried: set[tuple[int, ...]] = set()
+        candidates = candidates.copy()
         detections = self._detect_misregistrations()
         while detection := next((d for d in detections if d.images not in tried), None):
             tried.add(detection.images)
@@ -321,19 +322,23 @@ class Component:
                 self._event_log.registered(image, self.size)
             if detection.splits:
                 self._split_off(detection)
+                candidates[list(detection.images)] = False
                 detections = self._detect_misregistrations()
             self._event_log.scene_changed(self.scene)
 
     def _split_off(self, detection: Misregistration) -> None:
-        """Deregister images whose pose one image pair supports and several image pairs contradict.
-
-        The deregistered images may form another component.
-        """
+        """Deregister a group of images whose common matches with other images contradict it."""
         reason = ImageReason.SPLIT_OFF.because(num_matches=int(detection.margin))
         self.maintenance.deregister(list(detection.images), reason)
         reason = ImageReason.LOST_POINTS.because(step="component-split")
         self.maintenance.deregister(find_lost_images(self.scene), reason)
         self.maintenance.refine_globally()
+
+    @property
+    def has_contradicted_group(self) -> bool:
+        """True if the matches of a group of images with the other images contradict its poses."""
+        min_matches = self._options.registration.min_inliers
+        return any(group.splits for group in detect_misregistrations(self.scene, min_matches))
 
     def _find_deregistered(self, before: ModelState) -> list[int]:
         """Return the images that were registered in an earlier model state and no longer are."""

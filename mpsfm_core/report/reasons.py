@@ -123,9 +123,9 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         _CHECK_MATCHES,
     ),
     ImageReason.SPLIT_OFF: (
-        "connected by one contradicted pair",
-        "Only one pair of photos connected it to the model, and {num_matches} more matches "
-        "contradict that pair.",
+        "in a group that matches contradict",
+        "{num_matches} more matches contradict the place of its group of photos in the model than "
+        "support it.",
         _CHECK_MATCHES,
     ),
     ImageReason.DISCONNECTED: (
@@ -275,9 +275,16 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         "Look at these matches below. If they are right, part of the model is wrong: add photos "
         "between these two, or give the true focal length with --intrinsics.",
     ),
+    DoubtReason.CONTRADICTED_GROUP: (
+        "a part of the model that matches contradict",
+        "{num_matches} more matches contradict the place of {num_images} photos in the model than "
+        "support it: places that look alike may be joined.",
+        "Compare these photos with the photos that they match. Add photos between both parts of "
+        "the model, from nearby places.",
+    ),
     DoubtReason.DISCONNECTED: (
-        "parts of the model share no points",
-        "The model has {num_parts} parts that share no points; {num_images} photos are outside of "
+        "parts of the model share hardly any points",
+        "The model has {num_parts} parts that share few points; {num_images} photos are outside of "
         "the largest part, and their position relative to it is uncertain.",
         "Add photos that overlap with both parts.",
     ),

@@ -184,6 +184,13 @@ def _unexplained_pairs(pairs: list[Mapping[str, Any]]) -> Iterator[Doubt]:
 
 def _weak_evidence(evidence: Mapping[str, Any]) -> Iterator[Doubt]:
     """Yield doubts from connectivity, parallax, points, pose errors and explained matches."""
+    contradicted = evidence.get("contradicted_group")
+    if contradicted:
+        names = tuple(contradicted["images"])
+        reason = DoubtReason.CONTRADICTED_GROUP.because(
+            num_images=len(names), num_matches=contradicted["margin"]
+        )
+        yield Doubt(reason, names)
     parts = evidence["parts"]
     if len(parts) > 1:
         apart = tuple(name for part in parts[1:] for name in part)

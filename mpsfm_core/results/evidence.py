@@ -5,6 +5,7 @@ The evidence is written into ``summary.json`` and judged by :mod:`mpsfm_core.rep
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -14,6 +15,10 @@ from scipy.sparse.csgraph import connected_components
 
 from mpsfm_core.data import Bool, Float64, Int64, MappingProblem
 from mpsfm_core.geometry import camera_center
+from mpsfm_core.mapping.consistency.misregistration import (
+    count_contradictions,
+    find_contradicted_cuts,
+)
 from mpsfm_core.mapping.scene.reconstruction import (
     Reconstruction,
     RegisteredImage,
@@ -21,8 +26,12 @@ from mpsfm_core.mapping.scene.reconstruction import (
 )
 from mpsfm_core.results.frame_errors import FrameErrors, measure_frame_errors
 
-MIN_SHARED_POINTS = 3
-"""Minimum number of common 3D points of connected images [minimal sample of PnP]."""
+MIN_CONTRADICTING_MATCHES = 30
+"""Minimum number of matches of a pair that can contradict poses [COLMAP
+abs_pose_min_num_inliers]."""
+MIN_SHARED_POINTS = 30
+"""Minimum number of common 3D points of connected parts of a model, as of an image and its model
+[COLMAP abs_pose_min_num_inliers]."""
 
 
 def count_explained_matches(
@@ -59,16 +68,18 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
         problem: mapping problem with images and verified pairs.
 
     Returns:
-        Plain data with the keys ``parts``, ``median_angle_deg``, ``relative_scale_std``,
-        ``depth_disagreement``, ``images`` and ``frames``.
-        ``parts`` are the image names of each connected part of the covisibility graph, largest part
-        first. ``median_angle_deg`` is the median over the 3D points of the maximum triangulation
-        angle. ``relative_scale_std`` is the largest relative standard deviation of a distance
-        between two frames of rigs without depth priors, or None. ``depth_disagreement`` is the
-        largest difference of the depth of two frames of rigs, in standard deviations, or None.
-        ``images`` are, by image name, the number of 3D points, the share of explained matches, and
-        the predicted relative pose errors: that of an uncertain camera, and that of matches alone
-        for frames of rigs (None without a prediction). ``frames`` are the image names of each frame
+        Plain data with the keys ``contradicted_group``, ``parts``, ``median_angle_deg``,
+        ``relative_scale_std``, ``depth_disagreement``, ``images`` and ``frames``.
+        ``contradicted_group`` are the image names of a group whose matches with the other images
+        mostly contradict its poses, and the excess of these matches, or None. ``parts`` are the
+        image names of each part of the model, largest part first; parts share few 3D points.
+        ``median_angle_deg`` is the median over the 3D points of the maximum triangulation angle.
+        ``relative_scale_std`` is the largest relative standard deviation of a distance between two
+        frames of rigs without depth priors, or None. ``depth_disagreement`` is the largest
+        difference of the depth of two frames of rigs, in standard deviations, or None. ``images``
+        are, by image name, the number of 3D points, the share of explained matches, and the
+        predicted relative pose errors: that of an uncertain camera, and that of matches alone for
+        frames of rigs (None without a prediction). ``frames`` are the image names of each frame
         with several images.
     """
     frames = _group_by_frame(reconstruction, problem)
@@ -97,6 +108,7 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
     scale_std = errors.relative_scale_std if errors else None
     match_errors = errors.pose_deg.tolist() if errors else [None] * len(frames)
     return {
+        "contradicted_group": _find_contradicted_group(frames, frame_of, matched, explained),
         "parts": _connected_parts(frames, len(reconstruction.points)),
         "median_angle_deg": _median_angle_deg(frames, reconstruction.points, is_shared),
         "relative_scale_std": _round(scale_std, 4),
@@ -116,6 +128,45 @@ def describe_evidence(reconstruction: Reconstruction, problem: MappingProblem) -
 
 
 _Frame = list[RegisteredImage]
+_PairNumbers = Mapping[tuple[str, str], int]
+"""Number of matches by pair of image names."""
+
+
+def _find_contradicted_group(
+    frames: list[_Frame],
+    frame_of: Mapping[str, int],
+    num_matched: _PairNumbers,
+    num_explained: _PairNumbers,
+) -> dict[str, Any] | None:
+    """Find the group of images whose matches with the other images contradict its poses most.
+
+    Args:
+        frames: images of each frame.
+        frame_of: row of the frame of each image by name.
+        num_matched: number of matches of the image pairs of the problem.
+        num_explained: number of explained matches of the pairs of registered images.
+
+    Returns:
+        Names of the images and excess of contradicting matches, or None without such a group.
+    """
+    sums: dict[tuple[int, int], Int64] = {}
+    for names, count in num_explained.items():
+        a, b = sorted((frame_of[names[0]], frame_of[names[1]]))
+        total = sums.setdefault((a, b), np.zeros(2, np.int64))
+        total += num_matched[names], count
+    if not sums:
+        return None
+    pairs = sorted(sums)
+    a, b = np.array(pairs, dtype=np.int64).T
+    matches, explained = np.array([sums[pair] for pair in pairs]).T
+    counts = count_contradictions(a, b, matches, explained, MIN_CONTRADICTING_MATCHES)
+    cuts = find_contradicted_cuts(counts, np.ones(len(frames), np.bool_))
+    if not cuts:
+        return None
+    worst = max(cuts, key=lambda cut: cut.margin)
+    rows = np.flatnonzero(worst.inside)
+    image_names = [image.name for row in rows for image in frames[row]]
+    return {"images": image_names, "margin": worst.margin}
 
 
 def _measure_rig_errors(
@@ -155,19 +206,23 @@ def _count_frames(frames: list[_Frame], num_points: int) -> Int64:
 
 
 def _connected_parts(frames: list[_Frame], num_points: int) -> list[list[str]]:
-    """Return the connected components of the covisibility graph, largest component first."""
+    """Return the parts of the model that share at least ``MIN_SHARED_POINTS``, largest part first.
+
+    Parts are merged until no two parts share enough points.
+    """
     if not frames:
         return []
     rows = [_rows(frame) for frame in frames]
-    observations = coo_array(
-        (
-            np.ones(sum(map(len, rows))),
-            (np.repeat(np.arange(len(frames)), list(map(len, rows))), np.concatenate(rows)),
-        ),
-        shape=(len(frames), max(num_points, 1)),
-    ).tocsr()
-    shared = (observations @ observations.T) >= MIN_SHARED_POINTS
-    _, labels = connected_components(shared, directed=False)
+    part_of = np.repeat(np.arange(len(frames)), list(map(len, rows)))
+    point_ids, labels = np.concatenate(rows), np.arange(len(frames))
+    num_parts = 0
+    while num_parts != labels.max() + 1:
+        num_parts = int(labels.max()) + 1
+        shape = num_parts, max(num_points, 1)
+        observed = coo_array((np.ones(len(part_of)), (part_of, point_ids)), shape=shape).tocsr() > 0
+        shared = observed.astype(np.int64) @ observed.T.astype(np.int64) >= MIN_SHARED_POINTS
+        merged = connected_components(shared, directed=False)[1]
+        part_of, labels = merged[part_of], merged[labels]
     parts = [
         [
             image.name

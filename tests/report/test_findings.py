@@ -270,6 +270,10 @@ def test_verdict_doubts_pairs_that_share_no_points() -> None:
 @pytest.mark.parametrize(
     ("change", "code"),
     [
+        (
+            {"contradicted_group": {"images": ["a", "b"], "margin": 90}},
+            DoubtReason.CONTRADICTED_GROUP,
+        ),
         ({"parts": [["a", "b"], ["c"]]}, DoubtReason.DISCONNECTED),
         ({"median_angle_deg": 0.1}, DoubtReason.LOW_PARALLAX),
         (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -66,3 +67,27 @@ def test_image_without_common_points_is_a_separate_part(solved) -> None:
     assert evidence["parts"][-1] == [last.name]
     assert evidence["images"][last.name]["points"] == 0
     assert evidence["images"][last.name]["explained_ratio"] == 0
+
+
+def test_image_that_shares_few_points_is_a_contradicted_separate_part(solved) -> None:
+    """The last image has its own points, except ten that all images may share."""
+    model = solved.best
+    *others, last = model.images
+    rows = np.stack([np.arange(40)] * 2, axis=1)
+    scores = np.ones(len(rows), np.float32)
+    indices = [image.index for image in model.images]
+    pairs = tuple(
+        VerifiedPair(a, b, rows, scores, np.eye(3), np.zeros(3))
+        for a, b in combinations(indices, 2)
+    )
+    problem = replace(solved.problem, pairs=pairs)
+    assert describe_evidence(model, problem)["contradicted_group"] is None
+    point_ids = np.where(last.point_ids >= 10, last.point_ids + len(model.points), last.point_ids)
+    separate = replace(last, point_ids=point_ids)
+    points = np.concatenate([model.points, model.points])
+    separated = replace(model, images=(*others, separate), points=points)
+    evidence = describe_evidence(separated, problem)
+    assert [len(part) for part in evidence["parts"]] == [2, 1]
+    assert evidence["parts"][1] == [last.name]
+    assert evidence["contradicted_group"]["images"] == [last.name]
+    assert evidence["contradicted_group"]["margin"] > 0

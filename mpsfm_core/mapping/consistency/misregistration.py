@@ -52,9 +52,9 @@ class Misregistration(NamedTuple):
     """Number of matches that contradict the poses of the misregistered images, minus number of
     matches that support the poses."""
     splits: bool = False
-    """True if only one image pair connects the misregistered images to the model and several image
-    pairs contradict their poses. Misregistered images that only one image pair connects to the
-    model are deregistered if re-registration fails."""
+    """True for a group of images whose common matches with the rest of the model significantly
+    contradict its poses, or which only one image pair supports and several pairs contradict. The
+    group is deregistered if re-registration fails."""
 
 
 class ContradictedCut(NamedTuple):
@@ -141,7 +141,7 @@ def find_misregistrations(counts: PairCounts, registered: Bool) -> list[Misregis
     supporting = counts.graph(counts.is_explained, len(registered)).tocoo()
     detected: dict[tuple[int, ...], Misregistration] = {}
 
-    def add(inside: Bool, margin: int, splits: bool = False) -> None:
+    def add(inside: Bool, margin: int, *, splits: bool = False) -> None:
         images = tuple(map(int, np.flatnonzero(inside)))
         previous = detected.get(images)
         if previous is not None:
@@ -154,8 +154,7 @@ def find_misregistrations(counts: PairCounts, registered: Bool) -> list[Misregis
     for image, margin in _find_contradicted_images(among_registered, len(registered)):
         add(_mask([image], registered), margin)
     for cut in find_contradicted_cuts(among_registered, registered):
-        is_group = bool(np.count_nonzero(cut.inside) > 1)
-        add(cut.inside, cut.margin, splits=is_group and cut.has_one_link)
+        add(cut.inside, cut.margin, splits=bool(np.count_nonzero(cut.inside) > 1))
     pairs = np.array(sorted(separating), dtype=np.int64)
     widths = compute_widest_paths(counts, pairs, len(registered))
     for (a, b), width in zip(pairs.tolist(), widths, strict=True):
@@ -199,9 +198,24 @@ def count_pair_matches(scene: Scene, min_matches: int = 0) -> PairCounts:
         a[once] * n + b[once], return_inverse=True, return_counts=True
     )
     explained = np.bincount(pair_of[scene.explained_edges()[once]], minlength=len(keys))
+    return count_contradictions(keys // n, keys % n, matches, explained, min_matches)
+
+
+def count_contradictions(
+    a: Int64, b: Int64, matches: Int64, explained: Int64, min_matches: int
+) -> PairCounts:
+    """Return the counts of pairs, of which those with few explained matches contradict the poses.
+
+    Args:
+        a: (p,) index of the first image of each pair.
+        b: (p,) index of the second image of each pair, larger than ``a``.
+        matches: (p,) number of matches.
+        explained: (p,) number of matches whose keypoints observe the same 3D point.
+        min_matches: Smallest number of matches of a pair that can contradict poses.
+    """
     is_explained = explained > MAX_EXPLAINED_RATIO * matches
     contradicting = np.where(is_explained | (matches < min_matches), 0, matches)
-    return PairCounts(keys // n, keys % n, explained, contradicting, is_explained)
+    return PairCounts(a, b, explained, contradicting, is_explained)
 
 
 def compute_widest_paths(counts: PairCounts, pairs: Int64, num_images: int) -> Int64:
