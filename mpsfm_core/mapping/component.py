@@ -295,10 +295,9 @@ class Component:
         """Deregister misregistered images and register them with other reference images.
 
         The poses of re-registered images are kept if no image is lost and more matches observe
-        common 3D points. Each set of misregistered images is re-registered at most once. If
-        re-registration fails, contradicted groups of images are deregistered and may form another
-        component. Images with a known pose stay registered, unless the known poses are only initial
-        guesses.
+        common 3D points. Each set of misregistered images is re-registered at most once. Groups of
+        images that are contradicted afterwards are deregistered and may form another component.
+        Images with a known pose stay registered, unless the known poses are only initial guesses.
 
         Args:
             candidates: (n,) bool mask of the images that may be registered.
@@ -306,25 +305,31 @@ class Component:
         tried: set[tuple[int, ...]] = set()
         candidates = candidates.copy()
         detections = self._detect_misregistrations()
-        while detection := next((d for d in detections if d.images not in tried), None):
+        while detection := next((d for d in detections if d.splits or d.images not in tried), None):
+            is_new = detection.images not in tried
             tried.add(detection.images)
-            before, num_explained = self.maintenance.state(), self._count_explained_matches()
-            self._deregister_misregistered(detection)
-            self.register_images(candidates, wide=True)
-            if not self._find_deregistered(before):
-                self.maintenance.refine_globally()
-            lost = self._find_deregistered(before)
-            if not lost and self._count_explained_matches() > num_explained:
-                detections = self._detect_misregistrations()
-                continue
-            self.maintenance.restore(before)
-            for image in lost:
-                self._event_log.registered(image, self.size)
-            if detection.splits:
+            if not (is_new and self._reregister(detection, candidates)):
+                if not detection.splits:
+                    continue
                 self._split_off(detection)
                 candidates[list(detection.images)] = False
-                detections = self._detect_misregistrations()
-            self._event_log.scene_changed(self.scene)
+            detections = self._detect_misregistrations()
+
+    def _reregister(self, detection: Misregistration, candidates: Bool) -> bool:
+        """Re-register misregistered images, and return whether the new poses are kept."""
+        before, num_explained = self.maintenance.state(), self._count_explained_matches()
+        self._deregister_misregistered(detection)
+        self.register_images(candidates, wide=True)
+        if not self._find_deregistered(before):
+            self.maintenance.refine_globally()
+        lost = self._find_deregistered(before)
+        if not lost and self._count_explained_matches() > num_explained:
+            return True
+        self.maintenance.restore(before)
+        for image in lost:
+            self._event_log.registered(image, self.size)
+        self._event_log.scene_changed(self.scene)
+        return False
 
     def _split_off(self, detection: Misregistration) -> None:
         """Deregister a group of images whose common matches with other images contradict it."""
