@@ -36,12 +36,9 @@ MIN_SPEED_RATIO = 4.0
 """Minimum ratio of the speed of a jump to the 90 % quantile of the speed of the camera, for
 translation or rotation. [tuned: benchmarks.walks --look-alike]"""
 MIN_COMMON_POINTS = 15
-"""Number of common points from which two keyframes have no jump in between.
-[COLMAP two-view min_num_inliers]"""
+"""Number of common points from which two keyframes have no jump in between, and of verified matches
+from which they have no cut in between. [COLMAP two-view min_num_inliers]"""
 _SPEED_QUANTILE = 0.9
-MIN_JOINING_MATCHES = 30
-"""Number of verified matches of the last keyframe of a shot and the first one of the next shot from
-which there is no cut in between. [COLMAP abs_pose_min_num_inliers]"""
 NUM_NEIGHBORS = 10
 """Number of following keyframes with which a keyframe may be matched across a jump.
 [COLMAP sequential_matching.overlap]"""
@@ -58,7 +55,7 @@ def join_shots(shots: Sequence[Shot], problem: MappingProblem) -> list[Shot]:
     matched = {
         frozenset((names[pair.image_a], names[pair.image_b]))
         for pair in problem.pairs
-        if len(pair) >= MIN_JOINING_MATCHES
+        if len(pair) >= MIN_COMMON_POINTS
     }
     joined: list[Shot] = []
     for shot in shots:

@@ -9,7 +9,11 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, VerifiedPair
 from mpsfm_core.data.decisions import ImageReason, Reason
-from mpsfm_core.mapping.consistency.misregistration import Misregistration, detect_misregistrations
+from mpsfm_core.mapping.consistency.misregistration import (
+    Misregistration,
+    detect_misregistrations,
+    has_contradicted_group,
+)
 from mpsfm_core.mapping.consistency.pair_consistency import PairConsistencyCheck
 from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.incremental_registration import IncrementalRegistration
@@ -342,8 +346,7 @@ class Component:
     @property
     def has_contradicted_group(self) -> bool:
         """True if the matches of a group of images with the other images contradict its poses."""
-        min_matches = self._options.registration.min_inliers
-        return any(group.splits for group in detect_misregistrations(self.scene, min_matches))
+        return has_contradicted_group(self.scene, self._options.registration.min_inliers)
 
     def _find_deregistered(self, before: ModelState) -> list[int]:
         """Return the images that were registered in an earlier model state and no longer are."""

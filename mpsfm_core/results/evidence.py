@@ -29,9 +29,9 @@ from mpsfm_core.results.frame_errors import FrameErrors, measure_frame_errors
 MIN_CONTRADICTING_MATCHES = 30
 """Minimum number of matches of a pair that can contradict poses [COLMAP
 abs_pose_min_num_inliers]."""
-MIN_SHARED_POINTS = 30
-"""Minimum number of common 3D points of connected parts of a model, as of an image and its model
-[COLMAP abs_pose_min_num_inliers]."""
+MIN_SHARED_POINTS = 15
+"""Minimum number of common 3D points of connected parts of a model [COLMAP two-view
+min_num_inliers]."""
 
 
 def count_explained_matches(
@@ -206,9 +206,10 @@ def _count_frames(frames: list[_Frame], num_points: int) -> Int64:
 
 
 def _connected_parts(frames: list[_Frame], num_points: int) -> list[list[str]]:
-    """Return the parts of the model that share at least ``MIN_SHARED_POINTS``, largest part first.
+    """Return the parts of the model that share few 3D points, the largest part first.
 
-    Parts are merged until no two parts share enough points.
+    Parts with at least ``MIN_SHARED_POINTS`` common points are merged until no two parts have as
+    many.
     """
     if not frames:
         return []

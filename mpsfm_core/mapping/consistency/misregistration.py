@@ -124,6 +124,19 @@ def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistrat
     return find_misregistrations(count_pair_matches(scene, min_matches), registered)
 
 
+def has_contradicted_group(scene: Scene, min_matches: int) -> bool:
+    """Return whether matches significantly contradict the poses of a group of images.
+
+    Args:
+        scene: The scene with the registered images.
+        min_matches: Smallest number of matches of a pair that can contradict poses.
+    """
+    registered = scene.registered & scene.rigs.is_first
+    counts = count_pair_matches(scene, min_matches).between(registered)
+    cuts = find_contradicted_cuts(counts, registered)
+    return any(np.count_nonzero(cut.inside) > 1 for cut in cuts)
+
+
 def find_misregistrations(counts: PairCounts, registered: Bool) -> list[Misregistration]:
     """Find groups of registered images whose matches mostly contradict their poses.
 
@@ -204,7 +217,7 @@ def count_pair_matches(scene: Scene, min_matches: int = 0) -> PairCounts:
 def count_contradictions(
     a: Int64, b: Int64, matches: Int64, explained: Int64, min_matches: int
 ) -> PairCounts:
-    """Return the counts of pairs, of which those with few explained matches contradict the poses.
+    """Count the matches of pairs with few explained matches as contradicting.
 
     Args:
         a: (p,) index of the first image of each pair.
