@@ -93,7 +93,7 @@ def build_problem(ends: list[tuple[int, int]], num_matches: int = 0) -> MappingP
 
 
 @pytest.mark.parametrize(
-    ("ends", "num_matches", "num_shots"), [((9, 10), 30, 1), ((9, 10), 29, 2), ((8, 10), 30, 2)]
+    ("ends", "num_matches", "num_shots"), [((9, 10), 15, 1), ((9, 10), 14, 2), ((8, 10), 15, 2)]
 )
 def test_shots_are_joined_if_their_adjoining_keyframes_match(
     ends: tuple[int, int], num_matches: int, num_shots: int
