@@ -64,8 +64,8 @@ class ImageReason(ReasonCode):
     MISREGISTERED = ("misregistered", "num_matches")
     """The matches that contradict the pose outnumber the supporting matches by ``num_matches``."""
     SPLIT_OFF = ("split-off", "num_matches")
-    """The image is in a group whose matches with the rest of the model contradict its poses. The
-    contradicting matches outnumber the supporting ones by ``num_matches``."""
+    """Only one image pair connects the image to the model, and the matches that contradict the pair
+    outnumber its inliers by ``num_matches``."""
     DISCONNECTED = ("disconnected", "step")
     """No chain of shared 3D points connects the image to the largest part of the model after
     ``step``."""

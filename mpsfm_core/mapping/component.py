@@ -9,11 +9,7 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64, MappingProblem, VerifiedPair
 from mpsfm_core.data.decisions import ImageReason, Reason
-from mpsfm_core.mapping.consistency.misregistration import (
-    Misregistration,
-    detect_misregistrations,
-    has_contradicted_group,
-)
+from mpsfm_core.mapping.consistency.misregistration import Misregistration, detect_misregistrations
 from mpsfm_core.mapping.consistency.pair_consistency import PairConsistencyCheck
 from mpsfm_core.mapping.event_log import EventLog
 from mpsfm_core.mapping.incremental_registration import IncrementalRegistration
@@ -299,54 +295,45 @@ class Component:
         """Deregister misregistered images and register them with other reference images.
 
         The poses of re-registered images are kept if no image is lost and more matches observe
-        common 3D points. Each set of misregistered images is re-registered at most once. Groups of
-        images that are contradicted afterwards are deregistered and may form another component.
-        Images with a known pose stay registered, unless the known poses are only initial guesses.
+        common 3D points. Each set of misregistered images is re-registered at most once. If
+        re-registration fails, images are deregistered that only one image pair connects to the
+        model and several image pairs contradict. Images with a known pose stay registered, unless
+        the known poses are only initial guesses.
 
         Args:
             candidates: (n,) bool mask of the images that may be registered.
         """
         tried: set[tuple[int, ...]] = set()
-        candidates = candidates.copy()
         detections = self._detect_misregistrations()
-        while detection := next((d for d in detections if d.splits or d.images not in tried), None):
-            is_new = detection.images not in tried
+        while detection := next((d for d in detections if d.images not in tried), None):
             tried.add(detection.images)
-            if not (is_new and self._reregister(detection, candidates)):
-                if not detection.splits:
-                    continue
+            before, num_explained = self.maintenance.state(), self._count_explained_matches()
+            self._deregister_misregistered(detection)
+            self.register_images(candidates, wide=True)
+            if not self._find_deregistered(before):
+                self.maintenance.refine_globally()
+            lost = self._find_deregistered(before)
+            if not lost and self._count_explained_matches() > num_explained:
+                detections = self._detect_misregistrations()
+                continue
+            self.maintenance.restore(before)
+            for image in lost:
+                self._event_log.registered(image, self.size)
+            if detection.splits:
                 self._split_off(detection)
-                candidates[list(detection.images)] = False
-            detections = self._detect_misregistrations()
-
-    def _reregister(self, detection: Misregistration, candidates: Bool) -> bool:
-        """Re-register misregistered images, and return whether the new poses are kept."""
-        before, num_explained = self.maintenance.state(), self._count_explained_matches()
-        self._deregister_misregistered(detection)
-        self.register_images(candidates, wide=True)
-        if not self._find_deregistered(before):
-            self.maintenance.refine_globally()
-        lost = self._find_deregistered(before)
-        if not lost and self._count_explained_matches() > num_explained:
-            return True
-        self.maintenance.restore(before)
-        for image in lost:
-            self._event_log.registered(image, self.size)
-        self._event_log.scene_changed(self.scene)
-        return False
+                detections = self._detect_misregistrations()
+            self._event_log.scene_changed(self.scene)
 
     def _split_off(self, detection: Misregistration) -> None:
-        """Deregister a group of images whose common matches with other images contradict it."""
+        """Deregister images whose pose one image pair supports and several image pairs contradict.
+
+        The deregistered images may form another component.
+        """
         reason = ImageReason.SPLIT_OFF.because(num_matches=int(detection.margin))
         self.maintenance.deregister(list(detection.images), reason)
         reason = ImageReason.LOST_POINTS.because(step="component-split")
         self.maintenance.deregister(find_lost_images(self.scene), reason)
         self.maintenance.refine_globally()
-
-    @property
-    def has_contradicted_group(self) -> bool:
-        """True if the matches of a group of images with the other images contradict its poses."""
-        return has_contradicted_group(self.scene, self._options.registration.min_inliers)
 
     def _find_deregistered(self, before: ModelState) -> list[int]:
         """Return the images that were registered in an earlier model state and no longer are."""

@@ -388,8 +388,7 @@ class Mapper:
 
         A bad initialization leads to a small component, whose images fit a later component better.
         Completed components that lose an image are dissolved, and their images become unregistered.
-        Images with a known pose are not absorbed, and neither are images whose matches with the
-        current component mostly contradict their common poses.
+        Images with a known pose are not absorbed.
 
         Returns:
             True if the current component took images of completed components and was finalized.
@@ -403,10 +402,9 @@ class Mapper:
         component.register_images(
             np.array([image.known_pose is None for image in self.problem.images])
         )
-        is_largest = component.size > max_size and not component.has_contradicted_group
-        if is_largest:
+        if component.size > max_size:
             component.finalize()
-        if not is_largest or component.size <= max_size:
+        if component.size <= max_size:
             component.maintenance.restore(before)
             return False
         for model in list(self.models):

@@ -123,9 +123,9 @@ _TEMPLATES: Mapping[ReasonCode, tuple[str, str, str]] = {
         _CHECK_MATCHES,
     ),
     ImageReason.SPLIT_OFF: (
-        "in a group that matches contradict",
-        "{num_matches} more matches contradict the place of its group of photos in the model than "
-        "support it.",
+        "connected by one contradicted pair",
+        "Only one pair of photos connected it to the model, and {num_matches} more matches "
+        "contradict that pair.",
         _CHECK_MATCHES,
     ),
     ImageReason.DISCONNECTED: (

@@ -52,9 +52,9 @@ class Misregistration(NamedTuple):
     """Number of matches that contradict the poses of the misregistered images, minus number of
     matches that support the poses."""
     splits: bool = False
-    """True for a group of images whose common matches with the rest of the model significantly
-    contradict its poses, or which only one image pair supports and several pairs contradict. The
-    group is deregistered if re-registration fails."""
+    """True if only one image pair connects the misregistered images to the model and several image
+    pairs contradict their poses. Misregistered images that only one image pair connects to the
+    model are deregistered if re-registration fails."""
 
 
 class ContradictedCut(NamedTuple):
@@ -124,19 +124,6 @@ def detect_misregistrations(scene: Scene, min_matches: int) -> list[Misregistrat
     return find_misregistrations(count_pair_matches(scene, min_matches), registered)
 
 
-def has_contradicted_group(scene: Scene, min_matches: int) -> bool:
-    """Return whether matches significantly contradict the poses of a group of images.
-
-    Args:
-        scene: The scene with the registered images.
-        min_matches: Smallest number of matches of a pair that can contradict poses.
-    """
-    registered = scene.registered & scene.rigs.is_first
-    counts = count_pair_matches(scene, min_matches).between(registered)
-    cuts = find_contradicted_cuts(counts, registered)
-    return any(np.count_nonzero(cut.inside) > 1 for cut in cuts)
-
-
 def find_misregistrations(counts: PairCounts, registered: Bool) -> list[Misregistration]:
     """Find groups of registered images whose matches mostly contradict their poses.
 
@@ -154,7 +141,7 @@ def find_misregistrations(counts: PairCounts, registered: Bool) -> list[Misregis
     supporting = counts.graph(counts.is_explained, len(registered)).tocoo()
     detected: dict[tuple[int, ...], Misregistration] = {}
 
-    def add(inside: Bool, margin: int, *, splits: bool = False) -> None:
+    def add(inside: Bool, margin: int, splits: bool = False) -> None:
         images = tuple(map(int, np.flatnonzero(inside)))
         previous = detected.get(images)
         if previous is not None:
@@ -167,7 +154,8 @@ def find_misregistrations(counts: PairCounts, registered: Bool) -> list[Misregis
     for image, margin in _find_contradicted_images(among_registered, len(registered)):
         add(_mask([image], registered), margin)
     for cut in find_contradicted_cuts(among_registered, registered):
-        add(cut.inside, cut.margin, splits=bool(np.count_nonzero(cut.inside) > 1))
+        is_group = bool(np.count_nonzero(cut.inside) > 1)
+        add(cut.inside, cut.margin, splits=is_group and cut.has_one_link)
     pairs = np.array(sorted(separating), dtype=np.int64)
     widths = compute_widest_paths(counts, pairs, len(registered))
     for (a, b), width in zip(pairs.tolist(), widths, strict=True):

@@ -200,56 +200,6 @@ def test_failed_reregistration_restores_scene(
     assert component.refiner.noise == noise
 
 
-def separate(component: Component, group: list[int]) -> None:
-    """Give a group of images its own points, except a few that it shares with the other images."""
-    scene = component.scene
-    tracks, image_of = scene.tracks, scene.graph.image_of
-    observations = tracks.observations()
-    points = tracks.point_of[observations]
-    is_inside = np.isin(image_of[observations], group)
-    num_inside = np.bincount(points, is_inside, minlength=len(tracks.xyz))
-    is_shared = (num_inside > 0) & (num_inside < tracks.lengths())
-    shared = np.flatnonzero(is_shared)
-    is_shared[shared[:: len(shared) // 20]] = False
-    moved = observations[is_inside & is_shared[points]]
-    labels, track = np.unique(tracks.point_of[moved], return_inverse=True)
-    xyz, is_new = tracks.xyz[labels], num_inside[labels] > 1
-    tracks.remove_observations(moved)
-    chosen = is_new[track]
-    tracks.add(xyz[is_new], moved[chosen], (np.cumsum(is_new) - 1)[track[chosen]])
-
-
-def test_contradicted_group_is_split_if_reregistration_fails(
-    component: Component, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Several pairs with few matches support images 3 and 4, whose other matches contradict."""
-    assert not component.has_contradicted_group
-    separate(component, [3, 4])
-    assert component.has_contradicted_group
-    candidates = []
-
-    def register_images(images: Bool, *, wide: bool) -> None:
-        candidates.append(images.copy())
-
-    monkeypatch.setattr(component, "register_images", register_images)
-    component.reregister_images(np.ones(5, np.bool_))
-    assert component.scene.registered.tolist() == [True, True, True, False, False]
-    assert not component.has_contradicted_group
-    assert all(images.all() for images in candidates[:1])
-
-
-@pytest.mark.parametrize(("num_supporting", "splits"), [(60, True), (120, False)])
-def test_contradicted_group_with_several_supporting_pairs_is_split(
-    num_supporting: int, splits: bool
-) -> None:
-    """Two false pairs register images 3 and 4; three correct pairs contradict them."""
-    supporting = {(2, 3): num_supporting, (2, 4): num_supporting}
-    explained = {(0, 1): 900, (1, 2): 800, (3, 4): 900} | supporting
-    contradicting = {(0, 3): 70, (1, 3): 90, (0, 4): 80}
-    detected = detect(explained, contradicting, np.ones(5, np.bool_))
-    assert [d.images for d in detected if d.splits] == [(3, 4)] * splits
-
-
 @pytest.mark.parametrize(("known", "moves"), [("start", False), ("guess", True)])
 def test_image_with_known_pose_is_reregistered_only_if_guess(known: str, moves: bool) -> None:
     poses = arc_poses(5, 14.0)
