@@ -163,8 +163,8 @@ class DoubtReason(ReasonCode):
     UNEXPLAINED_PAIRS = ("unexplained-pairs", "num_pairs", "image_a", "image_b", "num_matches")
     """Some image pairs have many verified matches but share hardly any 3D point in the model."""
     CONTRADICTED_GROUP = ("contradicted-group", "num_images", "num_matches")
-    """More matches contradict the poses of ``num_images`` images relative to the rest of the model
-    than support these poses, by ``num_matches``."""
+    """The poses of ``num_images`` images relative to the other images are probably wrong, because
+    ``num_matches`` more matches contradict than support them."""
     DISCONNECTED = ("disconnected", "num_parts", "num_images")
     """The model falls into parts that share few 3D points, and ``num_images`` images are outside
     the largest part."""

@@ -261,7 +261,7 @@ class _Localization:
         cameras: Path | Cameras | None,
         rigs: PathLike | Sequence[Rig] | None = None,
     ) -> ImageSet:
-        """Load the photos to localize and their rigs, with known or estimated focal lengths."""
+        """Load the photos to localize and their rigs, and estimate unknown focal lengths."""
         folder, names = (photos.parent, [photos.name]) if photos.is_file() else (photos, [])
         names = names or find_images(photos)
         if not names:

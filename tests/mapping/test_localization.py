@@ -220,7 +220,7 @@ def make_rig_problem(problem: MappingProblem, scale: float) -> MappingProblem:
 
 
 def test_images_of_a_rig_share_the_pose_of_their_frame(problem: MappingProblem) -> None:
-    """The second image of the frame has no matches."""
+    """The second image has no matches, so its pose follows from the first image and the rig."""
     made = make_rig_problem(problem, 1.0)
     made = replace(made, pairs=tuple(p for p in made.pairs if p.image_b != FRAME[1]))
     model = triangulate(made)

@@ -413,7 +413,7 @@ class _DepthGrid(NamedTuple):
         return sum(array.nbytes for array in self if not is_on_disk(array))
 
     def stored(self, store: ArrayStore) -> _DepthGrid:
-        """Return a copy whose arrays are stored in memory or on disk."""
+        """Return a copy whose arrays ``store`` has put in memory or in a mapped file."""
         depth, log_std, valid = store(self.depth), store(self.log_std), store(self.valid)
         return _DepthGrid(depth, log_std, valid, store(self.nearest), store(self.intrinsics))
 

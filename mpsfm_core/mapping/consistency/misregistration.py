@@ -205,7 +205,7 @@ def count_pair_matches(scene: Scene, min_matches: int = 0) -> PairCounts:
 def count_contradictions(
     a: Int64, b: Int64, matches: Int64, explained: Int64, min_matches: int
 ) -> PairCounts:
-    """Count the matches of pairs with few explained matches as contradicting.
+    """Return match counts of pairs; pairs with few explained matches contradict the poses.
 
     Args:
         a: (p,) index of the first image of each pair.

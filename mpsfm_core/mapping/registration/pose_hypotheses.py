@@ -315,7 +315,7 @@ class PoseHypothesisGenerator:
                 yield partial(half._estimate_from_essential_matrix, correspondences, frame)
 
     def _is_generalized(self, frame: int) -> bool:
-        """Return True if the new frame and a registered frame have several images.
+        """Return True if both the new frame and a registered frame have more than one image.
 
         With a single image, the poses of image pairs and PnP suffice, and are faster.
         """
