@@ -122,7 +122,7 @@ def video_in_photos(folder: Path, seed: int, config: str) -> Case:
 
 
 def name_frames(poses: Iterable[tuple[int, Pose]]) -> dict[str, Pose]:
-    """Return the poses of numbered frames of a video by the names of the frames."""
+    """Return the poses of the frames of a video, by image name instead of by frame number."""
     return {f"frame_{number:06d}.jpg": pose for number, pose in poses}
 
 
@@ -206,7 +206,7 @@ def read_poses(output: Path) -> dict[str, Pose]:
 
 
 def make_table(records: Sequence[Record]) -> str:
-    """Format a Markdown table with one row for photos in videos, and one for videos in photos."""
+    """Format a Markdown table: a row for photos localized in videos, and one for the reverse."""
     lines = [
         "| queries | models: images, ATE in cm | known: recall | median | unknown: recall | median "
         "| CPU s per query |",

@@ -70,7 +70,7 @@ def test_image_without_common_points_is_a_separate_part(solved) -> None:
 
 
 def test_image_that_shares_few_points_is_a_contradicted_separate_part(solved) -> None:
-    """The last image has its own points, except ten that all images may share."""
+    """The last image shares at most ten of its points with the other images."""
     model = solved.best
     *others, last = model.images
     rows = np.stack([np.arange(40)] * 2, axis=1)
