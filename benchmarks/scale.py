@@ -1,15 +1,16 @@
 """Mapping of many images in one piece and in overlapping parts, and COLMAP's mappers.
 
-    python -m benchmarks.scale [--views 200 500 ...] [--methods NAME ...] [--part-images 100]
-        [--joins 20] [--folder build/benchmarks/scale] [--output FILE]
+    python -m benchmarks.scale [--scene hall] [--views 200 500 ...] [--methods NAME ...]
+        [--part-images 100] [--joins 20] [--folder build/benchmarks/scale] [--output FILE]
 
-The first table maps synthetic halls (:mod:`mpsfm_core.testing.synthetic.halls`) with calibrated
-depth priors, 5 % wrong matches in each pair, and 1 % of pairs between distant views that look
-alike. Each run has its own process with one thread, which loads compiled code before timing starts.
-CPU time includes the depth maps of our mapper, and the Dask workers, which load compiled code
-within that time. Memory is the peak of the first process without pages of mapped files, sampled ten
-times a second, and the peak of the largest worker. As in a run, the maps of many images are in
-mapped files. Results are kept in ``--folder``, so that an interrupted benchmark continues.
+The first table maps synthetic halls (:mod:`mpsfm_core.testing.synthetic.halls`), or cities with a
+grid of streets (:mod:`mpsfm_core.testing.synthetic.streets`), with calibrated depth priors, 5 %
+wrong matches in each pair, and 1 % of pairs between distant views that look alike. Each run has its
+own process with one thread, which loads compiled code before timing starts. CPU time includes the
+depth maps of our mapper, and the Dask workers, which load compiled code within that time. Memory is
+the peak of the first process without pages of mapped files, sampled ten times a second, and the
+peak of the largest worker. As in a run, the maps of many images are in mapped files. Results are
+kept in ``--folder``, so that an interrupted benchmark continues.
 
 The second table joins two parts of twin rooms (:mod:`mpsfm_core.testing.synthetic.two_rooms`) at
 given poses. A true join has common images in the corridor. In a false join, some images of the
@@ -26,7 +27,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -56,7 +57,13 @@ from mpsfm_core.support.disk_arrays import store_on_disk
 from mpsfm_core.support.npz import read_npz
 from mpsfm_core.support.threads import limit_threads
 from mpsfm_core.testing.synthetic.degraded_depth import DepthErrors
-from mpsfm_core.testing.synthetic.halls import CALIBRATED_PRIORS, HallProblem, make_hall_problem
+from mpsfm_core.testing.synthetic.halls import (
+    CALIBRATED_PRIORS,
+    HallProblem,
+    PriorErrors,
+    make_hall_problem,
+)
+from mpsfm_core.testing.synthetic.streets import make_street_problem
 from mpsfm_core.testing.synthetic.two_rooms import (
     SymmetricProblem,
     make_twin_room_problem,
@@ -66,6 +73,10 @@ from mpsfm_core.testing.synthetic.two_rooms import (
 ONE_PIECE, IN_PARTS = "ours, one piece", "ours, in parts"
 WORKERS = {f"{IN_PARTS}, 1 Dask worker": 1, f"{IN_PARTS}, 2 Dask workers": 2}
 METHODS = (ONE_PIECE, IN_PARTS, *WORKERS, "colmap", "colmap-hierarchical", "colmap-global")
+SCENES: Mapping[str, Callable[[int, PriorErrors], HallProblem]] = {
+    "hall": make_hall_problem,
+    "streets": make_street_problem,
+}
 LOOK_ALIKE_RATIO = 0.01
 """Number of added false pairs, relative to the number of pairs."""
 MIN_DISTANCE = 4
@@ -75,6 +86,7 @@ MIN_DISTANCE = 4
 def main() -> None:
     """Parse the command line, run all methods that have no result yet, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
+    parser.add_argument("--scene", choices=list(SCENES), default="hall")
     parser.add_argument("--views", type=int, nargs="*", default=[200, 500])
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=list(METHODS))
     parser.add_argument("--part-images", type=int, default=100)
@@ -85,7 +97,8 @@ def main() -> None:
     rows = []
     for views in arguments.views:
         for method in arguments.methods:
-            rows.append(_measure(views, method, arguments.part_images, arguments.folder))
+            scene = store_scene(arguments.scene, views, arguments.folder)
+            rows.append(_measure(scene, views, method, arguments.part_images))
     text = f"{_table(rows)}\n\n{_count_joins(arguments.joins)}\n"
     print(text)
     if arguments.output:
@@ -120,14 +133,13 @@ def add_look_alike_pairs(hall: HallProblem, seed: int = 0) -> MappingProblem:
     return MappingProblem(tuple(images), tuple(pairs))
 
 
-def _measure(views: int, method: str, part_images: int, folder: Path) -> dict[str, Any]:
-    """Map a synthetic hall with one mapper in a new process, or load its stored result."""
-    name = f"{views}-{method}" + (f"-{part_images}" if method.startswith(IN_PARTS) else "")
-    path = folder / f"{name.replace(' ', '_')}.json"
+def _measure(scene: Path, views: int, method: str, part_images: int) -> dict[str, Any]:
+    """Map a synthetic scene with one mapper in a new process, or load its stored result."""
+    name = f"{scene.stem}-{method}" + (f"-{part_images}" if method.startswith(IN_PARTS) else "")
+    path = scene.with_name(f"{name.replace(' ', '_')}.json")
     if not path.exists():
-        hall = _store_hall(views, folder)
         context = multiprocessing.get_context("spawn")
-        process = context.Process(target=_run, args=(hall, method, part_images, path))
+        process = context.Process(target=_run, args=(scene, method, part_images, path))
         process.start()
         process.join()
         print(f"{name}: exit code {process.exitcode}", file=sys.stderr)
@@ -135,28 +147,28 @@ def _measure(views: int, method: str, part_images: int, folder: Path) -> dict[st
     return row | (json.loads(path.read_text(encoding="utf-8")) if path.exists() else {})
 
 
-def _store_hall(views: int, folder: Path) -> Path:
-    """Write the mapping problem and the true poses of a hall, unless they are stored."""
-    path = folder / f"hall-{views}.npz"
+def store_scene(scene: str, views: int, folder: Path) -> Path:
+    """Write the mapping problem and the true poses of a scene, unless they are stored."""
+    path = folder / f"{scene}-{views}.npz"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
-        hall = make_hall_problem(views, CALIBRATED_PRIORS)
-        problem = problem_to_state(add_look_alike_pairs(hall))
-        state: Any = flatten_state({"problem": problem, "truth": dict(hall.truth)})
+        made = SCENES[scene](views, CALIBRATED_PRIORS)
+        problem = problem_to_state(add_look_alike_pairs(made))
+        state: Any = flatten_state({"problem": problem, "truth": dict(made.truth)})
         np.savez(path, **state)
     return path
 
 
-def _run(hall: Path, method: str, part_images: int, path: Path) -> None:
-    """Map a hall, and write result, time and memory."""
+def _run(scene: Path, method: str, part_images: int, path: Path) -> None:
+    """Map a scene, and write result, time and memory."""
     with limit_threads(1), store_on_disk(path.parent):
-        state = unflatten_state(read_npz(hall))
+        state = unflatten_state(read_npz(scene))
         problem = problem_from_state(state["problem"])
         truth = {name: (rotation, shift) for name, (rotation, shift) in state["truth"].items()}
         del state
         initialize_process()
         started, cpu_started = time.perf_counter(), _cpu_seconds()
-        with _watch_memory() as peaks_mib:
+        with watch_memory() as peaks_mib:
             models = list(_map(problem, method, part_images))
     seconds, cpu_seconds = time.perf_counter() - started, _cpu_seconds() - cpu_started
     largest = models[0] if models else {}
@@ -174,7 +186,7 @@ def _run(hall: Path, method: str, part_images: int, path: Path) -> None:
 
 
 @contextmanager
-def _watch_memory() -> Iterator[list[float]]:
+def watch_memory() -> Iterator[list[float]]:
     """Sample the resident memory of this process without mapped files, in MiB."""
     samples: list[float] = []
     ended = threading.Event()

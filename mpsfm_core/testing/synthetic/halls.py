@@ -115,9 +115,47 @@ def make_hall_problem(
     """
     rng = np.random.default_rng(seed)
     poses, scene = make_hall(views, rng)
+    parts = [remove_hidden_boxes(scene, pose) for pose in poses]
+    return observe_scene(
+        parts,
+        poses,
+        REACH,
+        errors,
+        rng,
+        points_per_view=points_per_view,
+        map_width=map_width,
+        keypoint_noise_px=keypoint_noise_px,
+        wrong_matches=wrong_matches,
+    )
+
+
+def observe_scene(
+    parts: Sequence[AnalyticScene],
+    poses: Sequence[Float64],
+    reach: float,
+    errors: PriorErrors,
+    rng: np.random.Generator,
+    *,
+    points_per_view: int = 60,
+    map_width: int = 160,
+    keypoint_noise_px: float = 0.7,
+    wrong_matches: float = 0.05,
+) -> HallProblem:
+    """Create the mapping problem of views of a scene, in time nearly linear in their number.
+
+    Args:
+        parts: Surfaces that each view can see.
+        poses: Pose ``cam_from_world`` (3, 4) of each view.
+        reach: Largest distance in meters between the cameras of two views of a surface point.
+        errors: Model of the errors of the depth priors.
+        rng: Random generator of surface points and errors.
+        points_per_view: See :func:`make_hall_problem`.
+        map_width: See :func:`make_hall_problem`.
+        keypoint_noise_px: See :func:`make_hall_problem`.
+        wrong_matches: See :func:`make_hall_problem`.
+    """
     eyes = np.array([camera_center(pose[:, :3], pose[:, 3]) for pose in poses])
-    parts = [_remove_hidden_boxes(scene, pose) for pose in poses]
-    numbers, pixels = _keypoints(parts, poses, eyes, points_per_view, rng)
+    numbers, pixels = _keypoints(parts, poses, eyes, reach, points_per_view, rng)
     noise = SyntheticNoise(keypoints_px=keypoint_noise_px)
     images = []
     for i, (pose, xy) in enumerate(zip(poses, pixels, strict=True)):
@@ -130,7 +168,7 @@ def make_hall_problem(
         prior = DepthPrior.from_arrays(depth, (errors.declared * depth) ** 2)
         images.append(replace(image, depth=prior))
     pairs = []
-    for a, b in _list_near_pairs(eyes):
+    for a, b in _list_near_pairs(eyes, reach):
         _, rows_a, rows_b = np.intersect1d(numbers[a], numbers[b], return_indices=True)
         if len(rows_a) >= MIN_MATCHES:
             matches = np.stack([rows_a, rows_b], axis=1)
@@ -173,7 +211,7 @@ def make_hall(views: int, rng: np.random.Generator) -> tuple[list[Float64], Anal
     return poses, AnalyticScene(tuple(surfaces))
 
 
-def _remove_hidden_boxes(scene: AnalyticScene, pose: Float64) -> AnalyticScene:
+def remove_hidden_boxes(scene: AnalyticScene, pose: Float64) -> AnalyticScene:
     """Remove the boxes outside of the view frustum, which the camera cannot see."""
     centers, radii = scene.bounding_spheres
     local = centers @ pose[:, :3].T + pose[:, 3]
@@ -187,6 +225,7 @@ def _keypoints(
     parts: Sequence[AnalyticScene],
     poses: Sequence[Float64],
     eyes: Float64,
+    reach: float,
     points_per_view: int,
     rng: np.random.Generator,
 ) -> tuple[list[Int64], list[Float64]]:
@@ -196,9 +235,9 @@ def _keypoints(
     pixels: list[list[Float64]] = [[] for _ in poses]
     for i, pose in enumerate(poses):
         seen = parts[i].sample(CAMERA, pose, rng.uniform(2, size - 2, (points_per_view, 2)))
-        for j in map(int, np.flatnonzero(np.linalg.norm(eyes - eyes[i], axis=1) <= REACH)):
+        for j in map(int, np.flatnonzero(np.linalg.norm(eyes - eyes[i], axis=1) <= reach)):
             xy, depth = project(CAMERA, poses[j], seen.points)
-            visible = (depth > 0) & (xy > 0).all(axis=1) & (xy < size).all(axis=1)
+            visible = seen.valid & (depth > 0) & (xy > 0).all(axis=1) & (xy < size).all(axis=1)
             visible &= _can_match(seen.points - eyes[i], seen.points - eyes[j])
             rows = np.flatnonzero(visible)
             t, _, _ = parts[j].first_hit(eyes[j], seen.points[rows] - eyes[j])
@@ -208,9 +247,9 @@ def _keypoints(
     return [np.concatenate(n) for n in numbers], [np.concatenate(p) for p in pixels]
 
 
-def _list_near_pairs(eyes: Float64) -> list[tuple[int, int]]:
+def _list_near_pairs(eyes: Float64, reach: float) -> list[tuple[int, int]]:
     """Return the sorted pairs of views whose distances to a third view may be within the reach."""
-    pairs = cKDTree(eyes).query_pairs(2 * REACH + 1e-6)
+    pairs = cKDTree(eyes).query_pairs(2 * reach + 1e-6)
     return sorted(pairs)
 
 
