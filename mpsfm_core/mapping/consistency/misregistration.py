@@ -19,7 +19,7 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, eye_array
 from scipy.sparse.csgraph import (
     breadth_first_order,
     connected_components,
@@ -277,7 +277,9 @@ def find_contradicted_cuts(
 
     Each candidate cut removes an edge of the maximum spanning tree of the numbers of explained
     matches. The candidate cuts include every part of the model that a single pair connects to the
-    rest. The matches of all image pairs across a cut are counted.
+    rest. The matches of all image pairs across a cut are counted, except for contradicting pairs
+    that no other pair confirms. Otherwise a few pairs of distant images that look alike would
+    outnumber the matches across a thin cut of a large model.
 
     Args:
         counts: Numbers of matches of the pairs of registered images.
@@ -287,7 +289,8 @@ def find_contradicted_cuts(
     num_images = len(registered)
     forest = _find_spanning_forest(counts, num_images).tocoo()
     edges = np.stack([forest.row, forest.col], axis=1)
-    against, support = counts.contradicting, counts.explained
+    is_confirmed = _find_confirmed_contradictions(counts, num_images)
+    against, support = np.where(is_confirmed, counts.contradicting, 0), counts.explained
     values = [against, support, against**2 + support**2, support > 0, against > 0]
     pairs = np.stack([counts.a, counts.b], axis=1)
     sums = sum_across_tree_cuts(edges, pairs, np.stack(values, axis=1), num_images)
@@ -303,6 +306,21 @@ def find_contradicted_cuts(
         num_supporting, num_contradicting = map(int, sums[row, 3:])
         cuts.append(ContradictedCut(inside, int(margins[row]), num_supporting, num_contradicting))
     return cuts
+
+
+def _find_confirmed_contradictions(counts: PairCounts, num_images: int) -> Bool:
+    """Return a mask (p,) of the contradicting pairs that another contradicting pair confirms.
+
+    If a group of images is misregistered, neighbors of both images of a contradicting pair also
+    contradict each other. Neighbors are images with explained matches.
+    """
+    is_contradicting = counts.contradicting > 0
+    neighbors = counts.graph(counts.is_explained.astype(np.int64), num_images)
+    neighbors = neighbors + eye_array(num_images, dtype=np.int64, format="csr")
+    contradictions = counts.graph(is_contradicting.astype(np.int64), num_images)
+    num_confirming = (neighbors @ contradictions @ neighbors)[counts.a, counts.b]
+    confirmed: Bool = is_contradicting & (num_confirming > 1)  # a pair also confirms itself
+    return confirmed
 
 
 def _find_spanning_forest(counts: PairCounts, num_images: int) -> csr_array:

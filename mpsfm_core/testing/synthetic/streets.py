@@ -114,7 +114,7 @@ def _make_row(block: float, rng: np.random.Generator) -> Float64:
     while start < end:
         half = min(rng.uniform(3, 5), (end - start) / 2)
         middle, front = start + half, WIDTH / 2 + rng.uniform(0, 0.6)
-        row.append((middle, half, front + 3, 3, rng.uniform(3.5, 7)))
+        row.append((middle, half, front + 3, 3.0, rng.uniform(3.5, 7)))
         bay = middle + rng.uniform(-0.5, 0.5) * half
         row.append((bay, rng.uniform(0.4, 1), front, rng.uniform(0.3, 0.8), rng.uniform(1.5, 3)))
         if rng.uniform() < 0.5:

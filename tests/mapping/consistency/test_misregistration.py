@@ -127,6 +127,20 @@ def test_cut_with_more_supporting_matches_is_ignored() -> None:
     assert find_contradicted_cuts(count(explained, contradicting), np.ones(5, np.bool_)) == []
 
 
+@pytest.mark.parametrize(("step", "is_found"), [(1, True), (3, False)])
+def test_cut_is_contradicted_only_by_pairs_that_confirm_each_other(
+    step: int, is_found: bool
+) -> None:
+    """Images on a circle match their neighbors, and four of them contradict opposite images."""
+    n = 24
+    explained = {(i, (i + 1) % n): 61 for i in range(n)}
+    explained |= {(i, (i + 2) % n): 60 for i in range(n)}
+    contradicting = {(i, i + n // 2): 150 for i in range(0, 4 * step, step)}
+    cuts = find_contradicted_cuts(count(explained, contradicting), np.ones(n, np.bool_))
+    assert any(cut.num_contradicting_pairs == 4 for cut in cuts) == is_found
+    assert bool(cuts) == is_found
+
+
 def test_image_whose_pairs_together_contradict_it_is_detected() -> None:
     """False matches register image 6 next to 0 to 2; no single pair outweighs them."""
     correct = {(a, b): 200 for a in range(6) for b in range(a)}
