@@ -19,7 +19,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_matrix
+from scipy.sparse import coo_matrix, csr_array
 from scipy.sparse.csgraph import (
     breadth_first_order,
     connected_components,
@@ -216,8 +216,14 @@ def _cauchy_weights(errors: Float64) -> Float64:
 def _chain_rotations(
     a: Int64, b: Int64, b_from_a: Float64, weights: Float64, num_images: int
 ) -> Float64:
-    """Chain relative rotations along the maximum spanning tree of the view graph."""
-    graph = coo_matrix((1 / weights, (a, b)), shape=(num_images, num_images)).tocsr()
+    """Chain relative rotations along the maximum spanning tree of the view graph.
+
+    Edges on no cycle of three or four images are only in the tree if they connect the view graph.
+    One wrong edge in the tree rotates a whole part, from which the robust loss cannot recover.
+    """
+    costs = 1 / weights
+    costs += costs.max() * ~find_short_cycle_edges(a, b, num_images)
+    graph = coo_matrix((costs, (a, b)), shape=(num_images, num_images)).tocsr()
     tree = minimum_spanning_tree(graph)
     order, parents = breadth_first_order(tree, int(a[0]), directed=False)
     relative = {
@@ -319,6 +325,30 @@ def find_cycle_edges(a: Int64, b: Int64, num_nodes: int) -> Bool:
     child = np.where(first_is_child, first, second)
     on_cycle: Bool = ~in_tree | (node_labels[child] != 0)
     return on_cycle[: len(a)]
+
+
+def find_short_cycle_edges(a: Int64, b: Int64, num_nodes: int) -> Bool:
+    """Find the edges of a graph that are on a cycle of three or four nodes.
+
+    An edge of the view graph on no such cycle is often a wrong pair of images that look alike.
+
+    Args:
+        a: (m,) index of the first node of each graph edge.
+        b: (m,) index of the second node of each graph edge. No pair of graph nodes may occur twice.
+        num_nodes: Number of nodes.
+
+    Returns:
+        (m,) bool mask of the graph edges on a short cycle.
+    """
+    ends = np.concatenate([a, b]), np.concatenate([b, a])
+    links = csr_array((np.ones(2 * len(a)), ends), shape=(num_nodes, num_nodes))
+    degree = np.bincount(ends[0], minlength=num_nodes)
+    walks_2 = links @ links
+    walks_3 = walks_2 @ links  # of these, degree_a + degree_b - 1 repeat the edge a-b itself
+    num_triangles = np.asarray(walks_2[a, b]).ravel()
+    num_squares = np.asarray(walks_3[a, b]).ravel() - (degree[a] + degree[b] - 1)
+    on_cycle: Bool = num_triangles + num_squares > 0
+    return on_cycle
 
 
 def label_components(a: Int64, b: Int64, num_nodes: int) -> Int64:

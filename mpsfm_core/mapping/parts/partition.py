@@ -13,11 +13,12 @@ Images of one frame of a rig are never separated.
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import coo_array, csr_array, diags_array, eye_array
+from scipy.sparse import coo_array, csr_array, diags_array, eye_array, triu
 from scipy.sparse.csgraph import connected_components, minimum_spanning_tree
 from scipy.sparse.linalg import eigsh
 
 from mpsfm_core.data import Bool, Float64, Int64, MappingProblem
+from mpsfm_core.mapping.initialization.global_initialization import find_short_cycle_edges
 from mpsfm_core.mapping.scene.rig_frames import RigFrames
 
 OVERLAP = 0.1
@@ -77,21 +78,14 @@ def _build_frame_graph(problem: MappingProblem, frame_of: Int64, num_frames: int
 
 def _remove_unconfirmed_edges(graph: csr_array) -> csr_array:
     """Remove edges on no cycle of three or four nodes, except those that connect the graph."""
-    edges = graph.tocoo()
-    links = csr_array((np.ones(len(edges.data)), (edges.row, edges.col)), shape=graph.shape)
-    degree = np.asarray(links.sum(axis=1)).ravel()
-    walks_2 = links @ links
-    walks_3 = walks_2 @ links  # of these, degree_a + degree_b - 1 repeat the edge a-b itself
-    num_triangles = np.asarray(walks_2[edges.row, edges.col]).ravel()
-    num_squares = np.asarray(walks_3[edges.row, edges.col]).ravel()
-    num_squares -= degree[edges.row] + degree[edges.col] - 1
-    is_confirmed = num_triangles + num_squares > 0
+    edges = coo_array(triu(graph))
+    a, b = edges.row, edges.col
+    is_confirmed = find_short_cycle_edges(a, b, graph.shape[0])
     costs = 1 / edges.data + 2 * ~is_confirmed  # confirmed edges first
-    forest = minimum_spanning_tree(csr_array((costs, (edges.row, edges.col)), shape=graph.shape))
-    is_in_forest = np.asarray((forest + forest.T)[edges.row, edges.col]).ravel() > 0
-    remains = is_confirmed | is_in_forest
-    rows = edges.row[remains], edges.col[remains]
-    return csr_array((edges.data[remains], rows), shape=graph.shape)
+    forest = csr_array(minimum_spanning_tree(csr_array((costs, (a, b)), shape=graph.shape)))
+    remains = is_confirmed | (np.asarray(forest[a, b]).ravel() > 0)
+    once = csr_array((edges.data[remains], (a[remains], b[remains])), shape=graph.shape)
+    return csr_array(once + once.T)
 
 
 def _bisect(graph: csr_array, nodes: Int64, sizes: Int64, max_images: int) -> list[Int64]:

@@ -19,6 +19,7 @@ from mpsfm_core.mapping.initialization.global_initialization import (
     average_rotations,
     estimate_global_poses,
     find_cycle_edges,
+    find_short_cycle_edges,
 )
 from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
@@ -106,6 +107,39 @@ def test_find_cycle_edges_returns_edges_that_are_no_bridges(seed: int) -> None:
     whole = groups(links)
     spared = [groups(np.delete(links, row, axis=0)) == whole for row in range(len(links))]
     assert find_cycle_edges(links[:, 0], links[:, 1], count).tolist() == spared
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_find_short_cycle_edges_returns_edges_on_triangles_and_squares(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = 14
+    possible = np.stack(np.triu_indices(count, 1), axis=1)
+    links = possible[rng.choice(len(possible), rng.integers(1, 25), replace=False)]
+    neighbors = np.zeros((count, count), np.bool_)
+    neighbors[links[:, 0], links[:, 1]] = neighbors[links[:, 1], links[:, 0]] = True
+
+    def is_on_short_cycle(a: int, b: int) -> bool:
+        first, second = neighbors[a].copy(), neighbors[b].copy()
+        first[b] = second[a] = False
+        return bool((first & second).any() or neighbors[first][:, second].any())
+
+    expected = [is_on_short_cycle(a, b) for a, b in links.tolist()]
+    assert find_short_cycle_edges(links[:, 0], links[:, 1], count).tolist() == expected
+
+
+def test_rotations_of_a_circle_are_averaged_despite_heavy_wrong_edges() -> None:
+    """Wrong edges between opposite images have most matches, but are on no short cycle."""
+    count, rng = 60, np.random.default_rng(0)
+    truth = Rotation.random(count, rng=rng).as_matrix()
+    near = [(i, (i + step) % count) for step in (1, 2) for i in range(count)]
+    wrong = [(i, i + 30) for i in range(0, 30, 6)]
+    a, b = np.array([*near, *wrong]).T
+    relative = truth[b] @ truth[a].transpose(0, 2, 1)
+    relative[len(near) :] = Rotation.random(len(wrong), rng=rng).as_matrix()
+    weights = np.where(np.arange(len(a)) < len(near), 50.0, 400.0)
+    averaged = average_rotations(a, b, relative, weights, count)
+    gauge = truth[0].T @ averaged[0]
+    assert np.abs(truth @ gauge - averaged).max() < 1e-6
 
 
 def test_pairs_that_contradict_depth_have_low_weight(hall: HallProblem) -> None:
