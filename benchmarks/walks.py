@@ -12,13 +12,18 @@ poses. Frames are also localized between keyframes with true poses, and depth wi
 1.4 %. COLMAP extracts and matches SIFT features of the same keyframes (sequential matching without
 loop detection) and maps them. The frames of hololens_room are a video without its blurred frames.
 Results of earlier calls in DIR are not computed again.
+
+A loop is closed rightly if keyframes after the first round share 15 points with keyframes of its
+start, and if the loop error (:func:`measure_loop_error`) is at most 1 % of the length of a round. A
+false loop is a pair of keyframes whose relative position is wrong by more than 1 m, after alignment
+of the model with the true poses.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import resource
+import os
 import subprocess
 import sys
 import tempfile
@@ -56,6 +61,7 @@ from mpsfm_core.inputs.models import reconstruction_poses
 from mpsfm_core.inputs.video import read_selection
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.pipeline.trajectory import localize_frames
+from mpsfm_core.report.verdict import judge
 from mpsfm_core.results.original_images import OriginalImages
 from mpsfm_core.results.summary import read_summary
 
@@ -74,6 +80,12 @@ ROUNDS, OPEN_ROUNDS = 1.15, 0.75
 """Rounds of a walk that returns to its start, and of a walk past look-alike rooms."""
 START_ROUNDS = 0.3
 """Part of the first round that is aligned with the true poses to measure the error of the loop."""
+MAX_LOOP_ERROR_RATIO = 0.01
+"""Loop error of a loop that is closed rightly, relative to the length of a round."""
+MIN_LOOP_POINTS = 15
+"""Common points of the start and the keyframes after the first round of a closed loop."""
+FALSE_LOOP_ERROR = 1.0
+"""Error of the relative position of two keyframes in a model with a false loop, in meters."""
 _TEXTURES = 64
 Record = dict[str, Any]
 
@@ -338,18 +350,19 @@ def run_walk(
     """
     truth = Trajectory(np.array(sorted(poses)) / fps, tuple(poses[n] for n in sorted(poses)))
     output = video.with_suffix("")
-    before = resource.getrusage(resource.RUSAGE_CHILDREN)
     start = time.monotonic()
     arguments = ["reconstruct", str(video), "-o", str(output), "--config", config, "--quiet"]
     arguments += [part for setting in settings for part in ("--set", setting)]
-    subprocess.run([*MPSFM, *arguments], check=False)
-    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    # The memory of all children of this process would include the video before.
+    _, _, usage = os.wait4(subprocess.Popen([*MPSFM, *arguments]).pid, 0)
     summary = read_summary(output / "summary.json")
     record: Record = {
         "walk": video.stem,
+        "loop": rounds is not None,
         "seconds": time.monotonic() - start,
-        "cpu_seconds": usage.ru_utime - before.ru_utime,
+        "cpu_seconds": usage.ru_utime,
         "memory_mb": usage.ru_maxrss / 1024,
+        "verdict": _describe_verdict(summary),
         "video": summary["videos"][0],
         "stages": {name: stage["seconds"] for name, stage in summary["stages"].items()},
     }
@@ -378,18 +391,76 @@ def run_walk(
     return record
 
 
+def _describe_verdict(summary: Mapping[str, Any]) -> str:
+    """Return the level of the verdict about a run, and the codes of its doubts."""
+    verdict = judge(summary)
+    codes = sorted({doubt.reason.code.value for doubt in verdict.doubts})
+    return verdict.level + (f" ({', '.join(codes)})" if codes else "")
+
+
 def _evaluate_model(folder: Path, poses: Mapping[int, Pose], rounds: float | None) -> Record:
     """Return the number of registered keyframes of a COLMAP model, and its errors in meters."""
-    found = reconstruction_poses(pycolmap.Reconstruction(str(folder)))
-    numbered = {str(int(Path(name).stem[-6:])): pose for name, pose in found.items()}
+    model = pycolmap.Reconstruction(str(folder))
+    found = {_frame_number(name): pose for name, pose in reconstruction_poses(model).items()}
     truth = {str(number): pose for number, pose in poses.items()}
-    errors = trajectory_errors(numbered, truth)
-    return {
+    errors = trajectory_errors(found, truth)
+    record: Record = {
         "registered": len(found),
         "ate": None if errors is None else errors.ate_rmse,
         "max": None if errors is None else float(errors.centers.max()),
-        "loop": None if rounds is None else measure_loop_error(numbered, truth, rounds),
+        "pair": measure_pair_error(found, truth),
     }
+    if rounds is not None:
+        points: dict[str, set[int]] = {
+            _frame_number(image.name): {
+                point.point3D_id for point in image.points2D if point.has_point3D()
+            }
+            for image in model.images.values()
+        }
+        first, last = (
+            set().union(*(points[name] for name in names))
+            for names in _keyframes_of_loop(found, len(truth), rounds)
+        )
+        record["loop"] = measure_loop_error(found, truth, rounds)
+        record["loop_points"] = len(first & last)
+    return record
+
+
+def _frame_number(name: str) -> str:
+    """Return the frame number of a keyframe from its file name."""
+    return str(int(Path(name).stem[-6:]))
+
+
+def measure_pair_error(found: Mapping[str, Pose], truth: Mapping[str, Pose]) -> float | None:
+    """Return the largest error of the relative position of two keyframes, in meters.
+
+    The model is aligned with the true poses of all keyframes.
+
+    Args:
+        found: Estimated poses ``cam_from_world`` by frame number.
+        truth: True poses by frame number.
+
+    Returns:
+        The error, or None if too few keyframes have both poses.
+    """
+    names = [name for name in found if name in truth]
+    if len(names) < 3:
+        return None
+    centers, true_centers = (
+        np.stack([camera_center(*poses[name]) for name in names]) for poses in (found, truth)
+    )
+    offsets = umeyama(centers, true_centers).apply(centers) - true_centers
+    return float(np.linalg.norm(offsets[:, None] - offsets, axis=2).max())
+
+
+def _keyframes_of_loop(
+    found: Iterable[str], num_frames: int, num_rounds: float
+) -> tuple[list[str], list[str]]:
+    """Return the keyframes at the start of the first round, and those after this round."""
+    start, end = (rounds / num_rounds * num_frames for rounds in (START_ROUNDS, 1.0))
+    names = list(found)
+    first = [name for name in names if int(name) < start]
+    return first, [name for name in names if int(name) >= end]
 
 
 def measure_loop_error(
@@ -408,9 +479,7 @@ def measure_loop_error(
     Returns:
         The error, or None if too few keyframes at the start and at the end have a pose.
     """
-    start, end = (rounds / num_rounds * len(truth) for rounds in (START_ROUNDS, 1.0))
-    first = [name for name in found if name in truth and int(name) < start]
-    last = [name for name in found if name in truth and int(name) >= end]
+    first, last = _keyframes_of_loop(found, len(truth), num_rounds)
     if len(first) < 3 or not last:
         return None
     centers, true_centers = (
@@ -422,40 +491,61 @@ def measure_loop_error(
     return float(np.median(np.linalg.norm(offsets[len(first) :], axis=1)))
 
 
-def make_table(records: Sequence[Record]) -> str:
-    """Format the results of all videos as a Markdown table with one row per video."""
-    lines = [
-        "| video | frames | keyframes | placed | ATE all | WATE-AUC 10 m, full | "
-        "keyframes in the model, ATE, maximum, loop | COLMAP | memory GB | CPU s, COLMAP | "
-        "CPU min per min |",
-        "| --- |" + " ---: |" * 10,
-    ]
-    for record in records:
-        video, found = record["video"], record.get("mpsfm")
-        keyframes, minutes = video["keyframes"], video["duration_s"] / 60
-        cells = [record["walk"], video["frames"], keyframes]
-        if found is None:
-            cells += ["0 %", *["none"] * 2]
-        else:
-            areas = found["wate_auc"]
-            cells += [
-                f"{100 * found['poses'] / video['frames']:.1f} %",
-                f"{100 * found['ate_rmse']:.1f} cm",
-                f"{areas.get('10', float('nan')):.1f}, {areas['full']:.1f}",
-            ]
-        for model in (record.get("keyframes"), record.get("colmap")):
-            values = [_centimeters((model or {}).get(name)) for name in ("ate", "max", "loop")]
-            cells += [", ".join([f"{(model or {}).get('registered', 0)} of {keyframes}", *values])]
-        cells += [f"{record['memory_mb'] / 1024:.1f}"]
-        cells += [f"{record['cpu_seconds']:.0f}, {record['colmap_cpu_seconds']:.0f}"]
-        cells += [f"{record['cpu_seconds'] / 60 / minutes:.1f}"]
-        lines.append("| " + " | ".join(map(str, cells)) + " |")
-    lines += [
-        f"{record['walk']} between true keyframes: {json.dumps(record['true_keyframes'])}"
-        for record in records
-        if "true_keyframes" in record
-    ]
-    return "\n".join(lines)
+def is_loop_closed(model: Record) -> bool:
+    """Return whether the loop of a walk is closed rightly, see the docstring of this module."""
+    limit = MAX_LOOP_ERROR_RATIO * 2 * float(ROOM.sum())
+    error = model["loop"]
+    return error is not None and error <= limit and model["loop_points"] >= MIN_LOOP_POINTS
+
+
+HEADER = (
+    """\
+| video | frames | keyframes | placed | ATE all | WATE-AUC 10 m, full | \
+keyframes in the model, ATE, maximum | worst pair | loop, points | verdict | \
+COLMAP: keyframes, ATE, maximum, loop | memory GB | CPU s, COLMAP | CPU min per min |
+| --- |"""
+    + " ---: |" * 13
+)
+
+
+def format_row(record: Record) -> str:
+    """Format the results of a video as a row of a Markdown table."""
+    video, found = record["video"], record.get("mpsfm")
+    model, colmap = record.get("keyframes") or {}, record.get("colmap") or {}
+    keyframes, minutes = video["keyframes"], video["duration_s"] / 60
+    cells = [record["walk"], video["frames"], keyframes]
+    if found is None:
+        cells += ["0 %", *["none"] * 2]
+    else:
+        areas = found["wate_auc"]
+        cells += [
+            f"{100 * found['poses'] / video['frames']:.1f} %",
+            f"{100 * found['ate_rmse']:.1f} cm",
+            f"{areas.get('10', float('nan')):.1f}, {areas['full']:.1f}",
+        ]
+    cells += [_format_model(model, keyframes, "ate", "max"), _centimeters(model.get("pair"))]
+    cells += [f"{_centimeters(model.get('loop'))}, {model.get('loop_points', 'none')}"]
+    cells += [record["verdict"], _format_model(colmap, keyframes, "ate", "max", "loop")]
+    cells += [f"{record['memory_mb'] / 1024:.1f}"]
+    cells += [f"{record['cpu_seconds']:.0f}, {record['colmap_cpu_seconds']:.0f}"]
+    cells += [f"{record['cpu_seconds'] / 60 / minutes:.1f}"]
+    return "| " + " | ".join(map(str, cells)) + " |"
+
+
+def _format_model(model: Record, keyframes: int, *errors: str) -> str:
+    """Format the number of registered keyframes of a model, and some of its errors."""
+    cells = [f"{model.get('registered', 0)} of {keyframes}"]
+    return ", ".join(cells + [_centimeters(model.get(name)) for name in errors])
+
+
+def summarize_loops(records: Sequence[Record]) -> str:
+    """Return the numbers of walks with a loop closed rightly, and with a false loop."""
+    models = [record.get("keyframes") for record in records]
+    pairs = [model["pair"] for model in models if model is not None]
+    false = sum(error is not None and error > FALSE_LOOP_ERROR for error in pairs)
+    loops = [model for record, model in zip(records, models, strict=True) if record["loop"]]
+    closed = sum(model is not None and is_loop_closed(model) for model in loops)
+    return f"loops closed rightly: {closed} of {len(loops)}; false loops: {false} of {len(records)}"
 
 
 def _centimeters(meters: float | None) -> str:
@@ -480,6 +570,7 @@ def main() -> None:
     walks += [(seed, True) for seed in range(arguments.look_alike)]
     with tempfile.TemporaryDirectory() as temporary:
         folder, records = arguments.records or Path(temporary), []
+        print(HEADER, flush=True)
         for seed, look_alike in walks:
             path = folder / f"{'look_alike' if look_alike else 'walk'}{seed}-{config}.json"
             if not path.is_file():
@@ -493,12 +584,17 @@ def main() -> None:
                     )
                 path.write_text(json.dumps(record))
             records.append(json.loads(path.read_text()))
+            print(format_row(records[-1]), flush=True)
         path = folder / f"hololens_room-{config}.json"
         if not path.is_file():
             record = run_walk(*write_room(folder), 4.0, config, settings)
             path.write_text(json.dumps(record))
-        records.append(json.loads(path.read_text()))
-    print(make_table(records))
+        print(format_row(json.loads(path.read_text())))
+    for record in records:
+        if "true_keyframes" in record:
+            between = json.dumps(record["true_keyframes"])
+            print(f"{record['walk']} between true keyframes: {between}")
+    print(summarize_loops(records))
 
 
 if __name__ == "__main__":
