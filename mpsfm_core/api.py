@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from mpsfm_core.config import Config
 from mpsfm_core.config.provider_arguments import Provider, configure
-from mpsfm_core.data import DepthPrior, Features, MappingProblem, Pose, View
+from mpsfm_core.data import DepthPrior, Features, MappingProblem, Pose
 from mpsfm_core.data.errors import InputError, did_you_mean
 from mpsfm_core.data.events import EventCallback
 from mpsfm_core.data.options import parse_settings
@@ -428,7 +428,7 @@ def densify(
     with stages.stage("dense"):
         progress = partial(stages.stage_progress, "dense")
         dense, _ = densify_reconstruction(
-            reconstruction, _ViewsByName(images), options or DenseOptions(), progress=progress
+            reconstruction, images.view_of, options or DenseOptions(), progress=progress
         )
     return dense
 
@@ -445,7 +445,7 @@ def fuse(reconstruction: Reconstruction, images: ImageSet, seed: int = 0) -> Fus
         >>> mpsfm.fuse(dense, images).points.shape
         (181534, 3)
     """
-    return fuse_depth_maps(reconstruction, _ViewsByName(images), seed=seed)
+    return fuse_depth_maps(reconstruction, images.view_of, seed=seed)
 
 
 def build_mesh(
@@ -470,7 +470,7 @@ def build_mesh(
     """
     if isinstance(options, Mapping):
         options = parse_settings(MeshOptions, options, ())
-    return mesh_depth_maps(reconstruction, _ViewsByName(images), options or MeshOptions())
+    return mesh_depth_maps(reconstruction, images.view_of, options or MeshOptions())
 
 
 def texture_mesh(
@@ -492,7 +492,7 @@ def texture_mesh(
         >>> mpsfm.texture_mesh(mesh, dense, images).texture.shape
         (3120, 4021, 3)
     """
-    return build_texture(mesh, reconstruction, _ViewsByName(images), max_size)
+    return build_texture(mesh, reconstruction, images.view_of, max_size)
 
 
 def evaluate(
@@ -536,20 +536,9 @@ def _poses(
     return read_poses(Path(model) if isinstance(model, (str, Path)) else model)
 
 
-class _ViewsByName:
-    """Function that returns the undistorted view of an image by name."""
-
-    def __init__(self, images: ImageSet) -> None:
-        self._images = images
-        self._rows = {name: row for row, name in enumerate(images.names)}
-
-    def __call__(self, name: str) -> View:
-        return self._images.view(self._rows[name])
-
-
 def _rows_of_pairs(images: ImageSet, pairs: Sequence[NamePair]) -> list[tuple[int, int]]:
     """Convert pairs of image names to sorted pairs of image indices."""
-    rows = {name: row for row, name in enumerate(images.names)}
+    rows = images.row_of
     for name in np.unique([name for pair in pairs for name in pair]):
         if name not in rows:
             raise InputError(f"pairs: {name!r} is not one of the images{did_you_mean(name, rows)}")

@@ -7,6 +7,7 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 from typing import Any
@@ -208,6 +209,15 @@ class ImageSet:
                 run.
         """
         return self._views.get(index, lambda: self._load(self.images[index]))
+
+    def view_of(self, name: str) -> View:
+        """Return the undistorted view of an image by name, see :meth:`view`."""
+        return self.view(self.row_of[name])
+
+    @cached_property
+    def row_of(self) -> Mapping[str, int]:
+        """Index of each image by name."""
+        return {image.name: row for row, image in enumerate(self.images)}
 
     def thumbnail(self, index: int) -> UInt8:
         """Return a gray thumbnail of the original image, or of the view for rare file formats."""

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import DepthPrior, Float64, Pose, View
+from mpsfm_core.data import DepthPrior, Float64, Pose
 from mpsfm_core.data.errors import InputError
 from mpsfm_core.data.result_layout import DENSE, DEPTH, MESH, SPARSE
 from mpsfm_core.dense.densify import DenseReport, densify
@@ -91,17 +91,13 @@ def _densify_model(
         raise InputError(
             f"{model}: the model has no points, from which the depth range is computed"
         )
-    view_of = _view_of(photos)
     dense, report = densify(
-        posed,
-        view_of,
-        options or DenseOptions(),
-        poses_use_depth=poses_use_depth,
+        posed, photos.view_of, options or DenseOptions(), poses_use_depth=poses_use_depth
     )
     with replace_entries(output, (SPARSE, DENSE, DEPTH)) as folder:
         write_model(folder / SPARSE, colmap)
         write_depth_maps(folder / DEPTH, dense)
-        write_cloud(folder / DENSE, fuse_depth_maps(dense, view_of))
+        write_cloud(folder / DENSE, fuse_depth_maps(dense, photos.view_of))
     return report
 
 
@@ -117,12 +113,6 @@ def _reconstruction_of_maps(
         if depth is not None
     )
     return Reconstruction(images, np.zeros((0, 3)), np.zeros(0))
-
-
-def _view_of(photos: ImageSet) -> Callable[[str], View]:
-    """Return a function that loads the undistorted view of an image by name."""
-    rows = {name: row for row, name in enumerate(photos.names)}
-    return lambda name: photos.view(rows[name])
 
 
 def _point_depths(model: pycolmap.Reconstruction, image: pycolmap.Image) -> Float64:
@@ -177,7 +167,7 @@ def mesh_model(
                 f"{folder}: the result folder has no depth maps: run mpsfm dense first"
             )
         options = options or MeshOptions()
-        view_of = _view_of(source.images)
+        view_of = source.images.view_of
         mesh = mesh_depth_maps(posed, view_of, options)
         textured = None
         if options.max_texture_size:

@@ -36,24 +36,23 @@ class OriginalImages:
 
     def __init__(self, images: ImageSet, problem: MappingProblem) -> None:
         self.problem = problem
-        self._images = images
-        self._rows = {name: row for row, name in enumerate(images.names)}
+        self.images = images
 
     def source(self, image: RegisteredImage) -> SourceImage:
         """Return the path of the original file of a registered image."""
-        return self._images[self._rows[image.name]]
+        return self.images[self.images.row_of[image.name]]
 
     def key(self, image: RegisteredImage) -> str:
         """Return the hash of the undistorted view of a registered image."""
-        return self._images.pixel_key(self._rows[image.name])
+        return self.images.pixel_key(self.images.row_of[image.name])
 
     def view(self, name: str) -> View:
         """Return the undistorted view of an image by name."""
-        return self._images.view(self._rows[name])
+        return self.images.view_of(name)
 
     def release_views(self) -> None:
         """Free the memory of the cached views, which are decoded again on demand."""
-        self._images.release_views()
+        self.images.release_views()
 
     def keypoints(self, reconstruction: Reconstruction) -> list[Float64]:
         """Return keypoints (n, 2) of each registered image in pixels of the undistorted image."""
@@ -84,7 +83,7 @@ class OriginalImages:
 
     def write_view(self, image: RegisteredImage, path: Path) -> None:
         """Write the undistorted view with :func:`export_view`."""
-        export_view(self._images, self._rows[image.name], path)
+        export_view(self.images, self.images.row_of[image.name], path)
 
 
 def exported_image_name(name: str) -> str:
