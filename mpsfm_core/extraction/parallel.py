@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, as_completed
-from contextlib import closing
 from typing import TypeVar
 
 from mpsfm_core.extraction.events import ExtractionEvents
+from mpsfm_core.extraction.executors import finish_items
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -49,9 +49,7 @@ def run_stage(
     try:
         if remote is None:
             return _run_on_threads(stage, items, work, workers, progress)
-        with closing(remote):
-            for done, _ in enumerate(remote, start=1):
-                progress(done)
+        finish_items(remote, progress)
         return _run_on_threads(stage, items, work, workers)
     finally:
         events.stage_finished(stage, time.perf_counter() - started)

@@ -6,8 +6,6 @@ machine. The worker writes results to the shared cache, from which the main proc
 
 from __future__ import annotations
 
-import socket
-import threading
 import uuid
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,12 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from mpsfm_core.config import Config, RuntimeOptions
-from mpsfm_core.data.errors import ConfigError, InputError, did_you_mean
+from mpsfm_core.config import Config
 from mpsfm_core.extraction.active_provider import thread_count
 from mpsfm_core.extraction.cache import content_key
 from mpsfm_core.extraction.context import RUNS, ExtractionContext
 from mpsfm_core.extraction.events import NullExtractionEvents
+from mpsfm_core.extraction.executors import (
+    THREADS,
+    missing_cache_error,
+    open_executor,
+    worker_state,
+)
 from mpsfm_core.extraction.features import NO_FEATURES, FeatureTable
 from mpsfm_core.extraction.matching.keypoint_adjustment import KeypointAdjuster
 from mpsfm_core.extraction.matching.pair_matching import (
@@ -34,11 +37,8 @@ from mpsfm_core.extraction.priors.multiview import GroupPriors
 from mpsfm_core.extraction.priors.prior_predictor import PriorPredictor
 from mpsfm_core.inputs.images import ImageSet
 from mpsfm_core.providers import Executor
-from mpsfm_core.providers.first_party import EXECUTORS
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.support.threads import limit_threads
-
-THREADS = "threads"
 
 
 @contextmanager
@@ -48,34 +48,10 @@ def use_executor(context: ExtractionContext) -> Iterator[None]:
     Raises:
         ConfigError: no plugin provides the executor, or its workers are unavailable.
     """
-    executor = create_executor(context.config.runtime, context.registry)
-    if executor is None:
+    with open_executor(context.config.runtime, context.registry) as executor:
+        if executor is not None:
+            context.run_remotely = _RemoteStages(context, executor)
         yield
-        return
-    context.run_remotely = _RemoteStages(context, executor)
-    try:
-        yield
-    finally:
-        executor.close()
-
-
-def create_executor(runtime: RuntimeOptions, registry: Registry) -> Executor | None:
-    """Create the configured executor, or return None if all work runs on threads.
-
-    Raises:
-        ConfigError: no plugin provides the executor, or its workers are unavailable.
-    """
-    name, options = runtime.executor, runtime.executor_options
-    if name == THREADS:
-        return None
-    created: Executor | None = registry.hook.mpsfm_executor(name=name, options=options)
-    if created is None:
-        known = (THREADS, *EXECUTORS)
-        hint = (
-            f": pip install {EXECUTORS[name]}" if name in EXECUTORS else did_you_mean(name, known)
-        )
-        raise ConfigError(f"runtime.executor: no plugin provides {name!r}{hint}")
-    return created
 
 
 class _RemoteStages:
@@ -107,7 +83,8 @@ class RemoteStep:
     def __call__(self, item: Any) -> None:
         """Process an item and write the result to the shared cache."""
         with limit_threads(thread_count(self.config.runtime)):
-            _worker_state(self).work[self.stage](item)
+            state = worker_state(self.run, lambda: _WorkerState(self))
+            state.work[self.stage](item)
 
 
 class _WorkerState:
@@ -120,11 +97,7 @@ class _WorkerState:
         )
         context.shared_run = step.run
         if context.cache.load(RUNS, content_key(step.run), np.ndarray) is None:
-            raise InputError(
-                f"the worker on {socket.gethostname()} does not see the cache "
-                f"{context.cache.folder} of this run: set runtime.cache_dir to a folder that all "
-                "machines share"
-            )
+            raise missing_cache_error(context.cache.folder)
         context.load_masks()
         table = None if config.features is None else FeatureTable(context, config.features)
         matcher = PairMatcher(context, table)
@@ -143,16 +116,3 @@ class _WorkerState:
             self.work["multiview"] = GroupPriors(context).predict
         if table is not None:
             self.work["features"] = table.__getitem__
-
-
-_LOCK = threading.Lock()
-_WORKER_STATES: dict[str, _WorkerState] = {}
-
-
-def _worker_state(step: RemoteStep) -> _WorkerState:
-    """Return the worker state of a run; states of earlier runs are dropped."""
-    with _LOCK:
-        if step.run not in _WORKER_STATES:
-            _WORKER_STATES.clear()
-            _WORKER_STATES[step.run] = _WorkerState(step)
-        return _WORKER_STATES[step.run]

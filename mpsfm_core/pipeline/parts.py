@@ -12,32 +12,26 @@ import os
 import socket
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
-
-import numpy as np
 
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data import MappingProblem
-from mpsfm_core.data.errors import InputError, OutputError
 from mpsfm_core.extraction.active_provider import thread_count
 from mpsfm_core.extraction.cache import cache_folder, digest
-from mpsfm_core.extraction.remote_execution import THREADS, create_executor
+from mpsfm_core.extraction.executors import THREADS, finish_items, open_executor
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.problem_state import problem_from_state, problem_to_state
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, compute_depth_maps
-from mpsfm_core.mapping.state import flatten_state, unflatten_state
 from mpsfm_core.pipeline.checkpoints import MappingCheckpoints
 from mpsfm_core.pipeline.stages import Stages, peak_memory_mb, reset_peak_memory
-from mpsfm_core.providers import Executor
+from mpsfm_core.pipeline.task_inputs import TaskInputs
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.support.disk_arrays import store_on_disk
 from mpsfm_core.support.files import write_file
 from mpsfm_core.support.memory import release_free_memory
-from mpsfm_core.support.npz import read_npz
 from mpsfm_core.support.threads import limit_threads
 
 MAX_WHOLE_IMAGES = 2000
@@ -98,10 +92,9 @@ class PartMapper:
         if self._fresh:
             self.forget()
         with self._stages.step(_STEP, len(parts)):
-            executor = create_executor(runtime, self._registry)
-            if executor is not None:
-                self._map_remotely(executor, step, parts)
-            stores = executor is not None or runtime.checkpoint_s is not None
+            self._map_remotely(step, parts)
+            is_remote = runtime.executor != THREADS
+            stores = is_remote or runtime.checkpoint_s is not None
             results, self.records = [], []
             for done, part in enumerate(parts, start=1):
                 with measure_part(part.problem) as measured:
@@ -109,7 +102,7 @@ class PartMapper:
                 models = compute_depth_maps(result.reconstructions)
                 results.append(replace(result, reconstructions=models))
                 self.records.append(step.read_record(part.key) or measured[0])
-                if executor is None:
+                if not is_remote:
                     self._stages.stage_progress(_STEP, done, len(parts))
         return results
 
@@ -118,18 +111,17 @@ class PartMapper:
         for part in self._stored:
             part.forget()
 
-    def _map_remotely(
-        self, executor: Executor, step: MapPart, parts: Sequence[_StoredPart]
-    ) -> None:
-        """Map the parts on the workers of an executor, which store their results."""
-        try:
+    def _map_remotely(self, step: MapPart, parts: Sequence[_StoredPart]) -> None:
+        """Map the parts on the workers of the executor, if any, which store their results."""
+        with open_executor(self._runtime, self._registry) as executor:
+            if executor is None:
+                return
             for part in parts:
                 part.store()
-            with closing(executor.run(step, [part.key for part in parts])) as run:
-                for done, _ in enumerate(run, start=1):
-                    self._stages.stage_progress(_STEP, done, len(parts))
-        finally:
-            executor.close()
+            finish_items(
+                executor.run(step, [part.key for part in parts]),
+                lambda done: self._stages.stage_progress(_STEP, done, len(parts)),
+            )
 
 
 @dataclass(frozen=True)
@@ -175,17 +167,9 @@ class MapPart:
 
     def __call__(self, key: str) -> None:
         """Map the part whose mapping problem is stored under a key."""
-        try:
-            arrays = read_npz(self.file(key))
-        except FileNotFoundError as error:
-            raise InputError(
-                f"the worker on {socket.gethostname()} does not see the cache {self.cache} of this "
-                "run: set runtime.cache_dir to a folder that all machines share"
-            ) from error
         reset_peak_memory()
         with limit_threads(self.threads), store_on_disk(self.cache):
-            problem = problem_from_state(unflatten_state(arrays))
-            del arrays  # the prior maps are on disk
+            problem = problem_from_state(self.inputs.load(key))
             with measure_part(problem) as records:
                 self.map(problem)
         release_free_memory()
@@ -213,13 +197,14 @@ class MapPart:
         quiet = Stages(Registry())
         return MappingCheckpoints(self.cache, problem, self.options, quiet, self.every_s)
 
-    def file(self, key: str) -> Path:
-        """Return the file of the mapping problem with a key."""
-        return self.cache / "mapping" / "parts" / f"{key}.npz"
+    @property
+    def inputs(self) -> TaskInputs:
+        """Mapping problems of the parts in the cache folder."""
+        return TaskInputs(self.cache, _STEP)
 
     def record_file(self, key: str) -> Path:
         """Return the file of time and memory of the mapping problem with a key."""
-        return self.file(key).with_suffix(".json")
+        return self.inputs.path(key).with_suffix(".json")
 
 
 class _StoredPart:
@@ -227,7 +212,7 @@ class _StoredPart:
 
     def __init__(self, step: MapPart, problem: MappingProblem) -> None:
         self.problem, self.key = problem, digest(problem)
-        self._file, self._record_file = step.file(self.key), step.record_file(self.key)
+        self._inputs, self._record_file = step.inputs, step.record_file(self.key)
         self._checkpoints = step.checkpoints(problem)
 
     def store(self) -> None:
@@ -236,16 +221,10 @@ class _StoredPart:
         Raises:
             OutputError: the file cannot be written.
         """
-        arrays = cast(Any, flatten_state(problem_to_state(self.problem)))
-        try:
-            write_file(self._file, lambda file: np.savez(file, **arrays))
-        except OSError as error:
-            raise OutputError(
-                f"cannot write {self._file}: {error}; free disk space or set runtime.cache_dir"
-            ) from error
+        self._inputs.store(self.key, problem_to_state(self.problem))
 
     def forget(self) -> None:
         """Delete mapping problem, checkpoint and record."""
         self._checkpoints.forget()
-        for path in (self._file, self._record_file):
-            path.unlink(missing_ok=True)
+        self._inputs.forget(self.key)
+        self._record_file.unlink(missing_ok=True)
