@@ -112,6 +112,11 @@ class StereoCheckpoints(Protocol):
         """Store the stereo depth of an image; several threads may call this method."""
 
 
+MatchImages = Callable[[Mapping[str, Sequence[str]]], None]
+"""Function that computes and stores the stereo depth of images, with the names of the source images
+by image name."""
+
+
 def densify(
     reconstruction: Reconstruction,
     view_of: Callable[[str], View],
@@ -119,6 +124,7 @@ def densify(
     workers: int | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     checkpoints: StereoCheckpoints | None = None,
+    match_remotely: MatchImages | None = None,
     poses_use_depth: bool = True,
 ) -> tuple[Reconstruction, DenseReport]:
     """Refine the depth maps of a reconstruction by multi-view stereo.
@@ -135,6 +141,8 @@ def densify(
         progress: Callback that receives the number of finished images and the number of all images.
         checkpoints: Storage of stereo depth, so that an interrupted run can resume (None stores
             nothing).
+        match_remotely: Function that runs stereo in other processes, reports progress, and stores
+            the stereo depth that ``checkpoints`` then loads (None runs stereo in threads).
         poses_use_depth: True if depth priors constrained the poses. With depth priors, the scale of
             an image pair may depend on the priors alone, so a scale variance is added to the depth
             variance.
@@ -146,10 +154,14 @@ def densify(
     images = reconstruction.dense_images
     steps = _DensifySteps(images, view_of, options, checkpoints, poses_use_depth)
     rows = [row for row, views in enumerate(steps.sources) if views]
+    sources = {image.name: steps.source_names(row) for row, image in enumerate(images)}
+    if match_remotely is not None:
+        match_remotely({name: views for name, views in sources.items() if views})
     with ThreadPoolExecutor(workers or thread_limit()) as pool:
         for row, image in zip(rows, pool.map(steps.match_image, rows), strict=True):
             steps.matched[row] = image
-            progress(len(steps.matched), len(rows))
+            if match_remotely is None:
+                progress(len(steps.matched), len(rows))
         checks = dict(zip(rows, pool.map(steps.check_image, rows), strict=True))
         steps.consistency.update({row: result for row, (result, _) in checks.items()})
         constraints = {row: known for row, (_, known) in checks.items() if known}
@@ -157,10 +169,9 @@ def densify(
         dense_images, measured_masks = {}, {}
         for dense_image, mask in pool.map(steps.fuse_image, rows):
             dense_images[dense_image.name], measured_masks[dense_image.name] = dense_image, mask
-    names = [image.name for image in images]
     report = DenseReport(
-        {names[row]: [names[view] for view in views] for row, views in enumerate(steps.sources)},
-        {name: _confirmed_ratio(steps.consistency.get(row)) for row, name in enumerate(names)},
+        sources,
+        {name: _confirmed_ratio(steps.consistency.get(row)) for row, name in enumerate(sources)},
         measured_masks,
     )
     all_images = (dense_images.get(image.name, image) for image in reconstruction.images)
@@ -187,17 +198,23 @@ class _DensifySteps:
         self._neighbors = select_source_views(images, max(_NUM_SOURCES, _MAX_SPLAT_VIEWS))
         self.sources = [views[:_NUM_SOURCES] for views in self._neighbors]
         self._compared_views = _symmetric_neighbors(self.sources)
-        self._views = _ViewCache(images, view_of, options)
+        self._views = DenseViewCache(
+            {image.name: image for image in images}.__getitem__, view_of, options
+        )
         self.matched: dict[int, _MatchedImage] = {}
         self.consistency: dict[int, GeometricConsistency] = {}
         self.scale_stds: dict[int, float] = {}
 
+    def source_names(self, row: int) -> list[str]:
+        """Return the names of the source images of an image."""
+        return [self._images[source].name for source in self.sources[row]]
+
     def match_image(self, row: int) -> _MatchedImage:
         """Compute or load the stereo depth of an image."""
-        view, name = self._views[row], self._images[row].name
+        view, name = self._view(row), self._images[row].name
         stereo = self._checkpoints.load(name) if self._checkpoints else None
         if stereo is None:
-            stereo = match_stereo_depth(view, [self._views[j] for j in self.sources[row]])
+            stereo = self._views.match(name, self.source_names(row))
             if self._checkpoints:
                 self._checkpoints.save(name, stereo)
         supported = view.usable & (stereo.cost < _MAX_COST)
@@ -212,7 +229,7 @@ class _DensifySteps:
         differences = _compare_with_views(row, self.matched, self._compared_views[row])
         patches = {
             source: measure_patch_offsets(
-                self._views[row], image.log_depth, self._views[source], difference.agree
+                self._view(row), image.log_depth, self._view(source), difference.agree
             )
             for source, difference in differences.items()
         }
@@ -222,9 +239,9 @@ class _DensifySteps:
             if not difference.is_coincidental(patches[source].matched_ratio)
         }
         pose_std_px = estimate_pose_error_px(patches[source] for source in consistent)
-        view = self._views[row]
+        view = self._view(row)
         parallax = (
-            resize_map(measure_parallax(view, [self._views[source]]), *view.camera.size)
+            resize_map(measure_parallax(view, [self._view(source)]), *view.camera.size)
             for source in consistent
         )
         differences_and_parallax = zip(consistent.values(), parallax, strict=True)
@@ -243,7 +260,7 @@ class _DensifySteps:
         moving object, or is occluded. The std of its depth is then unknown, and the pixel
         contributes to no cloud or mesh.
         """
-        view = self._views[row]
+        view = self._view(row)
         known = LogDepthMap(view.log_depth, view.log_std)
         stereo = _merge_stereo_depth(
             row, view, self.matched, self.consistency, self._neighbors[row]
@@ -257,29 +274,43 @@ class _DensifySteps:
         image = _replace_depth(self._images[row], view, posterior, scale_std, self._store_array)
         return image, self._store_array(measured.known)
 
+    def _view(self, row: int) -> DenseView:
+        return self._views[self._images[row].name]
+
 
 def _confirmed_ratio(consistency: GeometricConsistency | None) -> float:
     return 0.0 if consistency is None else float(consistency.confirmed.mean())
 
 
-class _ViewCache:
-    """Cache of views at stereo resolution, which are loaded on demand."""
+class DenseViewCache:
+    """Cache of views at stereo resolution, which are loaded on demand by image name.
+
+    Args:
+        image_of: Function that returns a registered image with its refined depth map.
+        view_of: Function that returns the undistorted view of an image.
+        options: Options of multi-view stereo.
+    """
 
     def __init__(
         self,
-        images: Sequence[RegisteredImage],
+        image_of: Callable[[str], RegisteredImage],
         view_of: Callable[[str], View],
         options: DenseOptions,
     ) -> None:
-        self._images, self._view_of, self._options = images, view_of, options
+        self._image_of, self._view_of, self._options = image_of, view_of, options
         self._cached_load = lru_cache(_NUM_CACHED_NEIGHBORHOODS * (1 + _NUM_SOURCES))(self._load)
 
-    def __getitem__(self, row: int) -> DenseView:
-        return self._cached_load(row)
+    def __getitem__(self, name: str) -> DenseView:
+        return self._cached_load(name)
 
-    def _load(self, row: int) -> DenseView:
-        image = self._images[row]
-        return DenseView.from_view(image, self._view_of(image.name), self._options.max_size)
+    def match(self, name: str, sources: Sequence[str]) -> StereoDepth:
+        """Estimate the stereo depth of an image from its source images."""
+        return match_stereo_depth(self[name], [self[source] for source in sources])
+
+    def _load(self, name: str) -> DenseView:
+        return DenseView.from_view(
+            self._image_of(name), self._view_of(name), self._options.max_size
+        )
 
 
 class _MatchedImage(NamedTuple):

@@ -46,6 +46,8 @@ _MAX_SAVING_RATIO = 0.02
 _MAX_AGE_S = 30 * 24 * 3600.0
 """Age above which unused checkpoints are deleted, in seconds (30 days)."""
 _DISK_ERROR = "no checkpoints from now on: %s"
+_WARNING_LOCK = Lock()
+"""Lock of the warning about a disk error, because several threads store depth maps."""
 _LIBRARIES = ("numpy", "scipy", "numba", "pycolmap", "cv2")
 _NUMERICS = (
     "data",
@@ -210,15 +212,15 @@ class DenseCheckpoints:
         image_keys: Sequence[str],
         options: DenseOptions,
     ) -> None:
-        self._cache = Cache(cache_dir)
+        self.cache = cache_folder(cache_dir)
+        self._cache = Cache(self.cache)
         self._reconstruction_key = content_key(
-            code_key(),
             digest(reconstruction),
             list(image_keys),
             options.model_dump(mode="json"),
         )
         self._names = [image.name for image in reconstruction.images]
-        self._failed, self._warning_lock = False, Lock()
+        self._failed = False
 
     def load(self, name: str) -> StereoDepth | None:
         """Load the stereo depth map of an image, or None if no map is stored."""
@@ -229,12 +231,20 @@ class DenseCheckpoints:
         if self._failed:
             return
         try:
-            self._cache.store("dense", self._key(name), depth)
+            self.store(name, depth)
         except OutputError as error:
-            with self._warning_lock:  # Several threads store depth maps.
+            with _WARNING_LOCK:
                 if not self._failed:
                     _log.warning(_DISK_ERROR, error)
                 self._failed = True
+
+    def store(self, name: str, depth: StereoDepth) -> None:
+        """Store the stereo depth of an image.
+
+        Raises:
+            OutputError: the checkpoint cannot be written.
+        """
+        self._cache.store("dense", self._key(name), depth)
 
     def forget(self) -> None:
         """Delete the stored stereo depth of all images."""
@@ -242,6 +252,11 @@ class DenseCheckpoints:
             self._cache.forget("dense", self._key(name))
 
     def _key(self, name: str) -> str:
+        # Workers with other code compute another key, so that their results are not used.
+        return content_key(code_key(), self.input_key(name))
+
+    def input_key(self, name: str) -> str:
+        """Return the hash of all inputs of the stereo depth of an image, without the code."""
         return content_key(self._reconstruction_key, name)
 
 

@@ -23,6 +23,7 @@ from mpsfm_core.data.result_layout import SUMMARY
 from mpsfm_core.dense.densify import densify
 from mpsfm_core.extraction.active_provider import thread_count, worker_count
 from mpsfm_core.extraction.cache import cache_folder
+from mpsfm_core.extraction.executors import THREADS, open_executor
 from mpsfm_core.extraction.priors.focal_length import estimate_focal_lengths
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import ImageSet
@@ -40,6 +41,7 @@ from mpsfm_core.pipeline.input_reader import InputReader, Source
 from mpsfm_core.pipeline.mapping_passes import MappingPasses
 from mpsfm_core.pipeline.parts import PartRecord
 from mpsfm_core.pipeline.provider_resolution import ProviderResolution, resolve_providers
+from mpsfm_core.pipeline.remote_stereo import MatchStereo, RemoteStereo
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.pipeline.trajectory import localize_frames
 from mpsfm_core.providers.provider_config import FROM_MATCHER
@@ -387,15 +389,25 @@ class _Run:
         if not config.dense.enabled:
             return mapping
         dense_parts, self._dense_reports = [], []
-        with self._stages.stage("dense"):
+        progress = partial(self._stages.stage_progress, "dense")
+        with (
+            self._stages.stage("dense"),
+            open_executor(config.runtime, self._registry) as executor,
+        ):
             for part in mapping.reconstructions:
+                checkpoints, remote = self._dense_checkpoints(part, originals), None
+                if executor is not None and checkpoints is not None:
+                    threads = thread_count(config.runtime)
+                    step = MatchStereo(originals.images, config.dense, checkpoints, threads)
+                    remote = RemoteStereo(executor, part, step, progress)
                 dense, report = densify(
                     part,
                     originals.view,
                     config.dense,
                     config.runtime.workers,
-                    partial(self._stages.stage_progress, "dense"),
-                    self._dense_checkpoints(part, originals),
+                    progress,
+                    checkpoints,
+                    remote,
                     poses_use_depth=not _has_poses(part, self._inputs.known_poses),
                 )
                 dense_parts.append(dense)
@@ -604,7 +616,7 @@ class _Run:
         self, part: Reconstruction, originals: OriginalImages
     ) -> DenseCheckpoints | None:
         config = self._config
-        if config.runtime.checkpoint_s is None:
+        if config.runtime.checkpoint_s is None and config.runtime.executor == THREADS:
             return None
         keys = [originals.key(image) for image in part.images]
         checkpoints = DenseCheckpoints(config.runtime.cache_dir, part, keys, config.dense)
