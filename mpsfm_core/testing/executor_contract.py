@@ -8,7 +8,7 @@ import shutil
 import signal
 import socket
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,18 +19,24 @@ import cv2
 from mpsfm_core.config import Config, RuntimeOptions
 from mpsfm_core.data import PinholeCamera
 from mpsfm_core.data.errors import ConfigError, DataError, ProviderRunError
+from mpsfm_core.dense.densify import densify
+from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.events import NullExtractionEvents
+from mpsfm_core.extraction.executors import open_executor
 from mpsfm_core.extraction.runner import Extraction, extract
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts import part_mapping
+from mpsfm_core.pipeline.checkpoints import DenseCheckpoints
 from mpsfm_core.pipeline.parts import PartMapper
+from mpsfm_core.pipeline.remote_stereo import MatchStereo, RemoteStereo
 from mpsfm_core.pipeline.stages import Stages
 from mpsfm_core.providers import Executor
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.testing.contract_case import describe_difference
+from mpsfm_core.testing.posed_room import make_posed_room
 from mpsfm_core.testing.synthetic.halls import make_hall_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
@@ -55,13 +61,44 @@ class _KillFirstWorker(_WriteMarker):
 
     def __call__(self, item: int) -> None:
         if item == 3:
-            try:
-                (self.folder / "lost").mkdir()
-            except FileExistsError:
-                pass
-            else:
-                os.kill(os.getpid(), signal.SIGKILL)
+            _kill_once(self.folder)
         super().__call__(item)
+
+
+@dataclass(frozen=True)
+class _KillingExecutor:
+    """Executor whose workers run a step on an image, except that the first worker is killed."""
+
+    executor: Executor
+    folder: Path
+
+    def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
+        return self.executor.run(_KillFirstImage(self.folder, step), items)
+
+    def close(self) -> None:
+        self.executor.close()
+
+
+@dataclass(frozen=True)
+class _KillFirstImage:
+    """Test step that kills the worker process of the first image, and records the others."""
+
+    folder: Path
+    step: Callable[[Any], None]
+
+    def __call__(self, item: tuple[str, Sequence[str]]) -> None:
+        _kill_once(self.folder)
+        self.step(item)
+        (self.folder / f"{item[0]}-{os.getpid()}").touch()
+
+
+def _kill_once(folder: Path) -> None:
+    """Kill this process, unless another process has been killed with the same folder."""
+    try:
+        (folder / "lost").mkdir()
+    except FileExistsError:
+        return
+    os.kill(os.getpid(), signal.SIGKILL)
 
 
 class _KillFirstPartWorker(Stages):
@@ -157,6 +194,54 @@ def check_mapping_in_parts(
     assert actual == expected, "mapping on the executor gives another result"
     remaining = [path for path in folder.rglob("*") if path.is_file()]
     assert not remaining, f"files of parts remain: {remaining}"
+
+
+def check_dense_stage(name: str, options: dict[str, Any], folder: Path) -> None:
+    """Require that dense depth maps are bitwise equal on the executor and in this process.
+
+    Ctrl-C interrupts a first run, and a worker of the second run is killed.
+
+    Args:
+        name: Value of ``runtime.executor``.
+        options: Value of ``runtime.executor_options``.
+        folder: Folder that the check creates and that the workers can access.
+    """
+    room, dense, cache = make_posed_room(6), DenseOptions(), folder / "cache"
+    images, model = room.write_images(folder / "photos"), room.reconstruction
+    checkpoints = DenseCheckpoints(cache, model, [image.digest for image in images], dense)
+    step = MatchStereo(images, dense, checkpoints, threads=1)
+    local, _ = densify(model, images.view_of, dense)
+    runtime = RuntimeOptions(executor=name, executor_options=options)
+    finished: list[tuple[int, int]] = []
+    with open_executor(runtime, Registry.discover()) as executor:
+        assert executor is not None
+        interrupted = RemoteStereo(
+            executor, model, step, lambda done, total: signal.raise_signal(signal.SIGINT)
+        )
+        try:
+            with _enable_keyboard_interrupt():
+                densify(model, images.view_of, dense, match_remotely=interrupted)
+        except KeyboardInterrupt:
+            pass
+        else:
+            raise AssertionError("Ctrl-C did not end the dense stage")
+        killing = _KillingExecutor(executor, folder)
+        remote = RemoteStereo(
+            killing, model, step, lambda done, total: finished.append((done, total))
+        )
+        actual, _ = densify(
+            model, images.view_of, dense, checkpoints=checkpoints, match_remotely=remote
+        )
+    total = len(model.images)
+    assert finished == [(done, total) for done in range(1, total + 1)]
+    assert (folder / "lost").exists(), "no worker was killed"
+    recorded = [path.name.rpartition("-") for path in folder.glob("*.png-*")]
+    assert {image for image, _, _ in recorded} == set(images.names)
+    assert str(os.getpid()) not in {process for _, _, process in recorded}
+    assert digest(actual) == digest(local), "the executor gives other depth maps"
+    checkpoints.forget()
+    remaining = [path for path in cache.rglob("*") if path.is_file()]
+    assert not remaining, f"files of the dense stage remain: {remaining}"
 
 
 def check_extraction(name: str, options: dict[str, Any], folder: Path) -> None:

@@ -22,8 +22,7 @@ from mpsfm_core.results.colmap_model import build_model, write_model
 from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.held_out import compare_rendering, evaluate_held_out
 from mpsfm_core.results.ply import read_ply, write_ply
-
-from .conftest import CAMERA, Room
+from mpsfm_core.testing.posed_room import CAMERA, PosedRoom
 
 IDENTITY = (np.eye(3), np.zeros(3))
 NO_TRIANGLES = np.zeros((0, 3), np.int64)
@@ -146,7 +145,7 @@ def test_comparison_measures_coverage_and_depth() -> None:
 
 
 @pytest.fixture(scope="module")
-def result_folder(room: Room, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def result_folder(room: PosedRoom, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a result folder with a cloud of true depth from all images but the held-out one."""
     folder = tmp_path_factory.mktemp("result")
     model = hold_out(MappingResult((room.reconstruction,), MappingReport()), 4).reconstructions[0]
@@ -173,7 +172,7 @@ def result_folder(room: Room, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_command_renders_recorded_held_out_photos(result_folder: Path, room: Room) -> None:
+def test_command_renders_recorded_held_out_photos(result_folder: Path, room: PosedRoom) -> None:
     output = CliRunner().invoke(build_app(), ["evaluate", str(result_folder), "--held-out"])
     assert output.exit_code == 0, output.output
     report = json.loads(output.stdout)["held_out"]

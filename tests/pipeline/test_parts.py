@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import pickle
 import signal
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from mpsfm_core import hookimpl
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data import MappingProblem
 from mpsfm_core.data.errors import InputError
@@ -30,6 +27,7 @@ from mpsfm_core.support.npz import read_npz
 from mpsfm_core.testing.synthetic.halls import make_hall_problem
 from mpsfm_core.testing.synthetic.rigs import make_rig_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
+from tests.support.backwards_executor import Backwards
 
 OPTIONS = MapperOptions(parts=20)
 
@@ -51,25 +49,6 @@ class Progress(Stages):
         self.done.append((done, total))
         if done == self._last:
             raise Killed
-
-
-class Backwards:
-    """Executor that runs a pickled step on the last item first, like other processes."""
-
-    def __init__(self) -> None:
-        self.closed = False
-
-    def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
-        for item in reversed(items):
-            pickle.loads(pickle.dumps(step))(item)
-            yield
-
-    def close(self) -> None:
-        self.closed = True
-
-    @hookimpl
-    def mpsfm_executor(self, name: str, options: Mapping[str, Any]) -> Backwards | None:
-        return self if name == "backwards" else None
 
 
 @pytest.fixture(scope="module")

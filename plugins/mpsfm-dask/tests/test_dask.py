@@ -51,6 +51,11 @@ def test_mapping_in_parts_with_a_killed_worker(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_dense_stage(tmp_path: Path) -> None:
+    executor_contract.check_dense_stage("dask", {"workers": 2}, tmp_path)
+
+
+@pytest.mark.slow
 def test_a_failing_provider(tmp_path: Path) -> None:
     executor_contract.check_failing_provider("dask", {"workers": 2}, tmp_path)
 

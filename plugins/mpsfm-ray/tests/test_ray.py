@@ -51,6 +51,11 @@ def test_mapping_in_parts_with_a_killed_worker(tmp_path: Path) -> None:
     executor_contract.check_mapping_in_parts("ray", options, tmp_path, kills_worker=True)
 
 
+@pytest.mark.slow  # starts a cluster
+def test_dense_stage(tmp_path: Path) -> None:
+    executor_contract.check_dense_stage("ray", {"workers": 2}, tmp_path)
+
+
 @pytest.mark.slow  # starts clusters
 def test_a_failing_provider(tmp_path: Path) -> None:
     executor_contract.check_failing_provider("ray", {"workers": 2}, tmp_path)
