@@ -51,8 +51,8 @@ class RuntimeOptions(Options):
     """Folder of network weights, extraction results and checkpoints, by default the platform's
     cache folder."""
     executor: str = "threads"
-    """Executor that runs the providers, either in ``threads`` of this process or in the workers of
-    a plugin (``dask``, ``ray``), which share ``cache_dir`` and the images."""
+    """Executor of providers, mapping in parts and stereo, either ``threads`` of this process or the
+    workers of a plugin (``dask``, ``ray``), which share ``cache_dir`` and the images."""
     executor_options: dict[str, Any] = expert({})
     """Options of the executor plugin, such as ``address`` of a Dask scheduler."""
     on_error: Literal["fail", "skip"] = "fail"

@@ -154,9 +154,8 @@ def densify(
     images = reconstruction.dense_images
     steps = _DensifySteps(images, view_of, options, checkpoints, poses_use_depth)
     rows = [row for row, views in enumerate(steps.sources) if views]
-    sources = {image.name: steps.source_names(row) for row, image in enumerate(images)}
     if match_remotely is not None:
-        match_remotely({name: views for name, views in sources.items() if views})
+        match_remotely({name: views for name, views in steps.source_names.items() if views})
     with ThreadPoolExecutor(workers or thread_limit()) as pool:
         for row, image in zip(rows, pool.map(steps.match_image, rows), strict=True):
             steps.matched[row] = image
@@ -169,13 +168,8 @@ def densify(
         dense_images, measured_masks = {}, {}
         for dense_image, mask in pool.map(steps.fuse_image, rows):
             dense_images[dense_image.name], measured_masks[dense_image.name] = dense_image, mask
-    report = DenseReport(
-        sources,
-        {name: _confirmed_ratio(steps.consistency.get(row)) for row, name in enumerate(sources)},
-        measured_masks,
-    )
     all_images = (dense_images.get(image.name, image) for image in reconstruction.images)
-    return replace(reconstruction, images=tuple(all_images)), report
+    return replace(reconstruction, images=tuple(all_images)), steps.report(measured_masks)
 
 
 class _DensifySteps:
@@ -197,6 +191,10 @@ class _DensifySteps:
         self._store_array, self._poses_use_depth = current_store(), poses_use_depth
         self._neighbors = select_source_views(images, max(_NUM_SOURCES, _MAX_SPLAT_VIEWS))
         self.sources = [views[:_NUM_SOURCES] for views in self._neighbors]
+        self.source_names = {
+            image.name: [images[view].name for view in views]
+            for image, views in zip(images, self.sources, strict=True)
+        }
         self._compared_views = _symmetric_neighbors(self.sources)
         self._views = DenseViewCache(
             {image.name: image for image in images}.__getitem__, view_of, options
@@ -205,16 +203,12 @@ class _DensifySteps:
         self.consistency: dict[int, GeometricConsistency] = {}
         self.scale_stds: dict[int, float] = {}
 
-    def source_names(self, row: int) -> list[str]:
-        """Return the names of the source images of an image."""
-        return [self._images[source].name for source in self.sources[row]]
-
     def match_image(self, row: int) -> _MatchedImage:
         """Compute or load the stereo depth of an image."""
         view, name = self._view(row), self._images[row].name
         stereo = self._checkpoints.load(name) if self._checkpoints else None
         if stereo is None:
-            stereo = self._views.match(name, self.source_names(row))
+            stereo = self._views.match(name, self.source_names[name])
             if self._checkpoints:
                 self._checkpoints.save(name, stereo)
         supported = view.usable & (stereo.cost < _MAX_COST)
@@ -273,6 +267,14 @@ class _DensifySteps:
         scale_std = self.scale_stds.get(row, 0.0)
         image = _replace_depth(self._images[row], view, posterior, scale_std, self._store_array)
         return image, self._store_array(measured.known)
+
+    def report(self, measured: dict[str, Bool]) -> DenseReport:
+        """Return the report of all images, with the masks of pixels with stereo depth."""
+        confirmed = {
+            image.name: _confirmed_ratio(self.consistency.get(row))
+            for row, image in enumerate(self._images)
+        }
+        return DenseReport(self.source_names, confirmed, measured)
 
     def _view(self, row: int) -> DenseView:
         return self._views[self._images[row].name]

@@ -88,7 +88,7 @@ class ProviderContext:
 
 
 class Executor(Protocol):
-    """Executor that runs extraction and mapping in other processes or on other machines."""
+    """Executor that runs extraction, mapping and stereo in other processes or on other machines."""
 
     def run(self, step: Callable[[Any], None], items: Sequence[Any]) -> Generator[None, None, None]:
         """Call ``step(item)`` for each item on one of the workers.
