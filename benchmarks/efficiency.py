@@ -52,7 +52,7 @@ STEPS: Mapping[str, Step] = MappingProxyType(
             ("refinement.py", "integrate"), paper=(9.19, 34.1, 81.33, 472.54)
         ),
         "of which point covariances": _step(
-            ("refinement.py", "_covariances"), paper=(2.26, 11.06, 19.94, 153.8)
+            ("refinement.py", "_measure_points"), paper=(2.26, 11.06, 19.94, 153.8)
         ),
         "depth check": _step(
             ("maintenance.py", "_find_conflicts"),

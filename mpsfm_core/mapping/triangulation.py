@@ -194,13 +194,17 @@ def _merge_disjoint_pairs(
     candidates = np.stack(np.divmod(keys, max(num_points, 1)), axis=1)
     if not len(candidates):
         return False
-    lengths = tracks.lengths()
-    weights = lengths[candidates].astype(np.float64)
+    points, rows_of_candidates = np.unique(candidates, return_inverse=True)
+    rows_of_candidates = rows_of_candidates.reshape(candidates.shape)
+    observations, observed_rows = tracks.observations_of(points)
+    lengths = np.bincount(observed_rows, minlength=len(points))
+    weights = lengths[rows_of_candidates].astype(np.float64)
     mean = (tracks.xyz[candidates] * weights[..., None]).sum(axis=1)
     mean /= weights.sum(axis=1, keepdims=True)
-    observations = tracks.observations()
-    first = np.searchsorted(tracks.point_of[observations], np.arange(len(tracks.xyz)))
-    rows, members = _expand_ranges(first[candidates.ravel()], lengths[candidates.ravel()])
+    first = np.cumsum(lengths) - lengths
+    rows, members = _expand_ranges(
+        first[rows_of_candidates.ravel()], lengths[rows_of_candidates.ravel()]
+    )
     candidate, keypoints = rows // 2, observations[members]
     errors_px, _ = scene.project(keypoints, mean[candidate])
     limit_px = options.max_error_px * scene.keypoint_std_px[graph.image_of[keypoints]]
@@ -214,10 +218,8 @@ def _merge_disjoint_pairs(
     is_disjoint = is_first.reshape(-1, 2).all(axis=1)
     remaining, merged = candidates[is_disjoint].T
     tracks.xyz[remaining] = mean[is_disjoint]
-    new_point = np.arange(len(tracks.xyz))
-    new_point[merged] = remaining
-    observed = tracks.point_of >= 0
-    tracks.point_of[observed] = new_point[tracks.point_of[observed]]
+    keypoints, rows = tracks.observations_of(merged)
+    tracks.point_of[keypoints] = remaining[rows]
     return bool(is_disjoint.any())
 
 

@@ -6,9 +6,9 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from mpsfm_core.data import Int64
 from mpsfm_core.mapping.options import TriangulationOptions
 from mpsfm_core.mapping.scene.scene import Scene
+from mpsfm_core.mapping.scene.tracks import NO_POINT
 
 MIN_IMAGE_POINTS = 3
 """Minimum number of observed 3D points that determine the pose of an image."""
@@ -31,7 +31,7 @@ def filter_points(
         The number of removed observations.
     """
     tracks, graph = scene.tracks, scene.graph
-    points = _find_points(scene, images)
+    points = np.arange(len(tracks.xyz)) if images is None else scene.points_of(images)
     keypoints, rows = tracks.observations_of(points)
     errors_px, _ = scene.project(keypoints, tracks.xyz[points[rows]])
     max_errors_px = options.max_error_px * scene.keypoint_std_px[graph.image_of[keypoints]]
@@ -41,19 +41,8 @@ def filter_points(
     angles_deg, lengths = scene.angles_deg_of(points)
     is_unstable = (angles_deg < options.min_angle_deg) & (num_depths == 0)
     num_removed += int(lengths[is_unstable].sum())
-    is_deleted = np.zeros(len(tracks.xyz), dtype=np.bool_)
-    is_deleted[points[is_unstable]] = True
-    tracks.delete(is_deleted)
+    tracks.point_of[keypoints[is_unstable[rows]]] = NO_POINT
     return num_removed
-
-
-def _find_points(scene: Scene, images: list[int] | None) -> Int64:
-    """Return the ascending points (m,) that given images observe, or all points for None."""
-    tracks = scene.tracks
-    if images is None:
-        return np.arange(len(tracks.xyz))
-    points = np.concatenate([tracks.point_of[scene.graph.keypoints_of(image)] for image in images])
-    return np.unique(points[points >= 0])
 
 
 def find_lost_images(scene: Scene) -> list[int]:

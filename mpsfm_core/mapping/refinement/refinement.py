@@ -147,6 +147,17 @@ class _Bundle(NamedTuple):
     """(k,) scene index of one image of each camera of the problem."""
 
 
+class _MeasuredPoints(NamedTuple):
+    """Points that the refinement of depth maps reads, measured without depth observations."""
+
+    points: Int64
+    """(m,) rows in the tracks, in ascending order."""
+    covariances: Float64
+    """(m, 3, 3) covariances in the world frame, in squared world units."""
+    angles_deg: Float64
+    """(m,) largest triangulation angles in degrees."""
+
+
 class Refiner:
     """Bundle adjustment and depth integration of a scene.
 
@@ -261,9 +272,9 @@ class Refiner:
         if not self.options.integrate:
             return
         images = [image for image in images if self.scene.maps[image].active]
-        covariances = self._covariances(images)
+        points = self._measure_points(images)
         for image in images:
-            self._integrate(image, *covariances)
+            self._integrate(image, points)
 
     def refine_depth(self, images: list[int]) -> None:
         """Measure depth noise, and refine the depth maps of images with the current points."""
@@ -471,15 +482,11 @@ class Refiner:
             local: Keep points with long tracks fixed.
         """
         scene, tracks = self.scene, self.scene.tracks
-        observations = tracks.observations()
-        image_of = scene.graph.image_of[observations]
-        seen = np.zeros(len(tracks.xyz), dtype=np.bool_)
-        seen[tracks.point_of[observations[scene.mask(variable)[image_of]]]] = True
-        observations = observations[seen[tracks.point_of[observations]]]
-        if not len(observations):
+        points = scene.points_of(variable)
+        if not len(points):
             return None
+        observations, point_rows = tracks.observations_of(points)
         images, image_rows = np.unique(scene.graph.image_of[observations], return_inverse=True)
-        points, point_rows = np.unique(tracks.point_of[observations], return_inverse=True)
         moving = (scene.mask(variable) & ~self.fixed)[images]
         if moving.all():
             moving[scene.rigs.frame_of[images] == scene.rigs.frame_of[images[0]]] = False
@@ -595,16 +602,16 @@ class Refiner:
         self.adapts_reprojection_loss = state["adapts_reprojection_loss"]
         self.calibrates_with_long_tracks = state["calibrates_with_long_tracks"]
 
-    def _integrate(self, image: int, covariances: Float64, angles: Float64) -> None:
-        scene, tracks = self.scene, self.scene.tracks
+    def _integrate(self, image: int, points: _MeasuredPoints) -> None:
+        scene = self.scene
         depth_map = scene.maps[image]
         keypoints, z = self._observed_depth(image)
-        points = tracks.point_of[keypoints]
+        measured = np.searchsorted(points.points, scene.tracks.point_of[keypoints])
         rows = keypoints - scene.graph.offsets[image]
-        rotation = np.broadcast_to(scene.rotations[image], (len(points), 3, 3))
-        variance = propagate_depth_variance(covariances[points], rotation)
+        rotation = np.broadcast_to(scene.rotations[image], (len(keypoints), 3, 3))
+        variance = propagate_depth_variance(points.covariances[measured], rotation)
         ratio = z / np.maximum(depth_map.scale * depth_map.prior_at_keypoints(rows), 1e-12)
-        good = (angles[points] >= MIN_ANCHOR_ANGLE_DEG) & (z > 0)
+        good = (points.angles_deg[measured] >= MIN_ANCHOR_ANGLE_DEG) & (z > 0)
         good &= np.isfinite(variance) & (variance > 0)
         good &= ~depth_map.keypoint_valid[rows] | self._near(ratio)
         xy = subsample_pixels(depth_map.keypoints[rows][good], self._step(image))
@@ -724,37 +731,27 @@ class Refiner:
         near: Bool = (ratio > 1 / limit) & (ratio < limit)
         return near
 
-    def _covariances(self, observed_by: list[int]) -> tuple[Float64, Float64]:
-        """Return point covariances without depth observations, and triangulation angles.
-
-        Args:
-            observed_by: Images whose observed points get valid covariances and angles.
-
-        Returns:
-            Point covariances (p, 3, 3), and triangulation angles (p,) in degrees.
-        """
-        scene, tracks = self.scene, self.scene.tracks
-        observations = tracks.observations()
-        images = scene.graph.image_of[observations]
-        is_observed = np.zeros(len(tracks.xyz), dtype=np.bool_)
-        is_observed[tracks.point_of[observations[scene.mask(observed_by)[images]]]] = True
-        observations = observations[is_observed[tracks.point_of[observations]]]
-        images = scene.graph.image_of[observations]
+    def _measure_points(self, images: list[int]) -> _MeasuredPoints:
+        """Measure the points that images observe, without the observations of depth."""
+        scene = self.scene
+        points = scene.points_of(images)
+        observations, rows = scene.tracks.observations_of(points)
+        observing_images = scene.graph.image_of[observations]
         covariances = compute_point_covariances(
             BundleProblem(
                 rotations=scene.rotations,
                 translations=scene.translations,
                 intrinsics=scene.intrinsics,
                 camera_of_image=np.arange(scene.num_images),
-                points=tracks.xyz,
-                obs_image=images,
-                obs_point=tracks.point_of[observations],
+                points=scene.tracks.xyz[points],
+                obs_image=observing_images,
+                obs_point=rows,
                 obs_xy=scene.keypoints[observations],
-                obs_std_px=scene.keypoint_std_px[images],
+                obs_std_px=scene.keypoint_std_px[observing_images],
             ),
             SOFT_L1_OPTIONS,
         )
-        return covariances, scene.track_angles_deg()
+        return _MeasuredPoints(points, covariances, scene.angles_deg_of(points)[0])
 
     def _num_observations(self) -> int:
         return int((self.scene.tracks.point_of >= 0).sum())

@@ -18,14 +18,8 @@ def find_local_bundle(scene: Scene, image: int, scores: csr_array) -> list[int]:
     If fewer than ``NUM_NEIGHBORS`` images share points, the images with the most matches are added.
     COLMAP's ``FindLocalBundle`` also ranks images by the number of shared points.
     """
-    tracks, graph = scene.tracks, scene.graph
-    points = tracks.point_of[graph.keypoints_of(image)]
-    points = points[points >= 0]
-    is_observed = np.zeros(len(tracks.xyz), dtype=np.bool_)
-    is_observed[points] = True
-    observations = np.flatnonzero(tracks.point_of >= 0)
-    shared = is_observed[tracks.point_of[observations]]
-    counts = np.bincount(graph.image_of[observations[shared]], minlength=scene.num_images)
+    shared, _ = scene.tracks.observations_of(scene.points_of([image]))
+    counts = np.bincount(scene.graph.image_of[shared], minlength=scene.num_images)
     score = scores[[image]].toarray()[0]
     order = np.lexsort((-score, -counts))
     usable = scene.registered & ((counts > 0) | (score > 0))

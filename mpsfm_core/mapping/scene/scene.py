@@ -338,6 +338,13 @@ class Scene:
         )
         return angles
 
+    def points_of(self, images: Sequence[int] | Int64) -> Int64:
+        """Return the points (m,) that given images observe, in ascending order."""
+        is_observed = np.zeros(len(self.tracks.xyz) + 1, dtype=np.bool_)
+        for image in images:
+            is_observed[self.tracks.point_of[self.graph.keypoints_of(image)]] = True
+        return np.flatnonzero(is_observed[:-1])  # the last entry is that of NO_POINT = -1
+
     def angles_deg_of(self, points: Int64) -> tuple[Float64, Int64]:
         """Return triangulation angles in degrees and track lengths of distinct points (m,)."""
         keypoints, rows = self.tracks.observations_of(points)

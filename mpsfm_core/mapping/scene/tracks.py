@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mpsfm_core.data import Bool, Float64, Int64
+from mpsfm_core.data import Float64, Int64
 from mpsfm_core.mapping.scene.kernels import sort_keypoints_by_point
 
 NO_POINT = -1
@@ -58,11 +58,14 @@ class Tracks:
             Global keypoint numbers (o,), and the row (o,) in 0..m-1 of the point that each keypoint
             observes, sorted by row, then keypoint.
         """
-        row_of = np.full(len(self.xyz) + 1, NO_POINT, dtype=np.int64)
+        is_selected = np.zeros(len(self.xyz) + 1, dtype=np.bool_)
+        is_selected[points] = True
+        keypoints = np.flatnonzero(is_selected[self.point_of])  # NO_POINT = -1 reads the last entry
+        row_of = np.empty(len(self.xyz), dtype=np.int64)
         row_of[points] = np.arange(len(points))
-        row_of_keypoint = row_of[self.point_of]  # NO_POINT = -1 reads the last row
-        keypoints = sort_keypoints_by_point(row_of_keypoint, len(points))
-        return keypoints, row_of_keypoint[keypoints]
+        rows = row_of[self.point_of[keypoints]]
+        order = sort_keypoints_by_point(rows, len(points))
+        return keypoints[order], rows[order]
 
     def add(self, xyz: Float64, keypoints: Int64, track: Int64) -> Int64:
         """Add points with their observations.
@@ -82,24 +85,18 @@ class Tracks:
         self.point_of[keypoints] = first + track
         return np.arange(first, end)
 
-    def delete(self, points: Bool) -> None:
-        """Delete the points that the bool mask ``points`` (p,) selects."""
-        observed = self.point_of >= 0
-        is_removed = np.zeros_like(observed)
-        is_removed[observed] = points[self.point_of[observed]]
-        self.point_of[is_removed] = NO_POINT
-
     def remove_observations(self, keypoints: Int64, min_length: int = 2) -> int:
-        """Remove observations, and points that keep fewer than ``min_length`` observations.
+        """Remove observations, and their points that keep fewer than ``min_length`` observations.
 
         Returns:
             The number of removed observations.
         """
-        num_before = int((self.point_of >= 0).sum())
+        points = np.unique(self.point_of[keypoints])
+        observations, rows = self.observations_of(points[points >= 0])
         self.point_of[keypoints] = NO_POINT
-        lengths = self.lengths()
-        self.delete(lengths < min_length)
-        return num_before - int((self.point_of >= 0).sum())
+        lengths = np.bincount(rows, self.point_of[observations] >= 0)
+        self.point_of[observations[lengths[rows] < min_length]] = NO_POINT
+        return int(np.count_nonzero(self.point_of[observations] < 0))
 
     def compact(self) -> None:
         """Remove the rows of deleted points, with the order of all other points unchanged."""
