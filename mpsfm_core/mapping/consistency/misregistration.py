@@ -314,12 +314,13 @@ def _find_confirmed_contradictions(counts: PairCounts, num_images: int) -> Bool:
     If a group of images is misregistered, neighbors of both images of a contradicting pair also
     contradict each other. Neighbors are images with explained matches.
     """
-    is_contradicting = counts.contradicting > 0
     neighbors = counts.graph(counts.is_explained.astype(np.int64), num_images)
     neighbors = neighbors + eye_array(num_images, dtype=np.int64, format="csr")
-    contradictions = counts.graph(is_contradicting.astype(np.int64), num_images)
-    num_confirming = (neighbors @ contradictions @ neighbors)[counts.a, counts.b]
-    confirmed: Bool = is_contradicting & (num_confirming > 1)  # a pair also confirms itself
+    confirmed: Bool = counts.contradicting > 0
+    contradictions = counts.graph(confirmed.astype(np.int64), num_images)
+    a, b = counts.a[confirmed], counts.b[confirmed]
+    num_confirming = csr_array(neighbors @ contradictions)[a].multiply(neighbors[b]).sum(axis=1)
+    confirmed[confirmed] = num_confirming > 1  # a pair also confirms itself
     return confirmed
 
 

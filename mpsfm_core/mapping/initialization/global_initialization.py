@@ -343,11 +343,11 @@ def find_short_cycle_edges(a: Int64, b: Int64, num_nodes: int) -> Bool:
     ends = np.concatenate([a, b]), np.concatenate([b, a])
     links = csr_array((np.ones(2 * len(a)), ends), shape=(num_nodes, num_nodes))
     degree = np.bincount(ends[0], minlength=num_nodes)
-    walks_2 = links @ links
-    walks_3 = walks_2 @ links  # of these, degree_a + degree_b - 1 repeat the edge a-b itself
-    num_triangles = np.asarray(walks_2[a, b]).ravel()
-    num_squares = np.asarray(walks_3[a, b]).ravel() - (degree[a] + degree[b] - 1)
-    on_cycle: Bool = num_triangles + num_squares > 0
+    walks_2 = csr_array(links @ links)
+    on_cycle: Bool = np.asarray(walks_2[a, b]).ravel() > 0
+    a, b = a[~on_cycle], b[~on_cycle]
+    num_walks_3 = walks_2[a].multiply(links[b]).sum(axis=1)
+    on_cycle[~on_cycle] = num_walks_3 > degree[a] + degree[b] - 1  # walks that repeat the edge a-b
     return on_cycle
 
 
