@@ -79,7 +79,7 @@ QUALITIES = {
 
 
 class HallProblem(NamedTuple):
-    """Synthetic mapping problem of a hall with its true solution."""
+    """Synthetic mapping problem of a hall or of streets with its true solution."""
 
     problem: MappingProblem
     truth: dict[str, Pose]
