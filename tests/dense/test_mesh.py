@@ -30,13 +30,12 @@ from mpsfm_core.results.colmap_model import build_model, write_model
 from mpsfm_core.results.depth_maps import write_depth_maps
 from mpsfm_core.results.obj import read_obj
 from mpsfm_core.support.disk_arrays import store_on_disk
-
-from .conftest import CAMERA, Room
+from mpsfm_core.testing.posed_room import CAMERA, PosedRoom
 
 STD = 0.01
 
 
-def measured(room: Room, std: float = STD, seed: int = 0) -> Reconstruction:
+def measured(room: PosedRoom, std: float = STD, seed: int = 0) -> Reconstruction:
     """Return true depth with independent relative noise."""
     rng = np.random.default_rng(seed)
     images = []
@@ -48,7 +47,7 @@ def measured(room: Room, std: float = STD, seed: int = 0) -> Reconstruction:
     return replace(room.reconstruction, images=tuple(images))
 
 
-def surface(room: Room) -> np.ndarray:
+def surface(room: PosedRoom) -> np.ndarray:
     """Return the world points of all true depth maps."""
     parts = []
     for image in room.reconstruction.images:
@@ -58,11 +57,11 @@ def surface(room: Room) -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def mesh(room: Room) -> TriangleMesh:
+def mesh(room: PosedRoom) -> TriangleMesh:
     return mesh_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
 
 
-def test_mesh_is_accurate_and_complete(room: Room, mesh: TriangleMesh) -> None:
+def test_mesh_is_accurate_and_complete(room: PosedRoom, mesh: TriangleMesh) -> None:
     truth = surface(room)
     depth = float(np.median(np.concatenate([t.ravel() for t in room.truth.values()])))
     pixel = depth / CAMERA.fx
@@ -72,7 +71,7 @@ def test_mesh_is_accurate_and_complete(room: Room, mesh: TriangleMesh) -> None:
     assert (to_mesh < 4 * pixel).mean() > 0.95
 
 
-def test_mesh_is_smoother_than_depth_maps(room: Room, mesh: TriangleMesh) -> None:
+def test_mesh_is_smoother_than_depth_maps(room: PosedRoom, mesh: TriangleMesh) -> None:
     image = room.reconstruction.images[0]
     local = mesh.vertices @ image.rotation.T + image.translation
     xy = CAMERA.fx * local[:, :2] / local[:, 2:] + (CAMERA.cx, CAMERA.cy)
@@ -82,7 +81,7 @@ def test_mesh_is_smoother_than_depth_maps(room: Room, mesh: TriangleMesh) -> Non
     assert np.median(np.abs(error)) < 0.5 * STD
 
 
-def test_triangles_face_cameras_and_have_image_colors(room: Room) -> None:
+def test_triangles_face_cameras_and_have_image_colors(room: PosedRoom) -> None:
     mesh = mesh_depth_maps(measured(room, std=0.0), room.views.__getitem__, MeshOptions())
     corners = mesh.vertices[mesh.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -98,7 +97,7 @@ def test_triangles_face_cameras_and_have_image_colors(room: Room) -> None:
     assert np.median(np.abs(mesh.colors[nearest] - seen)) < 20
 
 
-def test_max_triangles_limits_mesh(room: Room, mesh: TriangleMesh) -> None:
+def test_max_triangles_limits_mesh(room: PosedRoom, mesh: TriangleMesh) -> None:
     limit = len(mesh.triangles) // 4
     options = MeshOptions(max_triangles=limit)
     small = mesh_depth_maps(measured(room), room.views.__getitem__, options)
@@ -107,7 +106,7 @@ def test_max_triangles_limits_mesh(room: Room, mesh: TriangleMesh) -> None:
 
 
 def test_mesh_of_scene_with_many_voxels_has_larger_voxels(
-    room: Room, monkeypatch: pytest.MonkeyPatch
+    room: PosedRoom, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     sizes = []
 
@@ -122,14 +121,16 @@ def test_mesh_of_scene_with_many_voxels_has_larger_voxels(
     assert limit < sizes[1] < 0.5 * sizes[0] and sizes[1] < 8 * limit
 
 
-def test_mesh_from_stored_maps_is_equal(room: Room, mesh: TriangleMesh, tmp_path: Path) -> None:
+def test_mesh_from_stored_maps_is_equal(
+    room: PosedRoom, mesh: TriangleMesh, tmp_path: Path
+) -> None:
     with store_on_disk(tmp_path, in_memory=0):
         again = mesh_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
     for expected, actual in zip(mesh, again, strict=True):
         np.testing.assert_array_equal(actual, expected)
 
 
-def test_mesh_ignores_uncertain_wrong_map(room: Room) -> None:
+def test_mesh_ignores_uncertain_wrong_map(room: PosedRoom) -> None:
     exact = measured(room)
     wrong = exact.images[1].depth
     vague = DepthPrior.from_arrays(wrong.depth * 1.04, (0.05 * wrong.depth) ** 2)
@@ -141,7 +142,7 @@ def test_mesh_ignores_uncertain_wrong_map(room: Room) -> None:
     assert np.median(to_truth) < 0.25 * 0.04 * np.median(wrong.depth)
 
 
-def hole_distance(room: Room, points: np.ndarray) -> np.ndarray:
+def hole_distance(room: PosedRoom, points: np.ndarray) -> np.ndarray:
     """Return the distance (n,) of points to the center of a hole, in radii of the hole."""
     center = surface(room).reshape(-1, CAMERA.height, CAMERA.width, 3)[0, 20, 50]
     radius = 8 * room.truth["0.png"][20, 50] / CAMERA.fx
@@ -149,7 +150,7 @@ def hole_distance(room: Room, points: np.ndarray) -> np.ndarray:
     return distance
 
 
-def with_hole(room: Room, step: float = 1.0) -> Reconstruction:
+def with_hole(room: PosedRoom, step: float = 1.0) -> Reconstruction:
     """Return true depth with an uncertain hole, 16 pixels wide, and a depth step around it."""
     distance = hole_distance(room, surface(room)).reshape(-1, CAMERA.height, CAMERA.width)
     images = []
@@ -161,7 +162,7 @@ def with_hole(room: Room, step: float = 1.0) -> Reconstruction:
     return replace(room.reconstruction, images=tuple(images))
 
 
-def test_mesh_closes_and_marks_hole_where_depth_continues(room: Room) -> None:
+def test_mesh_closes_and_marks_hole_where_depth_continues(room: PosedRoom) -> None:
     mesh = mesh_depth_maps(with_hole(room), room.views.__getitem__, MeshOptions())
     distance, pixel = hole_distance(room, mesh.vertices), room.truth["0.png"][20, 50] / CAMERA.fx
     assert mesh.filled[distance < 0.8].all() and (distance < 0.8).sum() > 20
@@ -174,14 +175,14 @@ def test_mesh_closes_and_marks_hole_where_depth_continues(room: Room) -> None:
 
 @pytest.mark.parametrize(("max_hole_px", "step"), [(0, 1.0), (8, 1.0), (32, 0.8), (32, 1.25)])
 def test_mesh_does_not_close_wide_hole_or_hole_with_step(
-    room: Room, max_hole_px: float, step: float
+    room: PosedRoom, max_hole_px: float, step: float
 ) -> None:
     options = MeshOptions(max_hole_px=max_hole_px)
     mesh = mesh_depth_maps(with_hole(room, step), room.views.__getitem__, options)
     assert (hole_distance(room, mesh.vertices) > 0.7).all()
 
 
-def test_find_seen_through_nearer_pixels_than_surface_excluded(room: Room) -> None:
+def test_find_seen_through_nearer_pixels_than_surface_excluded(room: PosedRoom) -> None:
     images = list(measured(room, std=0.0).images)
     masks = [np.ones(image.depth.shape, np.bool_) for image in images]
     voters = select_voters(images)
@@ -193,7 +194,7 @@ def test_find_seen_through_nearer_pixels_than_surface_excluded(room: Room) -> No
     assert seen_through[10:20, 40:60].mean() > 0.9
 
 
-def test_mesh_without_valid_pixels_raises(room: Room) -> None:
+def test_mesh_without_valid_pixels_raises(room: PosedRoom) -> None:
     none = [
         replace(i, depth=DepthPrior(i.depth.depth, i.depth.variance, np.zeros_like(i.depth.valid)))
         for i in room.reconstruction.images
@@ -206,14 +207,14 @@ def test_mesh_without_valid_pixels_raises(room: Room) -> None:
         )
 
 
-def test_mesh_without_libraries_raises(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mesh_without_libraries_raises(room: PosedRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "skimage.measure", None)
     with pytest.raises(InputError, match=r"mpsfm-core\[mesh\]"):
         mesh_depth_maps(measured(room), room.views.__getitem__, MeshOptions())
 
 
 @pytest.fixture
-def result(room: Room, tmp_path: Path) -> Path:
+def result(room: PosedRoom, tmp_path: Path) -> Path:
     """Create a folder with a model, depth maps with a hole, and images."""
     exact = with_hole(room)
     nothing = np.zeros((0, 2))
@@ -277,7 +278,7 @@ def test_mesh_command_without_depth_maps_fails(result: Path) -> None:
     assert done.exit_code == 2 and "has no depth maps" in done.output
 
 
-def test_find_observed_triangles_omits_hidden_and_reversed_triangles(room: Room) -> None:
+def test_find_observed_triangles_omits_hidden_and_reversed_triangles(room: PosedRoom) -> None:
     image = replace(room.reconstruction.images[0], rotation=np.eye(3), translation=np.zeros(3))
     square = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], np.float64)
     vertices = np.concatenate([0.3 * square + (0, 0, 3), 0.3 * square + (0, 0, 9)])

@@ -21,12 +21,11 @@ from mpsfm_core.geometry import sample_nearest, transform
 from mpsfm_core.geometry.rasterization import rasterize
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.results.obj import read_obj, write_obj
-
-from .conftest import CAMERA, Room
+from mpsfm_core.testing.posed_room import CAMERA, PosedRoom
 
 
 @pytest.fixture(scope="module")
-def exact(room: Room) -> Reconstruction:
+def exact(room: PosedRoom) -> Reconstruction:
     images = []
     for image in room.reconstruction.images:
         true = room.truth[image.name]
@@ -35,7 +34,7 @@ def exact(room: Room) -> Reconstruction:
 
 
 @pytest.fixture(scope="module")
-def mesh(room: Room, exact: Reconstruction) -> TriangleMesh:
+def mesh(room: PosedRoom, exact: Reconstruction) -> TriangleMesh:
     return mesh_depth_maps(exact, room.views.__getitem__, MeshOptions())
 
 
@@ -49,12 +48,14 @@ def render_texture(textured: TexturedMesh, image: RegisteredImage) -> tuple[np.n
     return colors.astype(float), np.isfinite(depth)
 
 
-def color_error(room: Room, textured: TexturedMesh, image: RegisteredImage) -> float:
+def color_error(room: PosedRoom, textured: TexturedMesh, image: RegisteredImage) -> float:
     colors, covered = render_texture(textured, image)
     return float(np.abs(colors - room.views[image.name].image)[covered].mean())
 
 
-def test_texture_shows_the_photos(room: Room, exact: Reconstruction, mesh: TriangleMesh) -> None:
+def test_texture_shows_the_photos(
+    room: PosedRoom, exact: Reconstruction, mesh: TriangleMesh
+) -> None:
     textured = build_texture(mesh, exact, room.views.__getitem__, 4096)
     assert textured.uv.min() >= 0 and textured.uv.max() <= 1
     assert len(textured.triangles) == len(mesh.triangles)
@@ -69,7 +70,7 @@ def test_texture_shows_the_photos(room: Room, exact: Reconstruction, mesh: Trian
 
 
 def test_texture_is_not_larger_than_max_size(
-    room: Room, exact: Reconstruction, mesh: TriangleMesh
+    room: PosedRoom, exact: Reconstruction, mesh: TriangleMesh
 ) -> None:
     textured = build_texture(mesh, exact, room.views.__getitem__, 128)
     assert max(textured.texture.shape) <= 128
@@ -90,7 +91,7 @@ def seam_differences(textured: TexturedMesh) -> np.ndarray:
 
 
 def test_exposure_of_photos_is_leveled(
-    room: Room, exact: Reconstruction, mesh: TriangleMesh, monkeypatch: pytest.MonkeyPatch
+    room: PosedRoom, exact: Reconstruction, mesh: TriangleMesh, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     views = dict(room.views)
     dark = (0.6 * views["0.png"].image).astype(np.uint8)
@@ -169,7 +170,7 @@ def test_blurred_photo_is_chosen_only_if_it_is_much_nearer(blur_px: float, chose
 
 
 def test_texture_that_is_too_small_is_an_error(
-    room: Room, exact: Reconstruction, mesh: TriangleMesh
+    room: PosedRoom, exact: Reconstruction, mesh: TriangleMesh
 ) -> None:
     with pytest.raises(InputError, match="max_texture_size"):
         build_texture(mesh, exact, room.views.__getitem__, 16)
