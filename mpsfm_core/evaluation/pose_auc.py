@@ -13,13 +13,15 @@ from types import MappingProxyType
 
 import numpy as np
 
-from mpsfm_core.data import Float64, Pose
+from mpsfm_core.data import Float64, Int64, Pose
 from mpsfm_core.geometry import angle_between_deg, rotation_angle_deg
 
 THRESHOLDS_DEG = (1, 5, 20)
 """Thresholds of the pose AUC in degrees [paper, tables]."""
 UNREGISTERED_DEG = 180.0
 """Pose error in degrees of an image pair with an unregistered image."""
+_BLOCK_PAIRS = 1_000_000
+"""Number of pairs whose relative poses are in memory at once."""
 
 
 @dataclass(frozen=True)
@@ -131,19 +133,19 @@ def pose_errors_deg(
         ~np.eye(count, dtype=bool) if convention.ordered else np.triu(np.ones((count, count)), 1)
     )
     registered = np.array([name in estimated for name in names])
-    known = registered[first] & registered[second]
+    known = np.flatnonzero(registered[first] & registered[second])
     errors = np.full(len(first), UNREGISTERED_DEG)
-    if known.any():
-        poses = [estimated.get(name, truth[name]) for name in names]
-        relative = _relative_poses(poses, first[known], second[known])
-        true_relative = _relative_poses(
-            [truth[name] for name in names], first[known], second[known]
-        )
+    poses = _stack([estimated.get(name, truth[name]) for name in names])
+    true_poses = _stack([truth[name] for name in names])
+    for start in range(0, len(known), _BLOCK_PAIRS):
+        pairs = known[start : start + _BLOCK_PAIRS]
+        relative = _relative_poses(poses, first[pairs], second[pairs])
+        true_relative = _relative_poses(true_poses, first[pairs], second[pairs])
         rotation = rotation_angle_deg(relative[0] @ true_relative[0].transpose(0, 2, 1))
         translation = angle_between_deg(relative[1], true_relative[1])
         if convention.folded:
             translation = np.minimum(translation, 180.0 - translation)
-        errors[known] = np.maximum(rotation, translation)
+        errors[pairs] = np.maximum(rotation, translation)
     return errors
 
 
@@ -171,10 +173,14 @@ def pose_auc(
     return {threshold: convention.area(errors_deg, threshold) for threshold in thresholds}
 
 
-def _relative_poses(poses: Sequence[Pose], first: Float64, second: Float64) -> Pose:
+def _stack(poses: Sequence[Pose]) -> Pose:
+    """Stack poses to rotations (n, 3, 3) and translations (n, 3)."""
+    return np.stack([pose[0] for pose in poses]), np.stack([pose[1] for pose in poses])
+
+
+def _relative_poses(poses: Pose, first: Int64, second: Int64) -> Pose:
     """Compute relative poses ``second_from_first``: rotations (n, 3, 3), translations (n, 3)."""
-    rotations = np.stack([rotation for rotation, _ in poses])
-    translations = np.stack([translation for _, translation in poses])
+    rotations, translations = poses
     relative = rotations[second] @ rotations[first].transpose(0, 2, 1)
     moved = np.einsum("nij,nj->ni", relative, translations[first])
     return relative, translations[second] - moved
