@@ -113,6 +113,7 @@ def add_look_alike_pairs(hall: HallProblem, seed: int = 0) -> MappingProblem:
     """
     rng = np.random.default_rng([seed, 2])
     images, pairs = list(hall.problem.images), list(hall.problem.pairs)
+    matched = {(pair.image_a, pair.image_b) for pair in pairs}
     side = int(np.ceil(np.sqrt(len(images))))
     for row in rng.choice(len(pairs), round(LOOK_ALIKE_RATIO * len(pairs)), replace=False):
         pair = pairs[row]
@@ -120,6 +121,9 @@ def add_look_alike_pairs(hall: HallProblem, seed: int = 0) -> MappingProblem:
         if not len(distant):
             continue
         view = int(rng.choice(distant))
+        if (pair.image_a, view) in matched:
+            continue
+        matched.add((pair.image_a, view))
         xy = images[pair.image_b].keypoints[pair.matches[:, 1]]
         noise = images[view].keypoint_std_px * rng.normal(size=xy.shape)
         first = len(images[view].keypoints)
