@@ -17,12 +17,10 @@ from scipy.sparse import bsr_array, csr_array
 
 from mpsfm_core.data import Float64, Int64, MappingProblem
 from mpsfm_core.geometry import camera_center
+from mpsfm_core.mapping.refinement.filtering import MIN_IMAGE_POINTS
 from mpsfm_core.mapping.scene.depth_map import DepthMap
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 
-MIN_SHARED_POINTS = 3
-"""Minimum number of common 3D points of two frames whose distance is judged. [minimal sample of
-PnP]"""
 MAX_FRAMES = 300
 """Maximum number of frames, because the run time is cubic in the number of frames. [ours]"""
 DAMPING = 1e-12
@@ -148,7 +146,7 @@ def _measure_depth_disagreement(
     for a, b in edges:
         (ids_a, errors_a, stds_a), (ids_b, errors_b, stds_b) = depths[a], depths[b]
         common, of_a, of_b = np.intersect1d(ids_a, ids_b, return_indices=True)
-        if len(common) >= MIN_SHARED_POINTS:
+        if len(common) >= MIN_IMAGE_POINTS:
             differences = errors_a[of_a] - errors_b[of_b]
             ratios = differences / np.hypot(stds_a[of_a], stds_b[of_b])
             largest = max(largest, abs(float(np.median(ratios))))
@@ -219,7 +217,7 @@ class _Observations:
             shape=(self.num_frames, int(self._pairs[:, 0].max(initial=0)) + 1),
         )
         shared = (visible @ visible.T).toarray()
-        return np.argwhere(np.triu(shared, 1) >= MIN_SHARED_POINTS)
+        return np.argwhere(np.triu(shared, 1) >= MIN_IMAGE_POINTS)
 
     def compute_information(self) -> Float64:
         """Return the information matrix (6n, 6n) of the frames after eliminating the points."""
