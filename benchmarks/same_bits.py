@@ -32,7 +32,7 @@ from benchmarks.scale import SCENES, store_scene, watch_memory
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.evaluation.methods import initialize_process
 from mpsfm_core.extraction.cache import digest
-from mpsfm_core.extraction.remote_execution import THREADS
+from mpsfm_core.extraction.executors import THREADS
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts import part_mapping
 from mpsfm_core.mapping.problem_state import problem_from_state
