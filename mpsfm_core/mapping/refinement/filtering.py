@@ -38,7 +38,7 @@ def filter_points(
     num_removed = tracks.remove_observations(keypoints[~(errors_px <= max_errors_px)])
     keypoints, rows = tracks.observations_of(points)
     num_depths = np.bincount(rows, scene.keypoint_valid[keypoints], minlength=len(points))
-    angles_deg, lengths = scene.angles_deg_of(points)
+    angles_deg, lengths = scene.angles_deg_of(points, (keypoints, rows))
     is_unstable = (angles_deg < options.min_angle_deg) & (num_depths == 0)
     num_removed += int(lengths[is_unstable].sum())
     tracks.point_of[keypoints[is_unstable[rows]]] = NO_POINT

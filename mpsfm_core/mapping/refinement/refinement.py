@@ -751,7 +751,8 @@ class Refiner:
             ),
             SOFT_L1_OPTIONS,
         )
-        return _MeasuredPoints(points, covariances, scene.angles_deg_of(points)[0])
+        angles_deg, _ = scene.angles_deg_of(points, (observations, rows))
+        return _MeasuredPoints(points, covariances, angles_deg)
 
     def _num_observations(self) -> int:
         return int((self.scene.tracks.point_of >= 0).sum())

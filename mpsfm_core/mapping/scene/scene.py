@@ -345,9 +345,17 @@ class Scene:
             is_observed[self.tracks.point_of[self.graph.keypoints_of(image)]] = True
         return np.flatnonzero(is_observed[:-1])  # the last entry is that of NO_POINT = -1
 
-    def angles_deg_of(self, points: Int64) -> tuple[Float64, Int64]:
-        """Return triangulation angles in degrees and track lengths of distinct points (m,)."""
-        keypoints, rows = self.tracks.observations_of(points)
+    def angles_deg_of(
+        self, points: Int64, observations: tuple[Int64, Int64] | None = None
+    ) -> tuple[Float64, Int64]:
+        """Return triangulation angles in degrees and track lengths of distinct points (m,).
+
+        Args:
+            points: Rows of the points in the tracks.
+            observations: Result of :meth:`Tracks.observations_of` for the points, or None to
+                compute it.
+        """
+        keypoints, rows = observations or self.tracks.observations_of(points)
         centers = self.centers()[self.graph.image_of[keypoints]]
         angles: Float64 = compute_max_triangulation_angles(self.tracks.xyz[points], rows, centers)
         return angles, np.bincount(rows, minlength=len(points)).astype(np.int64)
