@@ -90,12 +90,17 @@ def test_bridge_separates_components_and_largest_is_returned(hall: HallProblem) 
     assert max(placed.images) < 10
 
 
+def draw_links(rng: np.random.Generator, count: int, end: int) -> Int64:
+    """Draw fewer than ``end`` distinct edges (m, 2) of a graph with ``count`` nodes."""
+    possible = np.stack(np.triu_indices(count, 1), axis=1)
+    return possible[rng.choice(len(possible), rng.integers(1, end), replace=False)]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_find_cycle_edges_returns_edges_that_are_no_bridges(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count = 20
-    possible = np.stack(np.triu_indices(count, 1), axis=1)
-    links = possible[rng.choice(len(possible), rng.integers(1, 30), replace=False)]
+    links = draw_links(rng, count, 30)
     flip = rng.random(len(links)) < 0.5
     links[flip] = links[flip][:, ::-1]
 
@@ -113,8 +118,7 @@ def test_find_cycle_edges_returns_edges_that_are_no_bridges(seed: int) -> None:
 def test_find_short_cycle_edges_returns_edges_on_triangles_and_squares(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count = 14
-    possible = np.stack(np.triu_indices(count, 1), axis=1)
-    links = possible[rng.choice(len(possible), rng.integers(1, 25), replace=False)]
+    links = draw_links(rng, count, 25)
     neighbors = np.zeros((count, count), np.bool_)
     neighbors[links[:, 0], links[:, 1]] = neighbors[links[:, 1], links[:, 0]] = True
 
