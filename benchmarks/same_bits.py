@@ -1,4 +1,4 @@
-"""Equality of mapping in parts: without workers, on workers, and after killed processes.
+"""Mapping in parts gives the same bits without workers, with workers, and after a kill.
 
     python -m benchmarks.same_bits [--scene hall] [--views 1000] [--part-images 250]
         [--cases NAME ...] [--folder build/benchmarks/scale] [--output FILE]
@@ -49,7 +49,7 @@ WORKER, FIRST_PROCESS = "worker", "first process"
 
 
 class Case(NamedTuple):
-    """Executor of the parts, and the process that is killed."""
+    """Executor that maps the parts, and the process that is killed meanwhile, if any."""
 
     executor: str = THREADS
     workers: int = 0
@@ -98,7 +98,7 @@ def main() -> int:
 
 
 def _measure(scene: Path, case: Case, part_images: int) -> Mapping[str, Any]:
-    """Map a scene in new processes, and return the result, empty after an unexpected exit."""
+    """Map a scene in new processes; return the result, or an empty one if a process failed."""
     cache = scene.with_name("same-bits-cache")
     path = cache / "result.json"
     shutil.rmtree(cache, ignore_errors=True)

@@ -21,7 +21,7 @@ THRESHOLDS_DEG = (1, 5, 20)
 UNREGISTERED_DEG = 180.0
 """Pose error in degrees of an image pair with an unregistered image."""
 _BLOCK_PAIRS = 1_000_000
-"""Number of pairs whose relative poses are in memory at once."""
+"""Number of image pairs whose errors are computed at once, which limits the memory."""
 
 
 @dataclass(frozen=True)

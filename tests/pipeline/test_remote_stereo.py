@@ -1,6 +1,6 @@
-"""Tests of stereo on the workers of an executor in this process.
+"""Tests of the dense stage with an executor that runs all items in this process.
 
-The tests of mpsfm-dask and mpsfm-ray use real clusters.
+The tests of mpsfm-dask and mpsfm-ray run the dense stage on real clusters.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tests of synthetic streets: connected views, crossings, sky, true matches."""
+"""Tests of the synthetic streets."""
 
 from __future__ import annotations
 
