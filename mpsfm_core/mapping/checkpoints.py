@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple, Protocol
 
 from mpsfm_core.data.errors import DataError
@@ -31,11 +32,12 @@ class CheckpointStore(Protocol):
     def due(self) -> bool:
         """Return True if the mapper must save a checkpoint before it registers the next image."""
 
-    def save(self, state: CheckpointArrays, registered: int) -> None:
+    def save(self, collect: Callable[[], CheckpointArrays], registered: int) -> None:
         """Save a checkpoint.
 
         Args:
-            state: Arrays of the mapper checkpoint, by name.
+            collect: Function that returns the arrays of the checkpoint, by name. The call computes
+                pending depth maps, so its time counts as time for saving.
             registered: Number of images that are registered in the current component.
         """
 
@@ -69,14 +71,18 @@ class Checkpointer:
     def save_if_due(self, runs: list[MapperRun], mapper: Stateful, num_registered: int) -> None:
         """Save a checkpoint of the mapper if the storage requests one."""
         if self._store is not None and self._store.due():
-            self._save(MapperProgress(runs, mapper.state_dict()), num_registered)
+            self._save(runs, mapper, num_registered)
 
     def save_completed(self, runs: list[MapperRun]) -> None:
         """Save the completed mapper runs, in case a later pipeline stage is interrupted."""
         if self._store is not None:
-            self._save(MapperProgress(runs, None), max(run.size for run in runs))
+            self._save(runs, None, max(run.size for run in runs))
 
-    def _save(self, progress: MapperProgress, num_registered: int) -> None:
+    def _save(self, runs: list[MapperRun], mapper: Stateful | None, num_registered: int) -> None:
+        def collect() -> CheckpointArrays:
+            progress = MapperProgress(runs, None if mapper is None else mapper.state_dict())
+            states = [run.state_dict() for run in runs]
+            return flatten_state({**progress._asdict(), "runs": states})
+
         assert self._store is not None
-        runs = [run.state_dict() for run in progress.runs]
-        self._store.save(flatten_state({**progress._asdict(), "runs": runs}), num_registered)
+        self._store.save(collect, num_registered)

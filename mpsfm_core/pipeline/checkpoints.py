@@ -14,7 +14,7 @@ import json
 import logging
 import platform
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from threading import Lock
@@ -42,7 +42,7 @@ FORMAT = 1
 
 _HEADER = "header"
 _MAX_SAVING_RATIO = 0.02
-"""Maximum ratio of the time for writing checkpoints to the run time."""
+"""Maximum ratio of the time for computing and writing checkpoints to the run time."""
 _MAX_AGE_S = 30 * 24 * 3600.0
 """Age above which unused checkpoints are deleted, in seconds (30 days)."""
 _DISK_ERROR = "no checkpoints from now on: %s"
@@ -103,7 +103,7 @@ class MappingCheckpoints:
         problem: Input of the mapper (images, priors and verified matches).
         options: Options of the mapper.
         stages: Receiver of messages to the user.
-        every_s: Minimum seconds between checkpoints; the interval is extended if writing is slow.
+        every_s: Minimum seconds between checkpoints; the interval is extended if saving is slow.
     """
 
     def __init__(
@@ -160,7 +160,7 @@ class MappingCheckpoints:
         """Check whether the next checkpoint should be written."""
         return not self._failed and time.monotonic() - self._last >= self._wait_s
 
-    def save(self, state: CheckpointArrays, registered: int) -> None:
+    def save(self, collect: Callable[[], CheckpointArrays], registered: int) -> None:
         """Write a checkpoint; after a disk error, warn once and disable checkpoints."""
         if self._failed:
             return
@@ -172,7 +172,7 @@ class MappingCheckpoints:
             "time": time.strftime("%Y-%m-%d %H:%M:%S"),
         }
         text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-        arrays = cast(Any, {_HEADER: text, **state})
+        arrays = cast(Any, {_HEADER: text, **collect()})
         try:
             write_file(self._path, lambda file: np.savez(file, **arrays), self._unfinished)
         except OSError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -44,8 +45,8 @@ class Memory:
     def due(self) -> bool:
         return True
 
-    def save(self, state: CheckpointArrays, registered: int) -> None:
-        self.states.append({name: array.copy() for name, array in state.items()})
+    def save(self, collect: Callable[[], CheckpointArrays], registered: int) -> None:
+        self.states.append({name: array.copy() for name, array in collect().items()})
         if len(self.states) == self._last:
             raise Killed
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Bool, Float64, Int64, MappingImage, MappingProblem, VerifiedPair
+from mpsfm_core.data import Bool, Float64, MappingImage, MappingProblem, VerifiedPair
 from mpsfm_core.data.camera_models import IntrinsicParameter, to_distortion
 from mpsfm_core.geometry.distortion import change_distortion
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
@@ -19,6 +19,7 @@ from mpsfm_core.mapping.initialization.camera_splitting import (
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.estimated_intrinsics import MIN_FOCAL_IMAGES
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+from mpsfm_core.support.threads import parallel_map
 
 MIN_FOCAL_CHANGE = 1.1
 """Ratio of refined and initial focal length from which the initial focal length has distorted the
@@ -98,31 +99,49 @@ def estimate_relative_poses(problem: MappingProblem, changed: Bool, seed: int) -
         changed: (n,) bool mask of the images with changed intrinsics or keypoints.
         seed: Seed of RANSAC.
     """
-    pairs = tuple(
-        _estimate_relative_pose(problem, pair, seed)
-        if changed[pair.image_a] or changed[pair.image_b]
-        else pair
-        for pair in problem.pairs
-    )
-    return replace(problem, pairs=pairs)
+    images = problem.images
+    keypoints = [_undistort_keypoints(image) for image in images]
+
+    def estimate(pair: VerifiedPair) -> VerifiedPair:
+        a, b = pair.image_a, pair.image_b
+        if not (changed[a] or changed[b]):
+            return pair
+        xy_a, xy_b = keypoints[a][pair.matches[:, 0]], keypoints[b][pair.matches[:, 1]]
+        return _estimate_relative_pose(pair, images[a], images[b], xy_a, xy_b, seed)
+
+    return replace(problem, pairs=tuple(parallel_map(estimate, problem.pairs)))
 
 
-def _estimate_relative_pose(problem: MappingProblem, pair: VerifiedPair, seed: int) -> VerifiedPair:
+def _estimate_relative_pose(
+    pair: VerifiedPair,
+    image_a: MappingImage,
+    image_b: MappingImage,
+    xy_a: Float64,
+    xy_b: Float64,
+    seed: int,
+) -> VerifiedPair:
     """Return a pair with a new relative pose if COLMAP's two-view geometry has one.
 
     The pair is calibrated if COLMAP prefers the essential matrix to fundamental matrix and
     homography.
+
+    Args:
+        pair: The pair.
+        image_a: First image of the pair.
+        image_b: Second image of the pair.
+        xy_a: (m, 2) matched keypoints of the first image without its initial distortion, in pixels.
+        xy_b: (m, 2) matched keypoints of the second image without its initial distortion.
+        seed: Seed of RANSAC.
     """
-    image_a, image_b = problem.images[pair.image_a], problem.images[pair.image_b]
     options = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True, detect_watermark=False)
     options.ransac.max_error = MAX_ERROR_PX * max(image_a.keypoint_std_px, image_b.keypoint_std_px)
     options.ransac.min_inlier_ratio = MIN_INLIER_RATIO
     options.ransac.random_seed = seed
     geometry = pycolmap.estimate_calibrated_two_view_geometry(
         colmap_from_pinhole(image_a.camera),
-        _undistort_keypoints(image_a, pair.matches[:, 0]),
+        xy_a,
         colmap_from_pinhole(image_b.camera),
-        _undistort_keypoints(image_b, pair.matches[:, 1]),
+        xy_b,
         np.repeat(np.arange(len(pair), dtype=np.uint32)[:, None], 2, axis=1),
         options,
     )
@@ -137,10 +156,9 @@ def _estimate_relative_pose(problem: MappingProblem, pair: VerifiedPair, seed: i
     )
 
 
-def _undistort_keypoints(image: MappingImage, rows: Int64) -> Float64:
-    """Return the keypoints (m, 2) of some rows without the initial distortion of the image."""
-    xy = image.keypoints[rows]
+def _undistort_keypoints(image: MappingImage) -> Float64:
+    """Return the keypoints (k, 2) of an image without its initial distortion, in pixels."""
     if image.initial_distortion is None:
-        return xy
+        return image.keypoints
     old = image.camera, image.distortion
-    return change_distortion(xy, old, (image.camera, image.initial_distortion))
+    return change_distortion(image.keypoints, old, (image.camera, image.initial_distortion))
