@@ -14,6 +14,7 @@ from mpsfm_core.data import Float64, Int64
 from mpsfm_core.geometry import camera_center, pixel_centers, sample_nearest, unproject
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 from mpsfm_core.support.jit import kernel
+from mpsfm_core.support.threads import parallel_map
 
 _GRID_ROWS = 16
 """Number of rows of the pixel grid on which the overlap of views is measured."""
@@ -46,6 +47,12 @@ class _SampledViews(NamedTuple):
     """(m,) median std of log depth of each view."""
     points: list[Float64]
     """(n, 3) world points of the grid pixels of each view."""
+    frusta: Float64
+    """(5, m, 4) planes of the view frusta, world frame: the plane z = 0 of the camera frame, and
+    the planes through the image borders. The product with a homogeneous point is its distance from
+    the plane, positive inside."""
+    max_log_depth: Float64
+    """(m,) natural log of the largest depth of each view."""
 
 
 def select_source_views(images: Sequence[RegisteredImage], max_sources: int) -> list[list[int]]:
@@ -57,7 +64,7 @@ def select_source_views(images: Sequence[RegisteredImage], max_sources: int) -> 
     if not images:
         return []
     views = _sample_views(images)
-    return [_select_sources(views, row, max_sources) for row in range(len(images))]
+    return parallel_map(lambda row: _select_sources(views, row, max_sources), range(len(images)))
 
 
 def _sample_views(images: Sequence[RegisteredImage]) -> _SampledViews:
@@ -71,7 +78,7 @@ def _sample_views(images: Sequence[RegisteredImage]) -> _SampledViews:
     rotations = np.stack([image.rotation for image in images])
     translations = np.stack([image.translation for image in images])
     centers = camera_center(rotations, translations)
-    log_depth = np.zeros((len(images), _GRID_ROWS, columns.max()))
+    log_depth = np.full((len(images), _GRID_ROWS, columns.max()), -np.inf)
     log_std = np.ones(len(images))
     points = []
     for row, (image, camera) in enumerate(zip(images, cameras, strict=True)):
@@ -88,18 +95,22 @@ def _sample_views(images: Sequence[RegisteredImage]) -> _SampledViews:
         log_depth[row, :, : camera.width] = np.log(depth).reshape(_GRID_ROWS, -1)
         points.append(unproject(camera, xy, depth) @ image.rotation + centers[row])
     params = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras])
-    return _SampledViews(
-        params, columns, rotations, translations, centers, log_depth, log_std, points
-    )
+    poses = np.concatenate([rotations, translations[:, :, None]], axis=2)
+    frusta = _frustum_planes(params, columns) @ poses
+    sampled = params, columns, rotations, translations, centers, log_depth, log_std
+    return _SampledViews(*sampled, points, frusta[:, :, 0], log_depth.max(axis=(1, 2)))
 
 
 def _select_sources(views: _SampledViews, row: int, max_sources: int) -> list[int]:
     """Select the source views of one image greedily."""
-    scores = np.zeros((len(views.points), len(views.points[row])))
-    _score_points(row, views.points[row], *views[:-1], scores)
+    sources = _find_overlapping_views(views, row)
+    scores = np.zeros((len(sources), len(views.points[row])))
+    _score_points(row, sources, views.points[row], *views[:7], scores)
+    useful = scores.mean(axis=1) >= _MIN_GAIN  # Gains only decrease during the selection.
+    sources, scores = sources[useful], scores[useful]
     selected: list[int] = []
     covered = np.zeros(scores.shape[1])
-    for _ in range(min(max_sources, len(scores) - 1)):
+    for _ in range(min(max_sources, len(sources))):
         gain = (scores / (1 + covered)).mean(axis=1)
         gain[selected] = 0
         best = int(gain.argmax())
@@ -107,12 +118,41 @@ def _select_sources(views: _SampledViews, row: int, max_sources: int) -> list[in
             break
         selected.append(best)
         covered += scores[best]
-    return selected
+    return [int(sources[best]) for best in selected]
+
+
+def _frustum_planes(params: Float64, columns: Int64) -> Float64:
+    """Compute the unit normals (5, m, 1, 3) of the frustum planes in the camera frames."""
+    fx, fy, cx, cy = params.T
+    zero, one = np.zeros_like(fx), np.ones_like(fx)
+    left, right = (fx, zero, cx), (-fx, zero, columns - cx)
+    top, bottom = (zero, fy, cy), (zero, -fy, _GRID_ROWS - cy)
+    planes = np.array([(zero, zero, one), left, right, top, bottom])
+    normals: Float64 = planes.transpose(0, 2, 1)[:, :, None]
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    return normals
+
+
+def _find_overlapping_views(views: _SampledViews, row: int) -> Int64:
+    """Find the views whose frustum intersects the bounding sphere of a view's points.
+
+    Points behind the largest depth of a view are occluded there, so the depth limits its frustum.
+    """
+    points = views.points[row]
+    center = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = np.linalg.norm(points - center, axis=1).max()
+    distances = views.frusta @ np.append(center, 1.0)
+    max_behind = _OCCLUSION_STDS * np.maximum(views.log_std[row], views.log_std)
+    max_depth = np.exp(views.max_log_depth + max_behind)
+    overlaps = (distances >= -radius).all(axis=0) & (distances[0] <= max_depth + radius)
+    overlaps[row] = False
+    return np.flatnonzero(overlaps)
 
 
 @kernel()
 def _score_points(
     reference: int,
+    sources: Int64,
     points: Float64,
     params: Float64,
     columns: Int64,
@@ -123,18 +163,17 @@ def _score_points(
     log_std: Float64,
     scores: Float64,
 ) -> None:
-    """Compute a score in [0, 1] of each view for stereo at each point of the reference view.
+    """Compute a score in [0, 1] of source views for stereo at each point of the reference view.
 
     The view score is the product of a term for the triangulation angle and a term for the ratio of
     distances. Occluded points have the score 0.
 
     The arrays from `params` to `log_std` are the fields of :class:`_SampledViews`. `points` are the
-    (n, 3) world points of the view `reference`. The array `scores` (m, n) is the output.
+    (n, 3) world points of the view `reference`. The array `scores` (k, n) of the k `sources` is the
+    output.
     """
     rows = log_depth.shape[1]
-    for source in range(len(params)):
-        if source == reference:
-            continue
+    for index, source in enumerate(sources):
         fx, fy, cx, cy = params[source]
         rotation, translation = rotations[source], translations[source]
         max_behind = _OCCLUSION_STDS * max(log_std[reference], log_std[source])
@@ -164,4 +203,4 @@ def _score_points(
             excess = max(angle - _WIDE_DEG, 0.0) / _WIDE_DEG
             distance_ratio = math.sqrt(min(d1, d2) / max(d1, d2))
             angle_score = min(angle / _FULL_SCORE_DEG, 1.0) * math.exp(-(excess**2) / 2)
-            scores[source, k] = angle_score * distance_ratio
+            scores[index, k] = angle_score * distance_ratio
