@@ -1,7 +1,7 @@
 """Reconstruct rendered walks through several rooms, and compare with COLMAP's mapper.
 
     python -m benchmarks.walks [--walks 2] [--look-alike 1] [--fps 20] [--rounds 1.15]
-        [--config sift] [--max-frames 70] [--set dense.enabled=false] [--records DIR]
+        [--config sift] [--set dense.enabled=false] [--records DIR]
 
 A walk is a video of a loop through four furnished rooms with equal doors, which ends after 1.15
 rounds, or after more rounds of 20 s for a long video. A walk past look-alike rooms ends after three
@@ -560,12 +560,11 @@ def main() -> None:
     parser.add_argument("--fps", type=float, default=FPS)
     parser.add_argument("--rounds", type=float, default=ROUNDS, help="rounds of the other walks")
     parser.add_argument("--config", default="sift")
-    parser.add_argument("--max-frames", type=int, default=70)
     parser.add_argument("--set", dest="settings", action="append", default=[])
     parser.add_argument("--records", type=Path)
     arguments = parser.parse_args()
-    settings = [f"inputs.video.max_frames={arguments.max_frames}", *arguments.settings]
-    config, fps, rounds = arguments.config, arguments.fps, arguments.rounds
+    config, settings = arguments.config, arguments.settings
+    fps, rounds = arguments.fps, arguments.rounds
     walks = [(seed, False) for seed in range(arguments.walks)]
     walks += [(seed, True) for seed in range(arguments.look_alike)]
     with tempfile.TemporaryDirectory() as temporary:
