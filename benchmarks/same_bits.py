@@ -1,4 +1,4 @@
-"""Mapping in parts gives the same bits without workers, with workers, and after a kill.
+"""Check that mapping in parts is bit-identical on all executors and after a killed process.
 
     python -m benchmarks.same_bits [--scene hall] [--views 1000] [--part-images 250]
         [--cases NAME ...] [--folder build/benchmarks/scale] [--output FILE]
@@ -98,7 +98,7 @@ def main() -> int:
 
 
 def _measure(scene: Path, case: Case, part_images: int) -> Mapping[str, Any]:
-    """Map a scene in new processes; return the result, or an empty one if a process failed."""
+    """Map a scene in new processes; return an empty result if one of the processes fails."""
     cache = scene.with_name("same-bits-cache")
     path = cache / "result.json"
     shutil.rmtree(cache, ignore_errors=True)

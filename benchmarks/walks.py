@@ -85,7 +85,8 @@ MAX_LOOP_ERROR_RATIO = 0.01
 MIN_LOOP_POINTS = 15
 """Common points of the start and the keyframes after the first round of a closed loop."""
 FALSE_LOOP_ERROR = 1.0
-"""Largest error of the relative position of two keyframes without a false loop, in meters."""
+"""Error of the relative position of two keyframes above which a model has a false loop, in meters.
+"""
 _TEXTURES = 64
 Record = dict[str, Any]
 

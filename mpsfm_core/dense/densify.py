@@ -113,8 +113,8 @@ class StereoCheckpoints(Protocol):
 
 
 MatchImages = Callable[[Mapping[str, Sequence[str]]], None]
-"""Function that computes and stores the stereo depth of images. Its argument maps the name of each
-image to the names of its source images."""
+"""Function that runs stereo matching for images and stores their depth maps. Its argument maps the
+name of each reference image to the names of its source images."""
 
 
 def densify(

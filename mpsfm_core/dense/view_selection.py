@@ -134,9 +134,10 @@ def _frustum_planes(params: Float64, columns: Int64) -> Float64:
 
 
 def _find_overlapping_views(views: _SampledViews, row: int) -> Int64:
-    """Find the views whose frustum intersects the bounding sphere of a view's points.
+    """Return the other views (k,) that may see points of a view, by their frusta.
 
-    Points behind the largest depth of a view are occluded there, so the depth limits its frustum.
+    A view cannot see the points if its frustum does not intersect their bounding sphere. The
+    frustum ends at the largest depth of the view, because points behind this depth are occluded.
     """
     points = views.points[row]
     center = (points.min(axis=0) + points.max(axis=0)) / 2

@@ -80,9 +80,8 @@ class Checkpointer:
 
     def _save(self, runs: list[MapperRun], mapper: Stateful | None, num_registered: int) -> None:
         def collect() -> CheckpointArrays:
-            progress = MapperProgress(runs, None if mapper is None else mapper.state_dict())
-            states = [run.state_dict() for run in runs]
-            return flatten_state({**progress._asdict(), "runs": states})
+            state = None if mapper is None else mapper.state_dict()
+            return flatten_state({"runs": [run.state_dict() for run in runs], "mapper": state})
 
         assert self._store is not None
         self._store.save(collect, num_registered)

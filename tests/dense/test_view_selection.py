@@ -1,4 +1,4 @@
-"""Tests of the selection of source views for stereo."""
+"""Tests that select the source views of multi-view stereo."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_select_source_views_opposite_views_are_not_selected(hall) -> None:
 
 
 def test_select_source_views_occluded_views_are_not_selected(hall) -> None:
-    """A wall directly in front of a camera hides everything that other views see."""
+    """A camera that only sees a wall in front of it is no source view of other cameras."""
     walled = []
     for image in hall[::2]:
         depth = np.full_like(image.depth.depth, 0.05)

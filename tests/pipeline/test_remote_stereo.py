@@ -1,6 +1,6 @@
-"""Tests of the dense stage with an executor that runs all items in this process.
+"""Tests of the dense stage with an executor without workers, which runs all items in this process.
 
-The tests of mpsfm-dask and mpsfm-ray run the dense stage on real clusters.
+The plugins mpsfm-dask and mpsfm-ray have tests of the dense stage with worker processes.
 """
 
 from __future__ import annotations

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -99,26 +100,18 @@ def estimate_relative_poses(problem: MappingProblem, changed: Bool, seed: int) -
         changed: (n,) bool mask of the images with changed intrinsics or keypoints.
         seed: Seed of RANSAC.
     """
-    images = problem.images
-    keypoints = [_undistort_keypoints(image) for image in images]
+    keypoints = [_undistort_keypoints(image) for image in problem.images]
 
     def estimate(pair: VerifiedPair) -> VerifiedPair:
-        a, b = pair.image_a, pair.image_b
-        if not (changed[a] or changed[b]):
-            return pair
-        xy_a, xy_b = keypoints[a][pair.matches[:, 0]], keypoints[b][pair.matches[:, 1]]
-        return _estimate_relative_pose(pair, images[a], images[b], xy_a, xy_b, seed)
+        if changed[pair.image_a] or changed[pair.image_b]:
+            return _estimate_relative_pose(problem, keypoints, pair, seed)
+        return pair
 
     return replace(problem, pairs=tuple(parallel_map(estimate, problem.pairs)))
 
 
 def _estimate_relative_pose(
-    pair: VerifiedPair,
-    image_a: MappingImage,
-    image_b: MappingImage,
-    xy_a: Float64,
-    xy_b: Float64,
-    seed: int,
+    problem: MappingProblem, keypoints: Sequence[Float64], pair: VerifiedPair, seed: int
 ) -> VerifiedPair:
     """Return a pair with a new relative pose if COLMAP's two-view geometry has one.
 
@@ -126,22 +119,21 @@ def _estimate_relative_pose(
     homography.
 
     Args:
+        problem: Mapping problem that contains the pair.
+        keypoints: Keypoints (k, 2) of each image without its initial distortion, in pixels.
         pair: The pair.
-        image_a: First image of the pair.
-        image_b: Second image of the pair.
-        xy_a: (m, 2) matched keypoints of the first image without its initial distortion, in pixels.
-        xy_b: (m, 2) matched keypoints of the second image without its initial distortion.
         seed: Seed of RANSAC.
     """
+    image_a, image_b = problem.images[pair.image_a], problem.images[pair.image_b]
     options = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True, detect_watermark=False)
     options.ransac.max_error = MAX_ERROR_PX * max(image_a.keypoint_std_px, image_b.keypoint_std_px)
     options.ransac.min_inlier_ratio = MIN_INLIER_RATIO
     options.ransac.random_seed = seed
     geometry = pycolmap.estimate_calibrated_two_view_geometry(
         colmap_from_pinhole(image_a.camera),
-        xy_a,
+        keypoints[pair.image_a][pair.matches[:, 0]],
         colmap_from_pinhole(image_b.camera),
-        xy_b,
+        keypoints[pair.image_b][pair.matches[:, 1]],
         np.repeat(np.arange(len(pair), dtype=np.uint32)[:, None], 2, axis=1),
         options,
     )

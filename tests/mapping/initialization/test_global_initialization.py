@@ -91,7 +91,7 @@ def test_bridge_separates_components_and_largest_is_returned(hall: HallProblem) 
 
 
 def draw_links(rng: np.random.Generator, count: int, end: int) -> Int64:
-    """Draw fewer than ``end`` distinct edges (m, 2) of a graph with ``count`` nodes."""
+    """Draw a graph with ``count`` nodes and 1 to ``end - 1`` edges; return the edges (m, 2)."""
     possible = np.stack(np.triu_indices(count, 1), axis=1)
     return possible[rng.choice(len(possible), rng.integers(1, end), replace=False)]
 
