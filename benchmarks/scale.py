@@ -152,7 +152,7 @@ def _measure(scene: Path, views: int, method: str, part_images: int) -> dict[str
 
 
 def store_scene(scene: str, views: int, folder: Path) -> Path:
-    """Write mapping problem and true poses of a scene to a file, unless it exists; return its path."""
+    """Return the path of the file of a scene, which is written if it does not exist."""
     path = folder / f"{scene}-{views}.npz"
     if not path.exists():
         folder.mkdir(parents=True, exist_ok=True)
