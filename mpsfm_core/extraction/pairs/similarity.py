@@ -68,13 +68,16 @@ def match_score(a: Float32, b: Float32) -> float:
     """
     if not len(a) or not len(b):
         return 0.0
-    squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)
-    nearest, back = squared.argmin(axis=1), squared.argmin(axis=0)
-    rows = np.flatnonzero(back[nearest] == np.arange(len(a)))
-    columns = nearest[rows]
-    first = np.maximum(squared[rows, columns], 0)
+    squared = a @ (-2 * b).T
+    squared += (a * a).sum(axis=1)[:, None]
+    squared += (b * b).sum(axis=1)
+    # Minima of all rows and columns are several times faster than those of selected ones.
+    columns = squared.argmin(axis=1)
+    first = squared[np.arange(len(a)), columns]
+    rows = np.flatnonzero(first == squared.min(axis=0)[columns])
+    columns, first = columns[rows], np.maximum(first[rows], 0)
     squared[rows, columns] = np.inf
-    second = np.minimum(squared[rows].min(axis=1), squared[:, columns].min(axis=0))
+    second = np.minimum(squared.min(axis=1)[rows], squared.min(axis=0)[columns])
     return float((1 - np.sqrt(np.minimum(first / np.maximum(second, _TINY), 1))).sum())
 
 
