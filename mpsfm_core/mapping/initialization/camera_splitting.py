@@ -26,6 +26,7 @@ from mpsfm_core.mapping.registration.pose_hypotheses import (
     estimate_pose_with_focal,
 )
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
+from mpsfm_core.support.threads import parallel_map
 
 MIN_FOCAL_RATIO = 1.05
 """Ratio between the focal length of an image and that of its shared camera, from which the image
@@ -79,12 +80,14 @@ def find_deviating_focals(
         and not image.camera_model.is_fisheye
         and (num_images[image.shared_camera] > 1) == is_shared
     }
-    focals = {}
-    for index, (keypoints, points) in _collect_correspondences(problem, model, examined).items():
+    correspondences = _collect_correspondences(problem, model, examined)
+
+    def measure(index: int) -> float | None:
+        keypoints, points = correspondences[index]
         image = problem.images[index]
         camera = cameras.get(image.shared_camera, image.camera)
         if len(keypoints) < options.min_inliers:
-            continue
+            return None
         step = max(1, len(keypoints) // MAX_FOCAL_CORRESPONDENCES)
         xy, xyz = image.keypoints[keypoints[::step]], model.points[points[::step]]
         distortion = distortions.get(image.shared_camera, image.distortion)
@@ -93,14 +96,15 @@ def find_deviating_focals(
         shared = estimate_absolute_pose(camera, xy, xyz, options, seed)
         cost = _measure_cost(camera, shared[:2], xy, xyz, max_error_px) if shared else 1.0
         if cost < MIN_COST:
-            continue
+            return None
         own = estimate_pose_with_focal(camera, xy, xyz, options, seed)
         if own is None or abs(np.log(own.focal_px / camera.fx)) < np.log(MIN_FOCAL_RATIO):
-            continue
+            return None
         own_cost = _measure_cost(own.camera, own.pose, xy, xyz, max_error_px)
-        if own_cost < MAX_COST_RATIO * cost:
-            focals[index] = own.focal_px
-    return focals
+        return own.focal_px if own_cost < MAX_COST_RATIO * cost else None
+
+    focals = zip(correspondences, parallel_map(measure, list(correspondences)), strict=True)
+    return {index: focal_px for index, focal_px in focals if focal_px is not None}
 
 
 def split_cameras(
