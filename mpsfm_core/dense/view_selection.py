@@ -28,7 +28,7 @@ _OCCLUSION_STDS = 1.5
 """Minimum distance of an occluded point behind the visible surface, in stds of log depth [ours]."""
 
 
-class _SampledViews(NamedTuple):
+class _DepthGrids(NamedTuple):
     """Poses and depth maps of m views, sampled on coarse pixel grids."""
 
     params: Float64
@@ -45,6 +45,12 @@ class _SampledViews(NamedTuple):
     """(m, rows, max columns) natural log of depth at the pixels of the coarse grids."""
     log_std: Float64
     """(m,) median std of log depth of each view."""
+
+
+class _SampledViews(NamedTuple):
+    """Sampled depth maps of m views, with their points and frusta."""
+
+    grids: _DepthGrids
     points: list[Float64]
     """(n, 3) world points of the grid pixels of each view."""
     frusta: Float64
@@ -97,15 +103,15 @@ def _sample_views(images: Sequence[RegisteredImage]) -> _SampledViews:
     params = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras])
     poses = np.concatenate([rotations, translations[:, :, None]], axis=2)
     frusta = _frustum_planes(params, columns) @ poses
-    sampled = params, columns, rotations, translations, centers, log_depth, log_std
-    return _SampledViews(*sampled, points, frusta[:, :, 0], log_depth.max(axis=(1, 2)))
+    grids = _DepthGrids(params, columns, rotations, translations, centers, log_depth, log_std)
+    return _SampledViews(grids, points, frusta[:, :, 0], log_depth.max(axis=(1, 2)))
 
 
 def _select_sources(views: _SampledViews, row: int, max_sources: int) -> list[int]:
     """Select the source views of one image greedily."""
     sources = _find_overlapping_views(views, row)
     scores = np.zeros((len(sources), len(views.points[row])))
-    _score_points(row, sources, views.points[row], *views[:7], scores)
+    _score_points(row, sources, views.points[row], views.grids, scores)
     useful = scores.mean(axis=1) >= _MIN_GAIN  # Gains only decrease during the selection.
     sources, scores = sources[useful], scores[useful]
     selected: list[int] = []
@@ -143,7 +149,7 @@ def _find_overlapping_views(views: _SampledViews, row: int) -> Int64:
     center = (points.min(axis=0) + points.max(axis=0)) / 2
     radius = np.linalg.norm(points - center, axis=1).max()
     distances = views.frusta @ np.append(center, 1.0)
-    max_behind = _OCCLUSION_STDS * np.maximum(views.log_std[row], views.log_std)
+    max_behind = _OCCLUSION_STDS * np.maximum(views.grids.log_std[row], views.grids.log_std)
     max_depth = np.exp(views.max_log_depth + max_behind)
     overlaps = (distances >= -radius).all(axis=0) & (distances[0] <= max_depth + radius)
     overlaps[row] = False
@@ -152,27 +158,17 @@ def _find_overlapping_views(views: _SampledViews, row: int) -> Int64:
 
 @kernel()
 def _score_points(
-    reference: int,
-    sources: Int64,
-    points: Float64,
-    params: Float64,
-    columns: Int64,
-    rotations: Float64,
-    translations: Float64,
-    centers: Float64,
-    log_depth: Float64,
-    log_std: Float64,
-    scores: Float64,
+    reference: int, sources: Int64, points: Float64, grids: _DepthGrids, scores: Float64
 ) -> None:
     """Compute a score in [0, 1] of source views for stereo at each point of the reference view.
 
     The view score is the product of a term for the triangulation angle and a term for the ratio of
     distances. Occluded points have the score 0.
 
-    The arrays from `params` to `log_std` are the fields of :class:`_SampledViews`. `points` are the
-    (n, 3) world points of the view `reference`. The array `scores` (k, n) of the k `sources` is the
-    output.
+    `points` are the (n, 3) world points of the view `reference`. The array `scores` (k, n) of the k
+    `sources` is the output.
     """
+    params, columns, rotations, translations, centers, log_depth, log_std = grids
     rows = log_depth.shape[1]
     for index, source in enumerate(sources):
         fx, fy, cx, cy = params[source]
