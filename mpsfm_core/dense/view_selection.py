@@ -48,7 +48,7 @@ class _DepthGrids(NamedTuple):
 
 
 class _SampledViews(NamedTuple):
-    """Sampled depth maps of m views, with their points and frusta."""
+    """Depth grids of m views, with the world points of their pixels and the view frusta."""
 
     grids: _DepthGrids
     points: list[Float64]

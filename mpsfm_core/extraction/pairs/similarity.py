@@ -71,7 +71,7 @@ def match_score(a: Float32, b: Float32) -> float:
     squared = a @ (-2 * b).T
     squared += (a * a).sum(axis=1)[:, None]
     squared += (b * b).sum(axis=1)
-    # Minima of all rows and columns are several times faster than those of selected ones.
+    # The minimum over the full matrix is faster than indexing rows and columns, which copies them.
     columns = squared.argmin(axis=1)
     first = squared[np.arange(len(a)), columns]
     rows = np.flatnonzero(first == squared.min(axis=0)[columns])
