@@ -24,6 +24,7 @@ from scipy.cluster.vq import kmeans2, vq
 from scipy.sparse import csr_array
 
 from mpsfm_core.data import Features, Float32, Float64, Int64
+from mpsfm_core.providers.builtin.mutual_nearest import mutual_nearest
 
 NUM_DESCRIPTORS = 512
 """Number of descriptors per image that are compared. The cost of comparison grows with the square
@@ -66,19 +67,8 @@ def match_score(a: Float32, b: Float32) -> float:
         a: (n, d) descriptors of the first image.
         b: (m, d) descriptors of the second image.
     """
-    if not len(a) or not len(b):
-        return 0.0
-    squared = a @ (-2 * b).T
-    squared += (a * a).sum(axis=1)[:, None]
-    squared += (b * b).sum(axis=1)
-    # The minimum over the full matrix is faster than indexing rows and columns, which copies them.
-    columns = squared.argmin(axis=1)
-    first = squared[np.arange(len(a)), columns]
-    rows = np.flatnonzero(first == squared.min(axis=0)[columns])
-    columns, first = columns[rows], np.maximum(first[rows], 0)
-    squared[rows, columns] = np.inf
-    second = np.minimum(squared.min(axis=1)[rows], squared.min(axis=0)[columns])
-    return float((1 - np.sqrt(np.minimum(first / np.maximum(second, _TINY), 1))).sum())
+    _, _, ratios = mutual_nearest(a, b)
+    return float((1 - ratios).sum())
 
 
 def candidate_pairs(descriptors: Sequence[Float32]) -> Int64:
