@@ -12,6 +12,7 @@ import numpy as np
 
 from mpsfm_core.data import Float64, Int64
 from mpsfm_core.geometry import camera_center, pixel_centers, sample_nearest, unproject
+from mpsfm_core.geometry.frustum import frustum_planes
 from mpsfm_core.mapping.scene.reconstruction import RegisteredImage
 from mpsfm_core.support.jit import kernel
 from mpsfm_core.support.threads import parallel_map
@@ -54,9 +55,7 @@ class _SampledViews(NamedTuple):
     points: list[Float64]
     """(n, 3) world points of the grid pixels of each view."""
     frusta: Float64
-    """(5, m, 4) planes of the view frusta, world frame: the plane z = 0 of the camera frame, and
-    the planes through the image borders. The product with a homogeneous point is its distance from
-    the plane, positive inside."""
+    """(m, 5, 4) planes of the view frusta, world frame."""
     max_log_depth: Float64
     """(m,) natural log of the largest depth of each view."""
 
@@ -101,10 +100,10 @@ def _sample_views(images: Sequence[RegisteredImage]) -> _SampledViews:
         log_depth[row, :, : camera.width] = np.log(depth).reshape(_GRID_ROWS, -1)
         points.append(unproject(camera, xy, depth) @ image.rotation + centers[row])
     params = np.array([(c.fx, c.fy, c.cx, c.cy) for c in cameras])
-    poses = np.concatenate([rotations, translations[:, :, None]], axis=2)
-    frusta = _frustum_planes(params, columns) @ poses
+    sizes = np.array([c.size for c in cameras], np.float64)
+    frusta = frustum_planes(rotations, translations, params, sizes)
     grids = _DepthGrids(params, columns, rotations, translations, centers, log_depth, log_std)
-    return _SampledViews(grids, points, frusta[:, :, 0], log_depth.max(axis=(1, 2)))
+    return _SampledViews(grids, points, frusta, log_depth.max(axis=(1, 2)))
 
 
 def _select_sources(views: _SampledViews, row: int, max_sources: int) -> list[int]:
@@ -127,18 +126,6 @@ def _select_sources(views: _SampledViews, row: int, max_sources: int) -> list[in
     return [int(sources[best]) for best in selected]
 
 
-def _frustum_planes(params: Float64, columns: Int64) -> Float64:
-    """Compute the unit normals (5, m, 1, 3) of the frustum planes in the camera frames."""
-    fx, fy, cx, cy = params.T
-    zero, one = np.zeros_like(fx), np.ones_like(fx)
-    left, right = (fx, zero, cx), (-fx, zero, columns - cx)
-    top, bottom = (zero, fy, cy), (zero, -fy, _GRID_ROWS - cy)
-    planes = np.array([(zero, zero, one), left, right, top, bottom])
-    normals: Float64 = planes.transpose(0, 2, 1)[:, :, None]
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    return normals
-
-
 def _find_overlapping_views(views: _SampledViews, row: int) -> Int64:
     """Return the other views (k,) that may see points of a view, by their frusta.
 
@@ -151,7 +138,7 @@ def _find_overlapping_views(views: _SampledViews, row: int) -> Int64:
     distances = views.frusta @ np.append(center, 1.0)
     max_behind = _OCCLUSION_STDS * np.maximum(views.grids.log_std[row], views.grids.log_std)
     max_depth = np.exp(views.max_log_depth + max_behind)
-    overlaps = (distances >= -radius).all(axis=0) & (distances[0] <= max_depth + radius)
+    overlaps = (distances >= -radius).all(axis=1) & (distances[:, 0] <= max_depth + radius)
     overlaps[row] = False
     return np.flatnonzero(overlaps)
 

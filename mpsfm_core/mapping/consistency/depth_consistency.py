@@ -46,6 +46,7 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera
 from mpsfm_core.geometry import pixel_centers, unproject
+from mpsfm_core.geometry.frustum import frustum_planes
 from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.refinement.depth_noise import (
     find_well_constrained_keypoints,
@@ -330,7 +331,6 @@ def _select_images_with_depth(scene: Scene) -> Int64:
     return registered[np.array(is_active, dtype=np.bool_)]
 
 
-@jit.kernel()
 def count_visible_points(
     points: Float64, rotations: Float64, translations: Float64, intrinsics: Float64, sizes: Float64
 ) -> Int64:
@@ -348,6 +348,20 @@ def count_visible_points(
     Returns:
         (n,) int64.
     """
+    frusta = frustum_planes(rotations, translations, intrinsics, sizes)
+    return _count_visible_points(points, rotations, translations, intrinsics, sizes, frusta)
+
+
+@jit.kernel()
+def _count_visible_points(
+    points: Float64,
+    rotations: Float64,
+    translations: Float64,
+    intrinsics: Float64,
+    sizes: Float64,
+    frusta: Float64,
+) -> Int64:
+    """Count the points that project into each image, with the planes (n, 5, 4) of its frustum."""
     num_groups = (len(points) + POINT_GROUP - 1) // POINT_GROUP
     spheres = np.zeros((num_groups, 4))  # center and radius
     for group in range(num_groups):
@@ -362,25 +376,18 @@ def count_visible_points(
             spheres[group, 3] = max(spheres[group, 3], radius)
     counts = np.zeros(len(rotations), np.int64)
     for image in range(len(rotations)):
-        r, t = rotations[image], translations[image]
+        r, t, planes = rotations[image], translations[image], frusta[image]
         fx, fy, cx, cy = intrinsics[image]
         width, height = sizes[image]
-        right, bottom = width - cx, height - cy
-        to_left, to_right = math.hypot(fx, cx), math.hypot(fx, right)
-        to_top, to_bottom = math.hypot(fy, cy), math.hypot(fy, bottom)
         for group in range(num_groups):
             x, y, z, radius = spheres[group]
-            u = fx * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0])
-            v = fy * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1])
-            depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
-            # the sphere is behind the camera, or beyond one of the four planes of the view frustum
-            if (
-                depth < -radius
-                or u + cx * depth < -radius * to_left
-                or right * depth - u < -radius * to_right
-                or v + cy * depth < -radius * to_top
-                or bottom * depth - v < -radius * to_bottom
-            ):
+            is_outside = False
+            for a in range(5):
+                nx, ny, nz, offset = planes[a]
+                if nx * x + ny * y + nz * z + offset < -radius:
+                    is_outside = True
+                    break
+            if is_outside:
                 continue
             for k in range(group * POINT_GROUP, min((group + 1) * POINT_GROUP, len(points))):
                 x, y, z = points[k]
