@@ -2,7 +2,9 @@
 
 Rooms that look alike have verified matches. If the mapper places keyframes of two such rooms in the
 same room, the camera jumps somewhere between the rooms, although a camera cannot jump within a
-shot. Matches between distant keyframes before and after the jump are then wrong.
+shot. Matches between distant keyframes before and after the jump may then be wrong. A model
+without them shows which are right: the places that they join are close to each other there, up to
+the drift of the camera between both keyframes.
 
 A fast turn looks like a cut in single frames, and then divides a shot in two. Matches between the
 keyframes on both sides show that there is no cut.
@@ -11,11 +13,13 @@ Usage::
 
     shots = join_shots(shots, problem)
     jumps = find_jumps(reconstructions, shots)
-    problem = remove_matches_across(problem, jumps, shots)      # then map again
+    shorter = remove_matches_across(problem, jumps, shots)      # then map again
+    problem = restore_right_matches(shorter, problem, reconstructions, shots)   # and map again
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -23,7 +27,7 @@ from pathlib import PurePosixPath
 
 import numpy as np
 
-from mpsfm_core.data import MappingProblem
+from mpsfm_core.data import Float64, MappingProblem, VerifiedPair
 from mpsfm_core.geometry import camera_center, rotation_angle_deg
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
@@ -42,6 +46,9 @@ _SPEED_QUANTILE = 0.9
 NUM_NEIGHBORS = 10
 """Number of following keyframes with which a keyframe may be matched across a jump.
 [COLMAP sequential_matching.overlap]"""
+MAX_DRIFT = 0.1
+"""Maximum distance of a place from itself in the model without the matches across jumps, relative
+to the length of the path between the two keyframes that see it. [tuned: benchmarks.walks]"""
 
 
 def join_shots(shots: Sequence[Shot], problem: MappingProblem) -> list[Shot]:
@@ -107,6 +114,69 @@ def remove_matches_across(
     names = [image.name for image in problem.images]
     pairs = [p for p in problem.pairs if not is_across(names[p.image_a], names[p.image_b])]
     return replace(problem, pairs=tuple(pairs))
+
+
+def restore_right_matches(
+    shorter: MappingProblem,
+    problem: MappingProblem,
+    reconstructions: Sequence[Reconstruction],
+    shots: Sequence[Shot],
+) -> MappingProblem:
+    """Add removed pairs back whose places agree in the model without them, up to drift.
+
+    The matched keypoints of a pair have two 3D points each, if the model does not know that they
+    are the same. The pair is right if their median distance is at most :data:`MAX_DRIFT` of the
+    length of the path of the camera between both keyframes.
+
+    Args:
+        shorter: Problem without the pairs across jumps.
+        problem: Problem with all pairs.
+        reconstructions: Components of the model of `shorter`.
+        shots: Keyframes of all shots.
+    """
+    kept = set(shorter.pairs)
+    for part in reconstructions:
+        images = {image.index: image for image in part.confirmed_images}
+        for lengths in _measure_paths(part, shots):
+            kept.update(
+                pair
+                for pair in problem.pairs
+                if pair.image_a in lengths
+                and pair.image_b in lengths
+                and _measure_displacement(pair, images, part.points)
+                <= MAX_DRIFT * abs(lengths[pair.image_a] - lengths[pair.image_b])
+            )
+    return replace(problem, pairs=tuple(pair for pair in problem.pairs if pair in kept))
+
+
+def _measure_displacement(
+    pair: VerifiedPair, images: Mapping[int, RegisteredImage], points: Float64
+) -> float:
+    """Return the median distance of the two 3D points of matched keypoints, in world units.
+
+    It is infinite for less than :data:`MIN_COMMON_POINTS` matches with two points.
+    """
+    ids = np.stack(
+        [
+            images[image].point_ids[pair.matches[:, side]]
+            for side, image in enumerate((pair.image_a, pair.image_b))
+        ]
+    )
+    first, second = points[ids[:, (ids >= 0).all(axis=0)]]
+    if len(first) < MIN_COMMON_POINTS:
+        return math.inf
+    return float(np.median(np.linalg.norm(first - second, axis=1)))
+
+
+def _measure_paths(part: Reconstruction, shots: Sequence[Shot]) -> Iterator[dict[int, float]]:
+    """Yield the length of the path to each keyframe, by its image, for each shot of a component."""
+    images = {image.name: image for image in part.confirmed_images}
+    for shot in shots:
+        registered = [images[name] for name in shot if name in images]
+        centers = np.array([camera_center(i.rotation, i.translation) for i in registered])
+        steps = np.linalg.norm(np.diff(centers.reshape(-1, 3), axis=0), axis=1)
+        lengths = np.cumsum([0.0, *steps])
+        yield {image.index: length for image, length in zip(registered, lengths, strict=True)}
 
 
 def _find_jumps_of_part(part: Reconstruction, shots: Sequence[Shot]) -> Iterator[Jump]:

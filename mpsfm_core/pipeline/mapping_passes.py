@@ -20,7 +20,13 @@ from mpsfm_core.config import Config
 from mpsfm_core.data import Bool, MappingProblem
 from mpsfm_core.extraction.runner import Extraction, extend_matches, predict_priors_again
 from mpsfm_core.inputs.images import ImageSet
-from mpsfm_core.mapping.camera_jumps import Jump, find_jumps, join_shots, remove_matches_across
+from mpsfm_core.mapping.camera_jumps import (
+    Jump,
+    find_jumps,
+    join_shots,
+    remove_matches_across,
+    restore_right_matches,
+)
 from mpsfm_core.mapping.initialization.refined_focal_lengths import estimate_relative_poses
 from mpsfm_core.mapping.initialization.rig_calibration import calibrate_rigs
 from mpsfm_core.mapping.initialization.seed_poses import apply_seed_poses, select_seed_images
@@ -212,9 +218,14 @@ class MappingPasses:
             options: Options of the mapper, by default those of the configuration.
         """
         options = options or self._config.mapper_options()
-        mapping = self._map(problem, options)
         shots = join_shots(self._shots, problem)
-        self.jumps = find_jumps(mapping.reconstructions, shots)
+
+        def run_mapper(problem: MappingProblem) -> MappingResult:
+            mapping = self._map(problem, options)
+            self.jumps = find_jumps(mapping.reconstructions, shots)
+            return mapping
+
+        complete, mapping = problem, run_mapper(problem)
         for _ in range(_MAX_JUMP_RUNS):
             shorter = remove_matches_across(problem, self.jumps, shots)
             num_removed = len(problem.pairs) - len(shorter.pairs)
@@ -225,10 +236,16 @@ class MappingPasses:
                 f"the camera jumps between the frames {first} and {second}, so the "
                 f"matches of {num_removed} pairs of distant frames across a jump are not used"
             )
-            kept = remove_matches_across(extraction.problem, self.jumps, shots)
-            extraction = replace(extraction, problem=kept)
-            problem, mapping = shorter, self._map(shorter, options)
-            self.jumps = find_jumps(mapping.reconstructions, shots)
+            problem, mapping = shorter, run_mapper(shorter)
+        restored = restore_right_matches(problem, complete, mapping.reconstructions, shots)
+        num_restored = len(restored.pairs) - len(problem.pairs)
+        if num_restored:
+            self._stages.notice(
+                f"{num_restored} of these pairs match places that are close to each other in the "
+                "model without them, so they are used again"
+            )
+            problem, mapping = restored, run_mapper(restored)
+        extraction = replace(extraction, problem=_select_pairs(extraction.problem, problem))
         return MappedImages(extracted_views, extraction, mapped_views, mapping)
 
     def _map(self, problem: MappingProblem, options: MapperOptions) -> MappingResult:
@@ -260,6 +277,13 @@ class MappingPasses:
                 runtime.cache_dir, problem, options, self._stages, runtime.checkpoint_s
             )
         )
+
+
+def _select_pairs(problem: MappingProblem, mapped: MappingProblem) -> MappingProblem:
+    """Return the problem with the pairs of images that the mapped problem has."""
+    kept = {(pair.image_a, pair.image_b) for pair in mapped.pairs}
+    pairs = (pair for pair in problem.pairs if (pair.image_a, pair.image_b) in kept)
+    return replace(problem, pairs=tuple(pairs))
 
 
 def _find_changes(images: ImageSet, refined: ImageSet) -> Bool:
