@@ -14,7 +14,7 @@ Usage::
     shots = join_shots(shots, problem)
     jumps = find_jumps(reconstructions, shots)
     shorter = remove_matches_across(problem, jumps, shots)      # then map again
-    problem = restore_right_matches(shorter, problem, reconstructions, shots)   # and map again
+    problem = restore_right_matches(shorter, problem, reconstructions, shots)  # and map again
 """
 
 from __future__ import annotations

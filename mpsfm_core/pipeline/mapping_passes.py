@@ -1,7 +1,7 @@
 """Mapper runs of one reconstruction, from the first pass to refined depth maps.
 
 1. The first pass maps all images. If a video camera jumps in the result, the images are mapped
-   again without the matches between look-alike places.
+   again without the matches across the jump, and once more with those that this model confirms.
 2. If the estimated distortion is strong, depth is predicted again in undistorted views, and the
    images are mapped again.
 3. With a fast first pass, the second pass matches images with too few points by the configured
@@ -52,7 +52,7 @@ _MIN_DISTORTION = 0.1
 """Relative displacement of the image corners by lens distortion from which depth is predicted again
 in undistorted images. [tuned: benchmarks.distortion]"""
 _MAX_JUMP_RUNS = 3
-"""Maximum number of mapper runs without matches of look-alike places in a video. [ours]"""
+"""Maximum number of mapper runs without matches across jumps of a video camera. [ours]"""
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class MappingPasses:
         problem: MappingProblem,
         options: MapperOptions | None = None,
     ) -> MappedImages:
-        """Map, and map again without matches of look-alike places if the camera of a video jumps.
+        """Map, and map again without wrong matches if the camera of a video jumps.
 
         Args:
             extracted_views: Images in whose undistorted views the extraction is.

@@ -16,7 +16,13 @@ from mpsfm_core.data import (
     PinholeCamera,
     VerifiedPair,
 )
-from mpsfm_core.mapping.camera_jumps import find_jumps, join_shots, remove_matches_across
+from mpsfm_core.mapping.camera_jumps import (
+    MAX_DRIFT,
+    find_jumps,
+    join_shots,
+    remove_matches_across,
+    restore_right_matches,
+)
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 
 CAMERA = PinholeCamera(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -122,3 +128,39 @@ def test_remove_matches_across_keeps_neighbors_and_pairs_on_one_side() -> None:
         end for end in ends if end not in [(5, 25), (9, 20), (8, 20)]
     ]
     assert len(remove_matches_across(problem, [], [SHOT]).pairs) == len(ends)
+
+
+def restore_pair_of_loop(offset: float, num_matches: int, num_shots: int = 1) -> int:
+    """Return the number of restored pairs of keyframes 0 and 20, between which the path is 2.
+
+    Args:
+        offset: Distance of the places that both keyframes see.
+        num_matches: Number of matches of the pair.
+        num_shots: Number of shots with equal numbers of keyframes.
+    """
+    part = build_walk(walk())
+    points = part.points.copy()
+    points[part.images[20].point_ids, 0] = offset
+    part = replace(part, points=points)
+    pair = build_problem([(0, 20)], num_matches).pairs[0]
+    keypoints = np.zeros((40, 2))
+    problem = build_problem([(0, 1)])
+    images = tuple(replace(image, keypoints=keypoints) for image in problem.images)
+    complete = replace(problem, images=images, pairs=(*problem.pairs, pair))
+    length = len(NAMES) // num_shots
+    shots = [dict(list(SHOT.items())[i : i + length]) for i in range(0, len(NAMES), length)]
+    restored = restore_right_matches(
+        replace(complete, pairs=problem.pairs), complete, [part], shots
+    )
+    assert restored.pairs[0] is problem.pairs[0]
+    return len(restored.pairs) - 1
+
+
+@pytest.mark.parametrize(("drift", "num_restored"), [(0.9 * MAX_DRIFT, 1), (1.1 * MAX_DRIFT, 0)])
+def test_pairs_whose_places_agree_up_to_drift_are_restored(drift: float, num_restored: int) -> None:
+    assert restore_pair_of_loop(2.0 * drift, 15) == num_restored
+
+
+def test_pairs_that_the_model_does_not_confirm_are_not_restored() -> None:
+    assert restore_pair_of_loop(0.0, 14) == 0
+    assert restore_pair_of_loop(0.0, 15, num_shots=2) == 0
