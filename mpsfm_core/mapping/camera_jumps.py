@@ -46,7 +46,7 @@ _SPEED_QUANTILE = 0.9
 NUM_NEIGHBORS = 10
 """Number of following keyframes with which a keyframe may be matched across a jump.
 [COLMAP sequential_matching.overlap]"""
-MAX_DRIFT = 0.2
+MAX_DRIFT = 0.25
 """Maximum distance of a place from itself in the model without the matches across jumps, relative
 to the length of the path between the two keyframes that see it. [tuned: benchmarks.walks]"""
 
