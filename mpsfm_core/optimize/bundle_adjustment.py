@@ -287,15 +287,14 @@ class SchurComplementSolver:
             for array, summand in zip(self.total, part, strict=True):
                 array += summand
         self._add_scale_prior(state)
-        self._add_intrinsic_priors(state)
+        self._add_intrinsic_prior(state)
         self.total.rhs[:] += self.total.gradient
         self._fix_constants()
         return cost + self._prior_cost(state)
 
     def _prior_cost(self, state: kernels.BundleParameters) -> float:
         """Return the cost of the priors on depth scales and intrinsic parameters."""
-        costs = (prior.cost(state) for prior in self.p.intrinsic_priors)
-        return sum(costs, self.p.scale_prior.cost(state))
+        return self.p.scale_prior.cost(state) + self.p.intrinsic_prior.cost(state)
 
     def _add_scale_prior(self, state: kernels.BundleParameters) -> None:
         """Add the prior of the depth maps' log scales to the reduced camera system."""
@@ -307,14 +306,13 @@ class SchurComplementSolver:
         residuals = state.log_scales[prior.image] - prior.log_scale
         self.total.gradient[rows] += prior.weight * residuals
 
-    def _add_intrinsic_priors(self, state: kernels.BundleParameters) -> None:
-        """Add the priors of intrinsic parameters to the reduced camera system."""
-        num_poses = self.p.bundle.layout.num_poses
-        for prior in self.p.intrinsic_priors:
-            rows = kernels.NUM_IMAGE_PARAMS * num_poses + prior.slot
-            self.total.corner[prior.slot, prior.slot] += prior.weight
-            self.total.diagonal[rows] += prior.weight
-            self.total.gradient[rows] += prior.weight * prior.residuals(state)
+    def _add_intrinsic_prior(self, state: kernels.BundleParameters) -> None:
+        """Add the prior of intrinsic parameters to the reduced camera system."""
+        prior = self.p.intrinsic_prior
+        rows = kernels.NUM_IMAGE_PARAMS * self.p.bundle.layout.num_poses + prior.slot
+        self.total.corner[prior.slot, prior.slot] += prior.weight
+        self.total.diagonal[rows] += prior.weight
+        self.total.gradient[rows] += prior.weight * prior.residuals(state)
 
     def compute_intrinsic_stds(self, state: kernels.BundleParameters) -> Float64:
         """Compute the posterior standard deviation of intrinsic parameters.

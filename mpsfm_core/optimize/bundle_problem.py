@@ -127,23 +127,23 @@ class ScalePrior(NamedTuple):
 
 
 class IntrinsicPrior(NamedTuple):
-    """Gaussian prior on one variable intrinsic parameter of the cameras."""
+    """Gaussian prior on the variable intrinsic parameters of the cameras."""
 
-    parameter: IntrinsicParameter
     camera: Int64
-    """(s,) index of each camera."""
+    """(s,) index of the camera of each parameter."""
+    parameter: Int64
+    """(s,) :class:`~mpsfm_core.data.camera_models.IntrinsicParameter`."""
     slot: Int64
-    """(s,) intrinsic slot of the parameter of each camera."""
+    """(s,) intrinsic slot of each parameter."""
     mean: Float64
     """(s,) mean."""
     weight: Float64
-    """(s,) inverse variance of the prior on the parameter of each camera."""
+    """(s,) inverse variance of the prior on each parameter."""
 
     def residuals(self, state: kernels.BundleParameters) -> Float64:
         """Return the differences (s,) between intrinsic parameters and their prior means."""
-        intrinsics, distortion = state.intrinsics[self.camera], state.distortion[self.camera]
-        values = intrinsic_parameters(intrinsics, distortion)[:, self.parameter]
-        residuals: Float64 = values - self.mean
+        values = intrinsic_parameters(state.intrinsics, state.distortion)
+        residuals: Float64 = values[self.camera, self.parameter] - self.mean
         return residuals
 
     def cost(self, state: kernels.BundleParameters) -> float:
@@ -160,7 +160,7 @@ class PreparedBundle(NamedTuple):
     pairs: Int64
     """(b, 2) pose slots of the two images of each block of the reduced camera system."""
     scale_prior: ScalePrior
-    intrinsic_priors: list[IntrinsicPrior]
+    intrinsic_prior: IntrinsicPrior
     held: Bool
     """(s, 7) bool, True for constant parameters of the images with a pose slot."""
     ranges: list[PointRange]
@@ -235,7 +235,7 @@ def prepare_bundle(problem: BundleProblem, options: BundleOptions) -> PreparedBu
         state,
         pairs,
         _scale_prior(problem, variable_scale, layout.pose_slot),
-        _intrinsic_priors(problem, variable, intrinsic_slot),
+        _intrinsic_prior(problem, variable, intrinsic_slot),
         held[moving],
         _ranges(obs.start, len(pairs)),
         int(np.diff(obs.start).max(initial=0)),
@@ -355,9 +355,9 @@ def _variable_intrinsics(variable: Bool | None, cameras: int) -> Bool:
     return variable
 
 
-def _intrinsic_priors(
+def _intrinsic_prior(
     problem: BundleProblem, variable: Bool, slot: NDArray[np.int32]
-) -> list[IntrinsicPrior]:
+) -> IntrinsicPrior:
     shape = variable.shape
     std = np.asarray(problem.prior_std_intrinsics, dtype=np.float64)
     if std.ndim and std.shape != shape:
@@ -369,13 +369,10 @@ def _intrinsic_priors(
     if means is None:
         means = intrinsic_parameters(problem.intrinsics, problem.distortion)
     means = _numbers(means, "prior_intrinsics", shape)
-    priors = []
-    for parameter in IntrinsicParameter:
-        camera = np.flatnonzero(variable[:, parameter] & np.isfinite(std[:, parameter]))
-        slots = slot[camera, parameter].astype(np.int64)
-        weight = 1.0 / std[camera, parameter] ** 2
-        priors.append(IntrinsicPrior(parameter, camera, slots, means[camera, parameter], weight))
-    return priors
+    parameter, camera = np.nonzero((variable & np.isfinite(std)).T)
+    chosen = camera, parameter
+    slots = slot[chosen].astype(np.int64)
+    return IntrinsicPrior(camera, parameter, slots, means[chosen], 1.0 / std[chosen] ** 2)
 
 
 def _numbers(values: ArrayLike, name: str, shape: tuple[int, ...]) -> Float64:

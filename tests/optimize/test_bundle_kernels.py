@@ -107,8 +107,8 @@ def residuals(p: PreparedBundle, state: kernels.BundleParameters) -> Float64:
     depth = (np.log(camera[:, 2]) - scaled) * obs.depth_weight
     prior = p.scale_prior
     scales = (state.log_scales[prior.image] - prior.log_scale) * np.sqrt(prior.weight)
-    priors = [prior.residuals(state) * np.sqrt(prior.weight) for prior in p.intrinsic_priors]
-    return np.concatenate([np.column_stack([pixel, depth]).ravel(), scales, *priors])
+    intrinsics = p.intrinsic_prior.residuals(state) * np.sqrt(p.intrinsic_prior.weight)
+    return np.concatenate([np.column_stack([pixel, depth]).ravel(), scales, intrinsics])
 
 
 def numeric_jacobian(p: PreparedBundle) -> Float64:
@@ -148,9 +148,8 @@ def test_gradient_of_every_loss_equals_finite_differences(
 
     def cost(delta: Float64, points: Float64) -> float:
         state = moved(p, delta, points)
-        priors = [p.scale_prior, *p.intrinsic_priors]
-        total = sum(prior.cost(state) for prior in priors)
-        return total + sum(sight.cost for sight in sights(p, state))
+        priors = p.scale_prior.cost(state) + p.intrinsic_prior.cost(state)
+        return priors + sum(sight.cost for sight in sights(p, state))
 
     size = len(normal.total.gradient)
     numeric = np.empty_like(gradient)
