@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from contextvars import ContextVar
+from functools import cache
 from typing import TypeVar
 
 import cv2
@@ -33,14 +34,21 @@ def count_cores(groups: ControlGroups | None = None) -> int:
     cores.
 
     Args:
-        groups: Linux control groups with a CPU quota, by default those of this process.
+        groups: Linux control groups with a CPU quota, by default those of this process at the first
+            call.
     """
     if hasattr(os, "sched_getaffinity"):
         available = len(os.sched_getaffinity(0))
     else:
         available = os.cpu_count() or 1
-    quota = (groups or ControlGroups()).cpu_quota()
+    quota = _own_cpu_quota() if groups is None else groups.cpu_quota()
     return available if quota is None else max(1, min(available, math.ceil(quota)))
+
+
+@cache
+def _own_cpu_quota() -> float | None:
+    """Return the CPU quota of this process, which is read once, because files are slow."""
+    return ControlGroups().cpu_quota()
 
 
 def thread_limit() -> int:
