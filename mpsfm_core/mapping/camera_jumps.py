@@ -4,7 +4,9 @@ Rooms that look alike have verified matches. If the mapper places keyframes of t
 same room, the camera jumps somewhere between the rooms, although a camera cannot jump within a
 shot. Matches between distant keyframes before and after the jump may then be wrong. A model
 without them shows which are right: the places that they join are close to each other there, up to
-the drift of the camera between both keyframes.
+the drift of the camera between both keyframes. A closed loop can also make the camera jump, where
+successive keyframes share few points, but not further than the drift. Matches across such a small
+jump remain.
 
 A fast turn looks like a cut in single frames, and then divides a shot in two. Matches between the
 keyframes on both sides show that there is no cut.
@@ -24,6 +26,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import PurePosixPath
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,8 +36,18 @@ from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredIm
 
 Shot = Mapping[str, float]
 """Time stamp in seconds by name of each keyframe of a shot, ascending."""
-Jump = tuple[str, str]
-"""Names of the successive registered keyframes of a shot between which the camera jumps."""
+
+
+class Jump(NamedTuple):
+    """Two successive registered keyframes of a shot between which the camera jumps."""
+
+    before: str
+    """Name of the keyframe before the jump."""
+    after: str
+    """Name of the keyframe after the jump."""
+    is_drift: bool = False
+    """True if the camera jumps about as far as it drifts, and does not turn too fast."""
+
 
 MIN_SPEED_RATIO = 4.0
 """Minimum ratio of the speed of a jump to the 90 % quantile of the speed of the camera, for
@@ -46,6 +59,9 @@ _SPEED_QUANTILE = 0.9
 NUM_NEIGHBORS = 10
 """Number of following keyframes with which a keyframe may be matched across a jump.
 [COLMAP sequential_matching.overlap]"""
+MAX_DRIFT_JUMP = 0.1
+"""Maximum distance of a jump that drift may cause, relative to the length of the path of the camera
+in the shot. [tuned: benchmarks.walks]"""
 MAX_DRIFT = 0.25
 """Maximum distance of a place from itself in the model without the matches across jumps, relative
 to the length of the path between the two keyframes that see it. [tuned: benchmarks.walks]"""
@@ -91,8 +107,10 @@ def remove_matches_across(
 ) -> MappingProblem:
     """Remove the pairs of distant keyframes that are on both sides of a jump in the same shot.
 
-    Pairs of keyframes with less than :data:`NUM_NEIGHBORS` keyframes in between remain.
+    Pairs of keyframes with less than :data:`NUM_NEIGHBORS` keyframes in between remain, and all
+    pairs across a jump that drift may cause.
     """
+    jumps = [jump for jump in jumps if not jump.is_drift]
     if not jumps:
         return problem
     places = {
@@ -100,7 +118,7 @@ def remove_matches_across(
         for number, shot in enumerate(shots)
         for place, name in enumerate(shot)
     }
-    cuts = [(*places[before], places[after][1]) for before, after in jumps]
+    cuts = [(*places[jump.before], places[jump.after][1]) for jump in jumps]
 
     def is_across(a: str, b: str) -> bool:
         if a not in places or b not in places or places[a][0] != places[b][0]:
@@ -183,20 +201,27 @@ def _find_jumps_of_part(part: Reconstruction, shots: Sequence[Shot]) -> Iterator
     """Yield the jumps in one component."""
     images = {image.name: image for image in part.confirmed_images}
     steps: list[tuple[RegisteredImage, RegisteredImage]] = []
-    speeds = []
+    speeds, paths = [], []
     for shot in shots:
         registered = [(images[name], time_s) for name, time_s in shot.items() if name in images]
+        distances = []
         for (a, start_s), (b, end_s) in pairwise(registered):
             steps.append((a, b))
-            distance = np.linalg.norm(
-                camera_center(a.rotation, a.translation) - camera_center(b.rotation, b.translation)
+            distances.append(
+                np.linalg.norm(
+                    camera_center(a.rotation, a.translation)
+                    - camera_center(b.rotation, b.translation)
+                )
             )
             turn_deg = rotation_angle_deg(a.rotation @ b.rotation.T)
-            speeds.append([distance / (end_s - start_s), turn_deg / (end_s - start_s)])
+            speeds.append([distances[-1] / (end_s - start_s), turn_deg / (end_s - start_s)])
+        paths += [(distance, sum(distances)) for distance in distances]
     if not steps:
         return
     limits = MIN_SPEED_RATIO * np.quantile(speeds, _SPEED_QUANTILE, axis=0)
-    for (a, b), too_fast in zip(steps, (np.array(speeds) > limits).any(axis=1), strict=True):
+    too_fast = np.array(speeds) > limits
+    for (a, b), fast, (distance, path) in zip(steps, too_fast, paths, strict=True):
         common = np.intersect1d(a.point_ids[a.point_ids >= 0], b.point_ids)
-        if too_fast and len(common) < MIN_COMMON_POINTS:
-            yield a.name, b.name
+        if fast.any() and len(common) < MIN_COMMON_POINTS:
+            is_drift = not fast[1] and distance <= MAX_DRIFT_JUMP * path
+            yield Jump(a.name, b.name, bool(is_drift))

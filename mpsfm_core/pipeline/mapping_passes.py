@@ -231,9 +231,9 @@ class MappingPasses:
             num_removed = len(problem.pairs) - len(shorter.pairs)
             if not num_removed:
                 break
-            first, second = self.jumps[0]
+            jump = next(jump for jump in self.jumps if not jump.is_drift)
             self._stages.notice(
-                f"the camera jumps between the frames {first} and {second}, so the "
+                f"the camera jumps between the frames {jump.before} and {jump.after}, so the "
                 f"matches of {num_removed} pairs of distant frames across a jump are not used"
             )
             problem, mapping = shorter, run_mapper(shorter)

@@ -276,8 +276,8 @@ class _Run:
         self._add_doubts(extraction.doubts[num_doubts:])
         self._part_records = passes.part_records
         self._add_doubts(
-            DoubtReason.CAMERA_JUMP.because(image_a=before, image_b=after)
-            for before, after in passes.jumps
+            DoubtReason.CAMERA_JUMP.because(image_a=jump.before, image_b=jump.after)
+            for jump in passes.jumps
         )
         if not mapping.reconstructions:
             self._fail(images, extraction, mapping, originals)

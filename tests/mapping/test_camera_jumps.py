@@ -18,6 +18,8 @@ from mpsfm_core.data import (
 )
 from mpsfm_core.mapping.camera_jumps import (
     MAX_DRIFT,
+    MAX_DRIFT_JUMP,
+    Jump,
     find_jumps,
     join_shots,
     remove_matches_across,
@@ -70,13 +72,34 @@ def test_steady_walk_has_no_jump() -> None:
 def test_find_jumps_returns_the_keyframes_around_a_jump() -> None:
     centers = walk()
     centers[20:] *= -1
-    assert find_jumps([build_walk(centers, slice(20, None))], [SHOT]) == [(NAMES[19], NAMES[20])]
+    part = build_walk(centers, slice(20, None))
+    assert find_jumps([part], [SHOT]) == [Jump(NAMES[19], NAMES[20])]
+
+
+@pytest.mark.parametrize(("factor", "turned"), [(0.9, False), (1.1, False), (0.9, True)])
+def test_small_jump_without_a_turn_is_drift(factor: float, turned: bool) -> None:
+    """The camera moves by a multiple of the limit within 20 ms."""
+    centers = walk()
+    ratio = factor * MAX_DRIFT_JUMP
+    centers[20:, 2] += ratio / (1 - ratio) * 0.1 * (len(NAMES) - 2) - 0.1
+    shot = {name: time_s - 0.08 * (row >= 20) for row, (name, time_s) in enumerate(SHOT.items())}
+    part = build_walk(centers, slice(20, None))
+    if not turned:
+        images = (
+            replace(image, rotation=np.eye(3), translation=-center)
+            for image, center in zip(part.images, centers, strict=True)
+        )
+        part = replace(part, images=tuple(images))
+    is_drift = factor < 1 and not turned
+    jumps = find_jumps([part], [shot])
+    assert jumps == [Jump(NAMES[19], NAMES[20], is_drift)]
+    assert len(remove_matches_across(build_problem([(5, 25)]), jumps, [shot]).pairs) == is_drift
 
 
 @pytest.mark.parametrize(("num_common", "jumps"), [(0, 1), (14, 1), (15, 0)])
 def test_turn_on_the_spot_is_a_jump_with_few_common_points(num_common: int, jumps: int) -> None:
     part = build_walk(walk(), slice(20, None), num_common)
-    assert find_jumps([part], [SHOT]) == [(NAMES[19], NAMES[20])] * jumps
+    assert find_jumps([part], [SHOT]) == [Jump(NAMES[19], NAMES[20])] * jumps
 
 
 def test_jump_at_a_cut_is_allowed() -> None:
@@ -123,7 +146,7 @@ def test_shots_of_two_videos_are_not_joined() -> None:
 def test_remove_matches_across_keeps_neighbors_and_pairs_on_one_side() -> None:
     ends = [(0, 12), (15, 22), (5, 25), (19, 20), (21, 29), (9, 20), (8, 20), (0, 30)]
     problem = build_problem(ends)
-    kept = remove_matches_across(problem, [(NAMES[19], NAMES[20])], [SHOT])
+    kept = remove_matches_across(problem, [Jump(NAMES[19], NAMES[20])], [SHOT])
     assert [(p.image_a, p.image_b) for p in kept.pairs] == [
         end for end in ends if end not in [(5, 25), (9, 20), (8, 20)]
     ]

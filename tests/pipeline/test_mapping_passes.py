@@ -11,6 +11,7 @@ import pytest
 from mpsfm_core.config import load_config
 from mpsfm_core.data import MappingImage, MappingProblem, NormalPrior, VerifiedPair
 from mpsfm_core.extraction.runner import Extraction
+from mpsfm_core.mapping.camera_jumps import Jump
 from mpsfm_core.mapping.parts import part_mapping
 from mpsfm_core.mapping.scene.reconstruction import (
     MappingReport,
@@ -81,4 +82,4 @@ def test_pairs_across_a_jump_are_removed_unless_the_model_without_them_confirms_
     assert mapped == ([PAIR_ENDS, kept, PAIR_ENDS] if is_restored else [PAIR_ENDS, kept])
     assert [(pair.image_a, pair.image_b) for pair in extraction.problem.pairs] == used
     assert mapping.reconstructions == (results[-1],)
-    assert passes.jumps == ([(NAMES[19], NAMES[20])] if results[-1] is JUMPING else [])
+    assert passes.jumps == ([Jump(NAMES[19], NAMES[20])] if results[-1] is JUMPING else [])
