@@ -46,7 +46,7 @@ class Jump(NamedTuple):
     after: str
     """Name of the keyframe after the jump."""
     is_drift: bool = False
-    """True if the camera jumps about as far as it drifts, and does not turn too fast."""
+    """True if drift can cause a jump of this length, and the camera does not turn too fast."""
 
 
 MIN_SPEED_RATIO = 4.0
