@@ -48,6 +48,8 @@ def frustum_planes(
             for a in range(3):
                 rotation = rotations[image, :, a]
                 planes[image, k, a] = (x * rotation[0] + y * rotation[1] + z * rotation[2]) / norm
-            offset = translations[image]
-            planes[image, k, 3] = (x * offset[0] + y * offset[1] + z * offset[2]) / norm
+            translation = translations[image]
+            planes[image, k, 3] = (
+                x * translation[0] + y * translation[1] + z * translation[2]
+            ) / norm
     return planes

@@ -42,9 +42,9 @@ class Jump(NamedTuple):
     """Two successive registered keyframes of a shot between which the camera jumps."""
 
     before: str
-    """Name of the keyframe before the jump."""
+    """Name of the last keyframe before the jump."""
     after: str
-    """Name of the keyframe after the jump."""
+    """Name of the first keyframe after the jump."""
     is_drift: bool = False
     """True if drift can cause a jump of this length, and the camera does not turn too fast."""
 
@@ -63,8 +63,9 @@ MAX_DRIFT_JUMP = 0.1
 """Maximum distance of a jump that drift may cause, relative to the length of the path of the camera
 in the shot. [tuned: benchmarks.walks]"""
 MAX_DRIFT = 0.25
-"""Maximum distance of a place from itself in the model without the matches across jumps, relative
-to the length of the path between the two keyframes that see it. [tuned: benchmarks.walks]"""
+"""Maximum distance between the two 3D points of matched keypoints in the model without the matches
+across jumps, relative to the length of the path of the camera between both keyframes. [tuned:
+benchmarks.walks]"""
 
 
 def join_shots(shots: Sequence[Shot], problem: MappingProblem) -> list[Shot]:
@@ -140,7 +141,7 @@ def restore_right_matches(
     reconstructions: Sequence[Reconstruction],
     shots: Sequence[Shot],
 ) -> MappingProblem:
-    """Add removed pairs back whose places agree in the model without them, up to drift.
+    """Use removed pairs again if the model without them confirms their matches.
 
     The matched keypoints of a pair have two 3D points each, if the model does not know that they
     are the same. The pair is right if their median distance is at most :data:`MAX_DRIFT` of the
@@ -153,16 +154,21 @@ def restore_right_matches(
         shots: Keyframes of all shots.
     """
     kept = set(shorter.pairs)
+    removed = [pair for pair in problem.pairs if pair not in kept]
+    if not removed:
+        return shorter
     for part in reconstructions:
         images = {image.index: image for image in part.confirmed_images}
-        for lengths in _measure_paths(part, shots):
+        for keyframes in _registered_keyframes(part, shots):
+            lengths = np.cumsum([0.0, *_step_lengths(keyframes)])
+            length_of = {image.index: x for (image, _), x in zip(keyframes, lengths, strict=True)}
             kept.update(
                 pair
-                for pair in problem.pairs
-                if pair.image_a in lengths
-                and pair.image_b in lengths
+                for pair in removed
+                if pair.image_a in length_of
+                and pair.image_b in length_of
                 and _measure_displacement(pair, images, part.points)
-                <= MAX_DRIFT * abs(lengths[pair.image_a] - lengths[pair.image_b])
+                <= MAX_DRIFT * abs(length_of[pair.image_a] - length_of[pair.image_b])
             )
     return replace(problem, pairs=tuple(pair for pair in problem.pairs if pair in kept))
 
@@ -186,42 +192,41 @@ def _measure_displacement(
     return float(np.median(np.linalg.norm(first - second, axis=1)))
 
 
-def _measure_paths(part: Reconstruction, shots: Sequence[Shot]) -> Iterator[dict[int, float]]:
-    """Yield the length of the path to each keyframe, by its image, for each shot of a component."""
+def _registered_keyframes(
+    part: Reconstruction, shots: Sequence[Shot]
+) -> Iterator[list[tuple[RegisteredImage, float]]]:
+    """Yield the keyframes of each shot in a component, with their time stamps in seconds."""
     images = {image.name: image for image in part.confirmed_images}
     for shot in shots:
-        registered = [images[name] for name in shot if name in images]
-        centers = np.array([camera_center(i.rotation, i.translation) for i in registered])
-        steps = np.linalg.norm(np.diff(centers.reshape(-1, 3), axis=0), axis=1)
-        lengths = np.cumsum([0.0, *steps])
-        yield {image.index: length for image, length in zip(registered, lengths, strict=True)}
+        keyframes = [(images[name], time_s) for name, time_s in shot.items() if name in images]
+        if keyframes:
+            yield keyframes
+
+
+def _step_lengths(keyframes: Sequence[tuple[RegisteredImage, float]]) -> Float64:
+    """Return the distances (n - 1,) between the camera centers of n successive keyframes."""
+    centers = np.stack([camera_center(i.rotation, i.translation) for i, _ in keyframes])
+    lengths: Float64 = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+    return lengths
 
 
 def _find_jumps_of_part(part: Reconstruction, shots: Sequence[Shot]) -> Iterator[Jump]:
     """Yield the jumps in one component."""
-    images = {image.name: image for image in part.confirmed_images}
-    steps: list[tuple[RegisteredImage, RegisteredImage]] = []
-    speeds, paths = [], []
-    for shot in shots:
-        registered = [(images[name], time_s) for name, time_s in shot.items() if name in images]
-        distances = []
-        for (a, start_s), (b, end_s) in pairwise(registered):
-            steps.append((a, b))
-            distances.append(
-                np.linalg.norm(
-                    camera_center(a.rotation, a.translation)
-                    - camera_center(b.rotation, b.translation)
-                )
-            )
+    steps: list[tuple[RegisteredImage, RegisteredImage, bool]] = []
+    speeds: list[tuple[float, float]] = []
+    for keyframes in _registered_keyframes(part, shots):
+        lengths = _step_lengths(keyframes)
+        is_short = lengths <= MAX_DRIFT_JUMP * lengths.sum()
+        for row, ((a, start_s), (b, end_s)) in enumerate(pairwise(keyframes)):
+            seconds = end_s - start_s
             turn_deg = rotation_angle_deg(a.rotation @ b.rotation.T)
-            speeds.append([distances[-1] / (end_s - start_s), turn_deg / (end_s - start_s)])
-        paths += [(distance, sum(distances)) for distance in distances]
+            steps.append((a, b, bool(is_short[row])))
+            speeds.append((float(lengths[row]) / seconds, float(turn_deg) / seconds))
     if not steps:
         return
     limits = MIN_SPEED_RATIO * np.quantile(speeds, _SPEED_QUANTILE, axis=0)
-    too_fast = np.array(speeds) > limits
-    for (a, b), fast, (distance, path) in zip(steps, too_fast, paths, strict=True):
+    too_fast = (np.array(speeds) > limits).tolist()
+    for (a, b, is_short_step), (moves_fast, turns_fast) in zip(steps, too_fast, strict=True):
         common = np.intersect1d(a.point_ids[a.point_ids >= 0], b.point_ids)
-        if fast.any() and len(common) < MIN_COMMON_POINTS:
-            is_drift = not fast[1] and distance <= MAX_DRIFT_JUMP * path
-            yield Jump(a.name, b.name, bool(is_drift))
+        if (moves_fast or turns_fast) and len(common) < MIN_COMMON_POINTS:
+            yield Jump(a.name, b.name, is_drift=is_short_step and not turns_fast)

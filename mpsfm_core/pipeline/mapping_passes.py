@@ -52,7 +52,7 @@ _MIN_DISTORTION = 0.1
 """Relative displacement of the image corners by lens distortion from which depth is predicted again
 in undistorted images. [tuned: benchmarks.distortion]"""
 _MAX_JUMP_RUNS = 3
-"""Maximum number of mapper runs without matches across jumps of a video camera. [ours]"""
+"""Maximum number of mapper runs that leave out matches across camera jumps of a video. [ours]"""
 
 
 @dataclass(frozen=True)
@@ -208,7 +208,7 @@ class MappingPasses:
         problem: MappingProblem,
         options: MapperOptions | None = None,
     ) -> MappedImages:
-        """Map, and map again without wrong matches if the camera of a video jumps.
+        """Map the images, and again without the false matches that make the video camera jump.
 
         Args:
             extracted_views: Images in whose undistorted views the extraction is.
@@ -245,7 +245,8 @@ class MappingPasses:
                 "model without them, so they are used again"
             )
             problem, mapping = restored, run_mapper(restored)
-        extraction = replace(extraction, problem=_select_pairs(extraction.problem, problem))
+        if len(problem.pairs) < len(complete.pairs):
+            extraction = replace(extraction, problem=_select_pairs(extraction.problem, problem))
         return MappedImages(extracted_views, extraction, mapped_views, mapping)
 
     def _map(self, problem: MappingProblem, options: MapperOptions) -> MappingResult:

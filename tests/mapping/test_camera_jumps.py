@@ -78,7 +78,7 @@ def test_find_jumps_returns_the_keyframes_around_a_jump() -> None:
 
 @pytest.mark.parametrize(("factor", "turned"), [(0.9, False), (1.1, False), (0.9, True)])
 def test_small_jump_without_a_turn_is_drift(factor: float, turned: bool) -> None:
-    """The camera moves by a multiple of the limit within 20 ms."""
+    """Within 20 ms, the camera moves by the given factor times the largest drift."""
     centers = walk()
     ratio = factor * MAX_DRIFT_JUMP
     centers[20:, 2] += ratio / (1 - ratio) * 0.1 * (len(NAMES) - 2) - 0.1

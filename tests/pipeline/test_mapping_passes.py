@@ -62,7 +62,7 @@ def test_pairs_across_a_jump_are_removed_unless_the_model_without_them_confirms_
     num_matches: int,
     is_restored: bool,
 ) -> None:
-    """Only jumps of the last mapper run remain."""
+    """The remaining jumps are those in the result of the last mapper run."""
     mapped: list[list[tuple[int, int]]] = []
 
     def reconstruct(problem: MappingProblem, *_: object) -> MappingResult:
