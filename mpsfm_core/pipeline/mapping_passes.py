@@ -219,24 +219,20 @@ class MappingPasses:
         """
         options = options or self._config.mapper_options()
         shots = join_shots(self._shots, problem)
-
-        def run_mapper(problem: MappingProblem) -> MappingResult:
-            mapping = self._map(problem, options)
-            self.jumps = find_jumps(mapping.reconstructions, shots)
-            return mapping
-
-        complete, mapping = problem, run_mapper(problem)
+        complete, first = problem, self._map(problem, options)
+        mapping = first
         for _ in range(_MAX_JUMP_RUNS):
-            shorter = remove_matches_across(problem, self.jumps, shots)
+            jumps = find_jumps(mapping.reconstructions, shots)
+            shorter = remove_matches_across(problem, jumps, shots)
             num_removed = len(problem.pairs) - len(shorter.pairs)
             if not num_removed:
                 break
-            jump = next(jump for jump in self.jumps if not jump.is_drift)
+            jump = next(jump for jump in jumps if not jump.is_drift)
             self._stages.notice(
                 f"the camera jumps between the frames {jump.before} and {jump.after}, so the "
                 f"matches of {num_removed} pairs of distant frames across a jump are not used"
             )
-            problem, mapping = shorter, run_mapper(shorter)
+            problem, mapping = shorter, self._map(shorter, options)
         restored = restore_right_matches(problem, complete, mapping.reconstructions, shots)
         num_restored = len(restored.pairs) - len(problem.pairs)
         if num_restored:
@@ -244,7 +240,9 @@ class MappingPasses:
                 f"{num_restored} of these pairs match places that are close to each other in the "
                 "model without them, so they are used again"
             )
-            problem, mapping = restored, run_mapper(restored)
+            is_complete = len(restored.pairs) == len(complete.pairs)
+            problem, mapping = restored, first if is_complete else self._map(restored, options)
+        self.jumps = find_jumps(mapping.reconstructions, shots)
         if len(problem.pairs) < len(complete.pairs):
             extraction = replace(extraction, problem=_select_pairs(extraction.problem, problem))
         return MappedImages(extracted_views, extraction, mapped_views, mapping)

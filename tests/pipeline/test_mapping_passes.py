@@ -26,7 +26,9 @@ from tests.mapping.test_camera_jumps import CAMERA, DEPTH, NAMES, SHOT, build_wa
 
 STEADY = build_walk(walk())
 JUMPING = build_walk(walk(), slice(20, None))
-PAIR_ENDS = [(0, 1), (5, 25), (19, 20)]
+KEPT = [(0, 1), (19, 20)]
+ACROSS = [(5, 25), (6, 26)]
+"""Pairs of distant frames across the jump."""
 
 
 class Images(list[SimpleNamespace]):
@@ -35,34 +37,40 @@ class Images(list[SimpleNamespace]):
     names = NAMES
 
 
-def build_problem(num_matches: int) -> MappingProblem:
+def build_problem(num_matches: tuple[int, int]) -> MappingProblem:
+    """Build a problem with 20 matches of each kept pair and the given matches across the jump."""
     normals = np.zeros((6, 8, 3), np.float32)
     normals[..., 2] = -1
     flat = NormalPrior.from_arrays(normals, np.ones((6, 8), np.float32))
     images = [MappingImage(name, CAMERA, np.zeros((40, 2)), DEPTH, flat) for name in NAMES]
-    matches = np.tile(np.arange(num_matches)[:, None], 2)
-    scores = np.ones(num_matches, np.float32)
-    pairs = [
-        VerifiedPair(a, b, matches, scores, np.eye(3), np.array([1.0, 0, 0])) for a, b in PAIR_ENDS
-    ]
+
+    def build_pair(a: int, b: int, number: int) -> VerifiedPair:
+        matches = np.tile(np.arange(number)[:, None], 2)
+        scores = np.ones(number, np.float32)
+        return VerifiedPair(a, b, matches, scores, np.eye(3), np.array([1.0, 0, 0]))
+
+    numbers = dict.fromkeys(KEPT, 20) | dict(zip(ACROSS, num_matches, strict=True))
+    pairs = (build_pair(a, b, number) for (a, b), number in sorted(numbers.items()))
     return MappingProblem(tuple(images), tuple(pairs))
 
 
 @pytest.mark.parametrize(
-    ("results", "num_matches", "is_restored"),
+    ("results", "num_matches", "restored", "final"),
     [
-        pytest.param([JUMPING, STEADY], 14, False, id="false-match"),
-        pytest.param([JUMPING, JUMPING], 14, False, id="jump-remains"),
-        pytest.param([JUMPING, STEADY, STEADY], 15, True, id="true-loop"),
+        pytest.param([JUMPING, STEADY], (14, 14), [], STEADY, id="false-matches"),
+        pytest.param([JUMPING, JUMPING], (14, 14), [], JUMPING, id="jump-remains"),
+        pytest.param([JUMPING, STEADY, STEADY], (15, 14), ACROSS[:1], STEADY, id="some-right"),
+        pytest.param([JUMPING, STEADY], (15, 15), ACROSS, JUMPING, id="first-result-was-right"),
     ],
 )
 def test_pairs_across_a_jump_are_removed_unless_the_model_without_them_confirms_them(
     monkeypatch: pytest.MonkeyPatch,
     results: list[Reconstruction],
-    num_matches: int,
-    is_restored: bool,
+    num_matches: tuple[int, int],
+    restored: list[tuple[int, int]],
+    final: Reconstruction,
 ) -> None:
-    """The remaining jumps are those in the result of the last mapper run."""
+    """The first result is kept if all pairs are right, and the same problem is not mapped again."""
     mapped: list[list[tuple[int, int]]] = []
 
     def reconstruct(problem: MappingProblem, *_: object) -> MappingResult:
@@ -77,9 +85,8 @@ def test_pairs_across_a_jump_are_removed_unless_the_model_without_them_confirms_
     checkpoints = RunCheckpoints(fresh=False)
     passes = MappingPasses(config, registry, Stages(registry), inputs, checkpoints)
     extraction, mapping, _ = passes.run(images, Extraction(build_problem(num_matches), {}))
-    kept = [PAIR_ENDS[0], PAIR_ENDS[2]]
-    used = PAIR_ENDS if is_restored else kept
-    assert mapped == ([PAIR_ENDS, kept, PAIR_ENDS] if is_restored else [PAIR_ENDS, kept])
+    used = sorted(KEPT + restored)
+    assert mapped == [sorted(KEPT + ACROSS), KEPT, used][: len(results)]
     assert [(pair.image_a, pair.image_b) for pair in extraction.problem.pairs] == used
-    assert mapping.reconstructions == (results[-1],)
-    assert passes.jumps == ([Jump(NAMES[19], NAMES[20])] if results[-1] is JUMPING else [])
+    assert mapping.reconstructions == (final,)
+    assert passes.jumps == ([Jump(NAMES[19], NAMES[20])] if final is JUMPING else [])
