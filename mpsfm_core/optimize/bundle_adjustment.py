@@ -567,10 +567,24 @@ class SchurComplementSolver:
         size = diagonal.shape[-1]
         corner = np.diagonal(total.corner) + boost[poses:]
 
+        bounds = np.linspace(0, len(self.p.pairs), len(self.p.ranges) + 1).astype(np.int64)
+
         def multiply(x: Float64) -> Float64:
-            out = np.empty_like(x)
-            kernels.multiply_reduced_matrix(total, boost, self.p.pairs, x, out)
-            return out
+            of_poses, of_intrinsics = x[:poses], x[poses:]
+
+            def multiply_pairs(n: int, *_: int) -> Float64:
+                out = np.zeros(poses)
+                kernels.multiply_pose_pairs(
+                    bounds[n], bounds[n + 1], total.blocks, self.p.pairs, of_poses, out
+                )
+                return out
+
+            products = np.einsum("nab,nb->na", diagonal, of_poses.reshape(-1, size)).ravel()
+            products += of_intrinsics @ total.border
+            for product in self.run(multiply_pairs):
+                products += product
+            others = total.border @ of_poses + total.corner @ of_intrinsics
+            return np.concatenate([products, others + boost[poses:] * of_intrinsics])
 
         max_iterations = ENOUGH_CG_ITERATIONS if can_factorize else MAX_CG_ITERATIONS
         if self._factor is not None:

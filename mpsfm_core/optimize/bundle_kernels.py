@@ -821,6 +821,21 @@ def _point_step(block: Float64, p: int, g0: float, g1: float, g2: float, step: F
 
 
 @_helper
+def _find_block(slot: int, first: int, last: int, layout: ParameterLayout) -> int:
+    """Return the row between ``first`` and ``last`` whose block has the column ``slot``.
+
+    Columns ascend. The row is often ``last``, as columns ascend by 1 where all poses share points.
+    """
+    while layout.block_column[last] != slot:
+        middle = (first + last) // 2
+        if layout.block_column[middle] < slot:
+            first = middle + 1
+        else:
+            last = middle
+    return last
+
+
+@_helper
 def _eliminate_from_poses(
     count: int,
     z0: float,
@@ -839,11 +854,11 @@ def _eliminate_from_poses(
             rhs[NUM_IMAGE_PARAMS * slots[a] + i] -= y0 * z0 + y1 * z1 + y2 * z2
             for j in range(i, NUM_IMAGE_PARAMS):
                 blocks[own, i, j] -= y0 * y[a, 0, j] + y1 * y[a, 1, j] + y2 * y[a, 2, j]
+        row, end = own, layout.first_block[slots[a] + 1]
         for b in range(a + 1, count):
-            # columns ascend by at least 1, so the block is at most this far from the diagonal
-            row = min(own + slots[b] - slots[a], layout.first_block[slots[a] + 1] - 1)
-            while layout.block_column[row] > slots[b]:
-                row -= 1
+            row = _find_block(
+                slots[b], row + 1, min(row + slots[b] - slots[b - 1], end - 1), layout
+            )
             for i in range(NUM_IMAGE_PARAMS):
                 y0, y1, y2 = y[a, 0, i], y[a, 1, i], y[a, 2, i]
                 for j in range(NUM_IMAGE_PARAMS):
@@ -1193,30 +1208,27 @@ def assemble_reduced_matrix(
 
 
 @_kernel
-def multiply_reduced_matrix(
-    system: ReducedCameraSystem, boost: Float64, pairs: Int64, x: Float64, out: Float64
+def multiply_pose_pairs(
+    first: int, last: int, blocks: Float64, pairs: Int64, x: Float64, out: Float64
 ) -> None:
-    """Multiply the reduced camera matrix with damping ``boost`` by a vector ``x`` (d,)."""
-    for a in range(len(x)):
-        out[a] = boost[a] * x[a]
-    for n in range(len(pairs)):
+    """Multiply the blocks ``first:last`` of pairs of poses and their transposes by ``x`` (7 s,).
+
+    The product is added to ``out`` (7 s,). The diagonal blocks of single poses are left out.
+    """
+    for n in range(first, last):
         i, j = NUM_IMAGE_PARAMS * pairs[n, 0], NUM_IMAGE_PARAMS * pairs[n, 1]
+        if i == j:
+            continue
         for a in range(NUM_IMAGE_PARAMS):
             value = 0.0
-            for b in range(a if i == j else 0, NUM_IMAGE_PARAMS):
-                value += system.blocks[n, a, b] * x[j + b]
+            for b in range(NUM_IMAGE_PARAMS):
+                value += blocks[n, a, b] * x[j + b]
             out[i + a] += value
-            for b in range(a + 1 if i == j else 0, NUM_IMAGE_PARAMS):
-                out[j + b] += system.blocks[n, a, b] * x[i + a]
-    poses = system.border.shape[1]
-    for f in range(len(system.corner)):
-        value = 0.0
-        for a in range(poses):
-            value += system.border[f, a] * x[a]
-            out[a] += system.border[f, a] * x[poses + f]
-        for g in range(len(system.corner)):
-            value += system.corner[f, g] * x[poses + g]
-        out[poses + f] += value
+        for b in range(NUM_IMAGE_PARAMS):
+            value = 0.0
+            for a in range(NUM_IMAGE_PARAMS):
+                value += blocks[n, a, b] * x[i + a]
+            out[j + b] += value
 
 
 @_kernel

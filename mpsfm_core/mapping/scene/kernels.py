@@ -49,25 +49,28 @@ def compute_max_triangulation_angles(
     """
     angles = np.zeros(len(points))
     count = len(observation_points)
+    rays = np.zeros((count, 3))
+    for n in range(count):
+        x, y, z = points[observation_points[n]] - centers[n]
+        distance = math.sqrt(x * x + y * y + z * z)
+        if distance > 0:
+            rays[n, 0], rays[n, 1], rays[n, 2] = x / distance, y / distance, z / distance
     start = 0
     while start < count:
         point = observation_points[start]
         end = start + 1
         while end < count and observation_points[end] == point:
             end += 1
-        best = 0.0
+        best, best_a, best_b = 0.0, start, start
         for a in range(start, end):
-            ax = points[point, 0] - centers[a, 0]
-            ay = points[point, 1] - centers[a, 1]
-            az = points[point, 2] - centers[a, 2]
+            ax, ay, az = rays[a]
             for b in range(a + 1, end):
-                bx = points[point, 0] - centers[b, 0]
-                by = points[point, 1] - centers[b, 1]
-                bz = points[point, 2] - centers[b, 2]
+                bx, by, bz = rays[b]
                 cx, cy, cz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
-                sine = math.sqrt(cx * cx + cy * cy + cz * cz)
-                angle = math.atan2(sine, abs(ax * bx + ay * by + az * bz))
-                best = max(best, angle)
-        angles[point] = math.degrees(best)
+                squared_sine = cx * cx + cy * cy + cz * cz
+                if squared_sine > best:
+                    best, best_a, best_b = squared_sine, a, b
+        cosine = abs((rays[best_a] * rays[best_b]).sum())
+        angles[point] = math.degrees(math.atan2(math.sqrt(best), cosine))
         start = end
     return angles
