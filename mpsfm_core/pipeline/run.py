@@ -65,7 +65,7 @@ from mpsfm_core.results.writer import ComponentResult, update_summary, write_fai
 from mpsfm_core.support.disk_arrays import store_on_disk
 from mpsfm_core.support.files import lock_output_folder
 from mpsfm_core.support.memory import ChildMemoryMonitor, measure_memory
-from mpsfm_core.support.threads import limit_threads, thread_limit
+from mpsfm_core.support.threads import limit_threads, opencv_threads, thread_limit
 
 PathLike = str | Path
 
@@ -419,7 +419,7 @@ class _Run:
         every = self._config.inputs.video.trajectory_every
         if not self._inputs.videos or not every:
             return
-        with self._stages.stage("trajectory"):
+        with self._stages.stage("trajectory"), opencv_threads():
             progress = partial(self._stages.stage_progress, "trajectory")
             for name, video in self._inputs.videos.items():
                 self._trajectories[name] = localize_frames(

@@ -81,3 +81,14 @@ def limit_threads(count: int | None) -> Iterator[None]:
     finally:
         cv2.setNumThreads(opencv)
         _LIMIT.reset(token)
+
+
+@contextmanager
+def opencv_threads() -> Iterator[None]:
+    """Allow OpenCV all threads of the run inside a ``with`` block, if only one thread calls it."""
+    count = cv2.getNumThreads()
+    cv2.setNumThreads(thread_limit())
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(count)

@@ -20,7 +20,13 @@ from mpsfm_core.pipeline.run import reconstruct
 from mpsfm_core.providers import ProviderContext
 from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
-from mpsfm_core.support.threads import count_cores, limit_threads, parallel_map, thread_limit
+from mpsfm_core.support.threads import (
+    count_cores,
+    limit_threads,
+    opencv_threads,
+    parallel_map,
+    thread_limit,
+)
 from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 
 CAMERA = PinholeCamera(160, 120, 140.0, 140.0, 80.0, 60.0)
@@ -122,6 +128,13 @@ def test_thread_limit_applies_to_all_libraries_and_is_restored() -> None:
         assert thread_limit() == 1
     assert (pools(), cv2.getNumThreads()) == before
     assert thread_limit() == count_cores()
+
+
+def test_opencv_has_all_threads_of_the_run_only_inside_the_block() -> None:
+    with limit_threads(2):
+        with opencv_threads():
+            assert cv2.getNumThreads() == 2
+        assert cv2.getNumThreads() == 1
 
 
 def test_each_gives_results_in_order_from_as_many_threads_as_are_allowed() -> None:
