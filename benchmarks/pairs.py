@@ -102,7 +102,7 @@ def main() -> None:
 def _row(name: str, case: Case) -> str:
     started = time.process_time()
     count, options = len(case.names), PairOptions()
-    pairs = pair_similarity.candidate_pairs(case.descriptors)
+    pairs = pair_similarity.candidate_pairs(case.descriptors, options.num_candidates)
     scores = [pair_similarity.match_score(*(case.descriptors[i] for i in pair)) for pair in pairs]
     similarity = pair_similarity.diffuse_similarity(PairSimilarity(pairs, np.array(scores)), count)
     alike = most_similar_pairs(similarity, options.partners)
@@ -136,7 +136,7 @@ def _candidate_row(count: int) -> str:
         outliers = _unit(rng.normal(size=seen.shape))
         descriptors.append(np.concatenate([_unit(seen + noise), outliers]).astype(np.float32))
     started = time.process_time()
-    pairs = pair_similarity.candidate_pairs(descriptors)
+    pairs = pair_similarity.candidate_pairs(descriptors, PairOptions().num_candidates)
     seconds = time.process_time() - started
     distances = np.abs(np.diff(positions[pairs], axis=1))
     cells = [str(count), f"{len(pairs) / count:.0f}"]
@@ -167,7 +167,7 @@ def _real(name: str, output: Path) -> Case:
     bench = ExtractionContext(images, config, Registry.discover(), NullExtractionEvents())
     assert config.features is not None
     table = FeatureTable(bench, config.features)
-    located = table.extract()
+    located = table.extract(range(len(names)))
     true = [p for p in combinations(range(len(names)), 2) if overlap[p] > MATCHED_OVERLAP]
     candidates = PairMatcher(bench, table).match(true, located)
     outcomes = PairVerifier(bench, located).verify(candidates)

@@ -8,6 +8,10 @@ from pydantic import Field
 
 from mpsfm_core.data.options import Options, expert
 
+CANDIDATES_PER_PARTNER = 8
+"""Number of candidates of each image, the images with the most similar global descriptors, relative
+to ``pairs.partners``. [tuned: benchmarks.pairs]"""
+
 
 class PairOptions(Options):
     """Selection of the image pairs to match."""
@@ -35,6 +39,11 @@ class PairOptions(Options):
     min_similarity: float = expert(0.0)
     """Minimum dot product of the global descriptors of a pair, in mode ``retrieval``.
     [reference]"""
+
+    @property
+    def num_candidates(self) -> int:
+        """Number of images that each image is compared with, to find its partners."""
+        return CANDIDATES_PER_PARTNER * self.partners
 
 
 class VerificationOptions(Options):

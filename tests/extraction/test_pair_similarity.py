@@ -122,9 +122,8 @@ def street(count: int, seed: int = 0) -> list[np.ndarray]:
     return [points + 0.02 * rng.normal(size=points.shape).astype(np.float32) for points in seen]
 
 
-def test_candidates_contain_overlapping_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pair_similarity, "NUM_CANDIDATES", 8)
-    pairs = candidate_pairs(street(120))
+def test_candidates_contain_overlapping_images() -> None:
+    pairs = candidate_pairs(street(120), 8)
     assert (pairs[:, 0] < pairs[:, 1]).all()
     assert len(pairs) <= 120 * 8
     chosen = {(a, b) for a, b in pairs.tolist()}
@@ -132,7 +131,14 @@ def test_candidates_contain_overlapping_images(monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_candidates_of_few_images_are_all_pairs() -> None:
-    assert candidate_pairs(street(4)).tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]]
+    assert candidate_pairs(street(4), 3).tolist() == [
+        [0, 1],
+        [0, 2],
+        [0, 3],
+        [1, 2],
+        [1, 3],
+        [2, 3],
+    ]
 
 
 def test_vlad_of_an_image_without_descriptors_is_zero() -> None:

@@ -172,7 +172,9 @@ class PairSelection:
         """
         if self._context.config.retrieval is not None:
             descriptors = np.stack(self._descriptors()).astype(np.float64)
-            found = pair_similarity.rank_images(descriptors, pair_similarity.NUM_CANDIDATES)
+            found = pair_similarity.rank_images(
+                descriptors, self._context.config.pairs.num_candidates
+            )
         elif self._table is None:
             return None
         else:
@@ -183,14 +185,17 @@ class PairSelection:
     def _match_scores(self, table: FeatureSource) -> PairSimilarity:
         """Return the match scores of candidate pairs of positions in the list of images."""
         context, count = self._context, len(self._images)
+        num_candidates = context.config.pairs.num_candidates
         key = content_key(
-            hash_module(pair_similarity.__name__), [table.key(image) for image in self._images]
+            hash_module(pair_similarity.__name__),
+            [table.key(image) for image in self._images],
+            num_candidates,
         )
         cached: Float64 | None = context.cache.load("pair-similarity", key, np.ndarray)
         if cached is not None:
             return PairSimilarity(cached[:, :2].astype(np.int64), cached[:, 2])
         strongest = [pair_similarity.strongest_descriptors(table[image]) for image in self._images]
-        pairs = pair_similarity.candidate_pairs(strongest)
+        pairs = pair_similarity.candidate_pairs(strongest, num_candidates)
         partners = np.split(pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(1, count)))
 
         def compare(first: int) -> list[float]:

@@ -31,9 +31,6 @@ NUM_DESCRIPTORS = 512
 of the number of descriptors. [tuned: benchmarks.pairs]"""
 DIFFUSION_RATIO = 0.8
 """Diffusion weight ``alpha`` of manifold ranking. [tuned: benchmarks.pairs]"""
-NUM_CANDIDATES = 256
-"""Number of images of most similar global descriptor that become candidates of each image. In sets
-of up to 257 images, all pairs are candidates. [tuned: benchmarks.pairs]"""
 _NUM_CLUSTERS = 64
 """Number of clusters of a VLAD descriptor."""
 _TRAINING_DESCRIPTORS = 256 * _NUM_CLUSTERS
@@ -71,19 +68,21 @@ def match_score(a: Float32, b: Float32) -> float:
     return float((1 - ratios).sum())
 
 
-def candidate_pairs(descriptors: Sequence[Float32]) -> Int64:
-    """Pair each image with the ``NUM_CANDIDATES`` images of most similar global descriptor.
+def candidate_pairs(descriptors: Sequence[Float32], num_candidates: int) -> Int64:
+    """Pair each image with the images of most similar global descriptor.
 
     Args:
         descriptors: Strongest descriptors (k, d) of each image; k may differ and may be 0.
+        num_candidates: Number of images that each image is paired with. If there are not more, all
+            pairs are candidates.
 
     Returns:
         Image indices (n, 2), the smaller index first, in ascending order.
     """
     count = len(descriptors)
-    if count <= NUM_CANDIDATES + 1:
+    if count <= num_candidates + 1:
         return np.stack(np.triu_indices(count, 1), axis=1)
-    return rank_images(compute_vlad(descriptors), NUM_CANDIDATES).pairs
+    return rank_images(compute_vlad(descriptors), num_candidates).pairs
 
 
 def compute_vlad(descriptors: Sequence[Float32]) -> Float32:
