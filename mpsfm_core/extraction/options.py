@@ -9,8 +9,8 @@ from pydantic import Field
 from mpsfm_core.data.options import Options, expert
 
 CANDIDATES_PER_PARTNER = 8
-"""Number of candidates of each image, the images with the most similar global descriptors, relative
-to ``pairs.partners``. [tuned: benchmarks.pairs]"""
+"""Number of candidates per partner. The candidates of an image are the images with the most similar
+global descriptors, and its partners are chosen among them. [tuned: benchmarks.pairs]"""
 
 
 class PairOptions(Options):
@@ -42,7 +42,7 @@ class PairOptions(Options):
 
     @property
     def num_candidates(self) -> int:
-        """Number of images that each image is compared with, to find its partners."""
+        """Number of candidates of each image, whose local features are compared with its own."""
         return CANDIDATES_PER_PARTNER * self.partners
 
 

@@ -63,8 +63,8 @@ MAX_DRIFT_JUMP = 0.1
 """Maximum distance of a jump that drift may cause, relative to the length of the path of the camera
 in the shot. [tuned: benchmarks.walks]"""
 MAX_DRIFT = 0.25
-"""Maximum distance between the two 3D points of matched keypoints in the model without the matches
-across jumps, relative to the length of the path of the camera between both keyframes. [tuned:
+"""Maximum median distance of two matched keypoints' 3D points, for a removed pair that is used
+again. The distance is relative to the length of the camera path between both keyframes. [tuned:
 benchmarks.walks]"""
 
 
@@ -227,6 +227,8 @@ def _find_jumps_of_part(part: Reconstruction, shots: Sequence[Shot]) -> Iterator
     limits = MIN_SPEED_RATIO * np.quantile(speeds, _SPEED_QUANTILE, axis=0)
     too_fast = (np.array(speeds) > limits).tolist()
     for (a, b, is_short_step), (moves_fast, turns_fast) in zip(steps, too_fast, strict=True):
+        if not (moves_fast or turns_fast):
+            continue
         common = np.intersect1d(a.point_ids[a.point_ids >= 0], b.point_ids)
-        if (moves_fast or turns_fast) and len(common) < MIN_COMMON_POINTS:
+        if len(common) < MIN_COMMON_POINTS:
             yield Jump(a.name, b.name, is_drift=is_short_step and not turns_fast)

@@ -45,7 +45,7 @@ from mpsfm_core.inputs.view_cutting import (
     find_wide_cameras,
 )
 from mpsfm_core.pipeline.stages import Stages
-from mpsfm_core.support.threads import opencv_threads
+from mpsfm_core.support.threads import opencv_threads, thread_limit
 
 _log = logging.getLogger(__name__)
 
@@ -122,7 +122,7 @@ class InputReader:
         if not self.videos:
             return
         assert self._output is not None
-        with self._stages.stage("video"), opencv_threads():
+        with self._stages.stage("video"), opencv_threads(thread_limit()):
             progress = partial(self._stages.stage_progress, "video")
             self.image_folder = extract_frames(
                 self.videos, self._output, self._options.video, progress

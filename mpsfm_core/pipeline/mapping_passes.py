@@ -52,7 +52,8 @@ _MIN_DISTORTION = 0.1
 """Relative displacement of the image corners by lens distortion from which depth is predicted again
 in undistorted images. [tuned: benchmarks.distortion]"""
 _MAX_JUMP_RUNS = 3
-"""Maximum number of mapper runs that leave out matches across camera jumps of a video. [ours]"""
+"""Maximum number of times that matches across a camera jump are removed and images are mapped
+again. [ours]"""
 
 
 @dataclass(frozen=True)
@@ -208,7 +209,7 @@ class MappingPasses:
         problem: MappingProblem,
         options: MapperOptions | None = None,
     ) -> MappedImages:
-        """Map the images, and again without the false matches that make the video camera jump.
+        """Map the images, and map again without false matches if the camera of a video jumps.
 
         Args:
             extracted_views: Images in whose undistorted views the extraction is.

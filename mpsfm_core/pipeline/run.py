@@ -419,7 +419,7 @@ class _Run:
         every = self._config.inputs.video.trajectory_every
         if not self._inputs.videos or not every:
             return
-        with self._stages.stage("trajectory"), opencv_threads():
+        with self._stages.stage("trajectory"), opencv_threads(thread_limit()):
             progress = partial(self._stages.stage_progress, "trajectory")
             for name, video in self._inputs.videos.items():
                 self._trajectories[name] = localize_frames(

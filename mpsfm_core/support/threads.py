@@ -73,22 +73,23 @@ def limit_threads(count: int | None) -> Iterator[None]:
     Args:
         count: Maximum number of threads, or None for one thread per core.
     """
-    token, opencv = _LIMIT.set(count), cv2.getNumThreads()
-    cv2.setNumThreads(1)
+    token = _LIMIT.set(count)
     try:
-        with threadpool_limits(thread_limit()):
+        with opencv_threads(1), threadpool_limits(thread_limit()):
             yield
     finally:
-        cv2.setNumThreads(opencv)
         _LIMIT.reset(token)
 
 
 @contextmanager
-def opencv_threads() -> Iterator[None]:
-    """Allow OpenCV all threads of the run inside a ``with`` block, if only one thread calls it."""
-    count = cv2.getNumThreads()
-    cv2.setNumThreads(thread_limit())
+def opencv_threads(count: int) -> Iterator[None]:
+    """Set the number of threads that OpenCV uses in each call inside a ``with`` block.
+
+    Use 1 where several threads of the run call OpenCV at the same time.
+    """
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(count)
     try:
         yield
     finally:
-        cv2.setNumThreads(count)
+        cv2.setNumThreads(before)

@@ -38,7 +38,7 @@ class Images(list[SimpleNamespace]):
 
 
 def build_problem(num_matches: tuple[int, int]) -> MappingProblem:
-    """Build a problem with 20 matches of each kept pair and the given matches across the jump."""
+    """Build a problem with the given numbers of matches of the two pairs across the jump."""
     normals = np.zeros((6, 8, 3), np.float32)
     normals[..., 2] = -1
     flat = NormalPrior.from_arrays(normals, np.ones((6, 8), np.float32))

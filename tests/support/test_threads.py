@@ -132,7 +132,7 @@ def test_thread_limit_applies_to_all_libraries_and_is_restored() -> None:
 
 def test_opencv_has_all_threads_of_the_run_only_inside_the_block() -> None:
     with limit_threads(2):
-        with opencv_threads():
+        with opencv_threads(thread_limit()):
             assert cv2.getNumThreads() == 2
         assert cv2.getNumThreads() == 1
 
