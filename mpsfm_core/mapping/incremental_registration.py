@@ -54,7 +54,7 @@ class IncrementalRegistration:
             False if no image can be registered at the most relaxed thresholds.
         """
         while True:
-            scores = self._history.select_scores(self._scores, excluded=False)
+            scores = self._history.select_scores(self._scores)
             ranked = rank_next_images(self._scene, scores, candidates)
             if self._register_first_possible(ranked, wide=False):
                 return True
@@ -62,8 +62,11 @@ class IncrementalRegistration:
                 continue
             if wide and self._register_first_possible(ranked, wide=True):
                 return True
-            if not ranked or not self._thresholds.relax():
-                return self._register_contradicted_image(candidates)
+            if ranked and self._thresholds.relax():
+                continue
+            self._thresholds.reset()
+            if not self._refine_for_contradicted(candidates):
+                return False
 
     def deregister_contradicted_image(self) -> bool:
         """Deregister the image whose depth several rejected images contradict.
@@ -100,23 +103,15 @@ class IncrementalRegistration:
             self._event_log.rejected(image, reason)
         return False
 
-    def _register_contradicted_image(self, candidates: Bool) -> bool:
-        """Register an image if only global refinement makes its depth consistent.
+    def _refine_for_contradicted(self, candidates: Bool) -> bool:
+        """Refine all images if the depth of a candidate image contradicts the scene.
 
-        At a loop closure, drift makes a correct pose contradict the depth of the scene. Returns
-        False if global refinement makes the depth of no image consistent.
+        Without global refinement, the drift of new images can make a correct pose contradict the
+        depth of the scene. Returns False if the images were not refined.
         """
-        self._thresholds.reset()
-        scores = self._history.select_scores(self._scores, excluded=True)
-        for image, best_match in rank_next_images(self._scene, scores, candidates):
-            for member in self._scene.rigs.images_of(image):
-                self._history.excluded_references.pop(member, None)
-            references = self._select_references(image, best_match)
-            if self._register_image(image, references, refine_globally=True) is None:
-                self._maintenance.confirm(image)
-                self._history.clear()
-                return True
-        return False
+        contradicted = list(self._history.excluded_references)
+        waits = (candidates & ~self._scene.registered)[contradicted].any()
+        return bool(waits) and self._maintenance.refine_new_images()
 
     def _select_references(self, image: int, best_match: int, *, wide: bool = False) -> list[int]:
         """Select the registered images whose points and depth determine the pose of an image.
@@ -162,17 +157,12 @@ class IncrementalRegistration:
         history.record_attempt(image, references, poses[0] if poses else None, searched=search)
         return poses
 
-    def _register_image(
-        self, image: int, references: list[int], *, refine_globally: bool = False
-    ) -> Reason | None:
+    def _register_image(self, image: int, references: list[int]) -> Reason | None:
         """Register an image with the first of its estimated poses that passes verification.
 
         Args:
             image: Index of the image to register.
             references: Registered images whose matches determine the pose of the image.
-            refine_globally: Refine all registered images before the depth check. Because global
-                refinement is slow, only poses with a high inlier ratio are tried, and the depth is
-                first checked after a rough bundle adjustment.
 
         Returns:
             None if the image is registered, else the rejection reason of the image, with the scene
@@ -193,13 +183,10 @@ class IncrementalRegistration:
         reason: Reason | None = ImageReason.NO_POSE.because()
         verified: list[tuple[int, tuple[Snapshot, DepthNoise]]] = []
         for pose in poses:
-            reason = self._thresholds.check_support(pose, confident=refine_globally)
-            if not refine_globally:
-                reason = reason or self._history.get_rejection(image, pose)
+            reason = self._thresholds.check_support(pose)
+            reason = reason or self._history.get_rejection(image, pose)
             if reason is None:
-                reason = self._extend_model(
-                    image, pose, correspondences, refine_globally=refine_globally
-                )
+                reason = self._extend_model(image, pose, correspondences)
                 if reason is None:
                     if len(scene.rigs.images_of(image)) == 1:
                         return None
@@ -220,12 +207,7 @@ class IncrementalRegistration:
         self._scene.restore(snapshot)
 
     def _extend_model(
-        self,
-        image: int,
-        pose: ScoredPose,
-        correspondences: PoseCorrespondences,
-        *,
-        refine_globally: bool,
+        self, image: int, pose: ScoredPose, correspondences: PoseCorrespondences
     ) -> Reason | None:
         """Register an image with a pose, triangulate, refine locally and check depth consistency.
 
@@ -251,16 +233,7 @@ class IncrementalRegistration:
             for member in members:
                 self._refiner.estimate_scale(member, neighbors)
             self._refiner.integrate(members)
-        if refine_globally:
-            with self._event_log.timed("global refinement"):
-                self._refiner.refine_locally(image)
-                self._refiner.close_loop()
-        max_violations = self._options.consistency.max_violations
-        reason = self._maintenance.check_depth(image, max_violations)
-        if refine_globally and not reason:
-            with self._event_log.timed("global refinement"):
-                self._refiner.refine_globally()
-            reason = self._maintenance.check_depth(image, max_violations)
+        reason = self._maintenance.check_depth(image, options.consistency.max_violations)
         if reason:
             self._exclude_references(pose, correspondences)
             return reason

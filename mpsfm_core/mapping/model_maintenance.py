@@ -124,6 +124,17 @@ class ModelMaintenance:
         if num_images > growth * self._last_size[0] or num_points > growth * self._last_size[1]:
             self.refine_globally()
 
+    def refine_new_images(self) -> bool:
+        """Refine all images if more are registered than at the last global refinement.
+
+        Returns:
+            True if the images were refined.
+        """
+        is_larger = self.size > self._last_size[0]
+        if is_larger:
+            self.refine_globally()
+        return is_larger
+
     def refine_globally(self, *, depth_maps: bool = True) -> None:
         """Refine all images and points, then deregister images with few or unconnected points.
 

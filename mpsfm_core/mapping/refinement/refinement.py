@@ -70,9 +70,6 @@ MAX_GLOBAL_REFINEMENTS = 5
 MAX_GLOBAL_CHANGE = 0.0005
 """Share of changed observations below which global refinement stops.
 [COLMAP ba_global_max_refinement_change]"""
-ROUGH_TOLERANCE = 1e-4
-"""Relative decrease of the cost at which the bundle adjustment of a possible loop stops. [tuned:
-benchmarks.walks]"""
 MAX_DEPTH_RATIO = 1.5
 """Largest ratio between the depth of a point and the depth map for which bundle adjustment uses the
 depth. [reference scale_filter]"""
@@ -289,7 +286,6 @@ class Refiner:
         focal: bool = False,
         reprojection_scale: float = 1.0,
         max_iterations: int | None = None,
-        tolerance: float | None = None,
     ) -> None:
         """Adjust poses and depth scales of images, and the points that the images observe.
 
@@ -303,18 +299,15 @@ class Refiner:
             reprojection_scale: Factor on the scale of the reprojection loss.
             max_iterations: Maximum number of bundle adjustment iterations, or None to use the
                 option.
-            tolerance: Relative decrease of the cost at which bundle adjustment stops, or None to
-                use the option.
         """
         scene = self.scene
         variable = scene.rigs.complete(variable)
         bundle = self._collect_bundle(variable, local=local)
         if bundle is None:
             return
-        limits = {"max_iterations": max_iterations, "function_tolerance": tolerance}
-        options = self._scale_losses(reprojection_scale).model_copy(
-            update={name: limit for name, limit in limits.items() if limit is not None}
-        )
+        options = self._scale_losses(reprojection_scale)
+        if max_iterations is not None:
+            options = options.model_copy(update={"max_iterations": max_iterations})
         if focal:
             result = calibrate_cameras(
                 scene,
@@ -542,13 +535,6 @@ class Refiner:
             changed += complete_and_merge_tracks(self.scene, self.triangulation, images=bundle)
             if changed < MAX_LOCAL_CHANGE * max(self._num_observations(), 1):
                 break
-
-    def close_loop(self) -> None:
-        """Merge tracks and roughly adjust all images, which distributes the drift of a loop."""
-        images = [int(i) for i in self.scene.registered_images()]
-        complete_and_merge_tracks(self.scene, self.triangulation, create=True)
-        self.adjust(images, tolerance=ROUGH_TOLERANCE)
-        filter_points(self.scene, self.triangulation)
 
     def refine_globally(self, *, depth_maps: bool = True) -> None:
         """Adjust all images and update tracks until few tracks change, then refine depth maps.

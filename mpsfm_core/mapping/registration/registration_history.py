@@ -117,13 +117,13 @@ class RegistrationHistory:
         """Allow rejected poses again after poses or points of the scene have changed."""
         self._rejected_poses.clear()
 
-    def select_scores(self, scores: csr_array, *, excluded: bool) -> csr_array:
-        """Select the matching scores (n, n) of the excluded, or of all other, reference images."""
+    def select_scores(self, scores: csr_array) -> csr_array:
+        """Return the matching scores (n, n) without those of excluded reference images."""
         is_excluded = np.zeros(len(scores.data), dtype=np.bool_)
         for image, references in self.excluded_references.items():
             row = slice(*scores.indptr[image : image + 2])
             is_excluded[row] = np.isin(scores.indices[row], list(references))
-        selected = np.where(is_excluded == excluded, scores.data, 0.0)
+        selected = np.where(is_excluded, 0.0, scores.data)
         return csr_array((selected, scores.indices, scores.indptr), shape=scores.shape)
 
     def clear(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mpsfm_core.data.decisions import ImageReason, Reason
 from mpsfm_core.mapping.options import RegistrationOptions
-from mpsfm_core.mapping.registration.pose_support import CONFIDENT_INLIER_RATIO, ScoredPose
+from mpsfm_core.mapping.registration.pose_support import ScoredPose
 from mpsfm_core.mapping.state import StateDict
 
 RELAXATION_FACTOR = 1.2
@@ -37,15 +37,9 @@ class ThresholdSchedule:
         """Tighten the limit of the depth violation ratio to the present step of the schedule."""
         return max_violations / self._factor
 
-    def check_support(self, pose: ScoredPose, *, confident: bool = False) -> Reason | None:
-        """Return the reason why a pose has too little support, or None if the support suffices.
-
-        Args:
-            pose: The pose with its number of inliers and its inlier ratio.
-            confident: Also require the inlier ratio ``CONFIDENT_INLIER_RATIO``.
-        """
-        min_inliers = self.min_inliers
-        min_ratio = CONFIDENT_INLIER_RATIO if confident else self.min_inlier_ratio
+    def check_support(self, pose: ScoredPose) -> Reason | None:
+        """Return the reason why a pose has too little support, or None if the support suffices."""
+        min_inliers, min_ratio = self.min_inliers, self.min_inlier_ratio
         if pose.num_inliers < min_inliers:
             return ImageReason.TOO_FEW_INLIERS.because(
                 num_inliers=pose.num_inliers, min_inliers=min_inliers
