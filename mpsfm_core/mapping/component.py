@@ -295,18 +295,18 @@ class Component:
         """Deregister misregistered images and register them with other reference images.
 
         The poses of re-registered images are kept if no image is lost and more matches observe
-        common 3D points. Each set of misregistered images is re-registered at most once. If
-        re-registration fails, images are deregistered that only one image pair connects to the
-        model and several image pairs contradict. Images with a known pose stay registered, unless
-        the known poses are only initial guesses.
+        common 3D points. Of sets that have most of their images in common, only the first is
+        re-registered. If re-registration fails, images are deregistered that only one image pair
+        connects to the model and several image pairs contradict. Images with a known pose stay
+        registered, unless the known poses are only initial guesses.
 
         Args:
             candidates: (n,) bool mask of the images that may be registered.
         """
-        tried: set[tuple[int, ...]] = set()
+        tried: list[Misregistration] = []
         detections = self._detect_misregistrations()
-        while detection := next((d for d in detections if d.images not in tried), None):
-            tried.add(detection.images)
+        while detection := next((d for d in detections if d.differs_from(tried)), None):
+            tried.append(detection)
             before, num_explained = self.maintenance.state(), self._count_explained_matches()
             self._deregister_misregistered(detection)
             self.register_images(candidates, wide=True)

@@ -15,6 +15,7 @@ Misregistered images are detected in three ways.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import combinations
 from typing import Any, NamedTuple
 
@@ -39,6 +40,11 @@ MIN_SIGNIFICANCE = 0.5
 standard deviations of the excess if each image pair supports or contradicts the pose at random.
 [tuned: benchmarks.symmetry]"""
 
+MAX_COMMON_IMAGES = 0.5
+"""Intersection over union of two sets of misregistered images above which the sets count as the
+same. The sets that cuts of a sequence at neighboring images separate are nearly equal. [tuned:
+benchmarks.symmetry, benchmarks.walks]"""
+
 
 class Misregistration(NamedTuple):
     """Set of images that may be misregistered together."""
@@ -55,6 +61,20 @@ class Misregistration(NamedTuple):
     """True if only one image pair connects the misregistered images to the model and several image
     pairs contradict their poses. Misregistered images that only one image pair connects to the
     model are deregistered if re-registration fails."""
+
+    def differs_from(self, others: Iterable[Misregistration]) -> bool:
+        """Return whether no other set has most of its images in common with this set.
+
+        A set that may be split off the model only equals a set of the same images.
+        """
+        images = frozenset(self.images)
+        for other in others:
+            num_common = len(images.intersection(other.images))
+            num_images = len(images.union(other.images))
+            is_similar = num_common > MAX_COMMON_IMAGES * num_images and not self.splits
+            if is_similar or num_common == num_images:
+                return False
+        return True
 
 
 class ContradictedCut(NamedTuple):

@@ -200,6 +200,24 @@ def test_misregistered_image_is_reregistered_at_correct_pose(component: Componen
     assert counts.is_explained[rows].all()
 
 
+@pytest.mark.parametrize(
+    ("images", "splits", "differs"),
+    [
+        ((4, 5, 6, 7, 8), False, False),
+        ((4, 5), False, True),
+        ((4, 5, 6, 7), True, False),
+        ((4, 5, 6, 7, 8), True, True),
+        ((7, 8, 9, 10), False, True),
+    ],
+)
+def test_set_with_mostly_the_same_images_counts_as_the_same(
+    images: tuple[int, ...], splits: bool, differs: bool
+) -> None:
+    none = np.zeros((0, 2), dtype=np.int64)
+    tried = [Misregistration((4, 5, 6, 7), none, 90), Misregistration((1, 2), none, 80)]
+    assert Misregistration(images, none, 70, splits).differs_from(tried) == differs
+
+
 def test_failed_reregistration_restores_scene(
     component: Component, monkeypatch: pytest.MonkeyPatch
 ) -> None:
