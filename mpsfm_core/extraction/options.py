@@ -42,7 +42,7 @@ class PairOptions(Options):
 
     @property
     def num_candidates(self) -> int:
-        """Number of candidates of each image, whose local features are compared with its own."""
+        """Number of images whose local features are compared with those of each image."""
         return CANDIDATES_PER_PARTNER * self.partners
 
 

@@ -125,7 +125,7 @@ class ModelMaintenance:
             self.refine_globally()
 
     def refine_new_images(self) -> bool:
-        """Refine all images if more are registered than at the last global refinement.
+        """Refine all images if the model has more images than at its last global refinement.
 
         Returns:
             True if the images were refined.

@@ -822,9 +822,10 @@ def _point_step(block: Float64, p: int, g0: float, g1: float, g2: float, step: F
 
 @_helper
 def _find_block(slot: int, first: int, last: int, layout: ParameterLayout) -> int:
-    """Return the row between ``first`` and ``last`` whose block has the column ``slot``.
+    """Find the block of the pose ``slot`` among the sorted blocks ``first`` to ``last``.
 
-    Columns ascend. The row is often ``last``, as columns ascend by 1 where all poses share points.
+    Binary search that starts at ``last``: if consecutive poses share points, the columns ascend by
+    1, and ``last`` is the block.
     """
     while layout.block_column[last] != slot:
         middle = (first + last) // 2

@@ -52,8 +52,8 @@ _MIN_DISTORTION = 0.1
 """Relative displacement of the image corners by lens distortion from which depth is predicted again
 in undistorted images. [tuned: benchmarks.distortion]"""
 _MAX_JUMP_RUNS = 3
-"""Maximum number of times that matches across a camera jump are removed and images are mapped
-again. [ours]"""
+"""Maximum number of repetitions of the mapping after a jump of the video camera. Before each
+repetition, the matches across the jump are removed. [ours]"""
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ STEADY = build_walk(walk())
 JUMPING = build_walk(walk(), slice(20, None))
 KEPT = [(0, 1), (19, 20)]
 ACROSS = [(5, 25), (6, 26)]
-"""Pairs of distant frames across the jump."""
+"""Image pairs with one frame before and one frame after the jump of the camera."""
 
 
 class Images(list[SimpleNamespace]):
@@ -70,7 +70,7 @@ def test_pairs_across_a_jump_are_removed_unless_the_model_without_them_confirms_
     restored: list[tuple[int, int]],
     final: Reconstruction,
 ) -> None:
-    """The first result is kept if all pairs are right, and the same problem is not mapped again."""
+    """If all removed pairs are right, the first result is used without another mapping."""
     mapped: list[list[tuple[int, int]]] = []
 
     def reconstruct(problem: MappingProblem, *_: object) -> MappingResult:

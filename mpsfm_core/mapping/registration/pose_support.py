@@ -29,8 +29,7 @@ from mpsfm_core.optimize.resection import (
 )
 
 CONFIDENT_INLIER_RATIO = 0.85
-"""Inlier ratio of a pose above which no further pose hypotheses are generated, and with which an
-image may be registered before the depth check of a global refinement. [ours]"""
+"""Inlier ratio of a pose above which no further pose hypotheses are generated. [ours]"""
 REFINEMENT_SCALES = np.maximum(5.0 * 0.8 ** np.arange(12), 1.0)
 """Factors of the inlier threshold in successive Gauss-Newton steps. The factors start large because
 a RANSAC pose from lifted points can have reprojection errors of many pixels. [ours]"""
