@@ -160,7 +160,8 @@ class ModelMaintenance:
         Image pairs whose depth was compared before are not compared again.
 
         Args:
-            max_violations: Largest accepted share of pixels with contradicting depth.
+            max_violations: Largest accepted share of pixels with contradicting depth, without
+                outliers of the depth priors.
             step: Name of the mapper step that the recorded rejection reason contains.
             compared: Sets of images whose depth was compared with each other.
         """
@@ -202,8 +203,8 @@ class ModelMaintenance:
 
         Args:
             image: The image.
-            max_violations: Largest accepted share of pixels with contradicting depth, before
-                thresholds relax.
+            max_violations: Largest accepted share of pixels with contradicting depth, without
+                outliers of the depth priors and before thresholds relax.
 
         Returns:
             None if the depth of the image is consistent, else the rejection reason.
@@ -211,6 +212,7 @@ class ModelMaintenance:
         if not self.options.consistency.enabled or not self._checks_new_images:
             return None
         limit = self.thresholds.tighten_violations(max_violations)
+        limit += self.refiner.noise.outlier_ratio
         with self.event_log.timed("depth check"):
             violation = self._depth_check.check_image(
                 image, self.refiner.std_factor, limit, self._wrong_depth
@@ -263,6 +265,7 @@ class ModelMaintenance:
         """Find images to deregister so that no depth map contradicts the depth of ``images``."""
         if not self.options.consistency.enabled:
             return []
+        limit += self.refiner.noise.outlier_ratio
         with self.event_log.timed("depth check"):
             return self._depth_check.find_conflicting_images(
                 images, limit, self.refiner.std_factor, compared

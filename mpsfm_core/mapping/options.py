@@ -118,7 +118,8 @@ class ConsistencyOptions(Options):
     """Repeat the depth check of every image after the last registration. [paper 3.4]"""
     max_violations: float = expert(0.05, gt=0)
     """Share of pixels that contradict the depth of another image above which an image is rejected;
-    raising it registers more images, also wrong ones. [paper beta] [tuned: benchmarks.symmetry]"""
+    raising it registers more images, also wrong ones. The measured share of wrong depth is added.
+    [paper beta] [tuned: benchmarks.symmetry]"""
     max_deviation: float = expert(2.7, gt=0)
     """Smallest depth error of a pixel that counts as a violation of depth consistency, in standard
     deviations of both depth priors. [paper gamma] [reference: 0.6 * 15 / 3.33]"""

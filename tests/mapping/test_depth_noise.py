@@ -16,6 +16,7 @@ from mpsfm_core.mapping.refinement.depth_noise import (
     find_well_constrained_keypoints,
     measure_depth_noise,
     measure_local_depth_noise,
+    measure_outlier_ratio,
 )
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import complete_and_merge_tracks
@@ -104,6 +105,29 @@ def test_wrong_scales_are_no_noise() -> None:
 def test_too_few_common_points_keep_the_declared_std() -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, POSES)
     assert measure_depth_noise(Scene(problem)) == DepthNoise()
+
+
+def test_outlier_ratio_is_the_share_of_wrong_depth() -> None:
+    def wrong_by_half(rng: np.random.Generator, shape: tuple[int, int]) -> Float64:
+        """Return errors of the declared std, and 50 % too far depth in the upper fifth."""
+        errors = DECLARED * rng.normal(size=shape)
+        errors[: shape[0] // 5] += np.log(1.5)
+        return errors
+
+    scene = scene_with(wrong_by_half)
+    keypoints = scene.tracks.observations()
+    is_upper = scene.keypoints[keypoints, 1] < CAMERA.height / 5
+    assert 0.1 < is_upper.mean() < 0.3
+    assert measure_outlier_ratio(scene, 1.0, 2.7) == pytest.approx(is_upper.mean(), abs=0.05)
+    declared = scene_with(lambda rng, shape: DECLARED * rng.normal(size=shape))
+    assert measure_outlier_ratio(declared, 1.0, 2.7) < 0.02
+
+
+def test_outlier_ratio_needs_points_of_three_images() -> None:
+    scene = scene_with(lambda rng, shape: np.full(shape, 0.5))
+    assert measure_outlier_ratio(scene, 1.0, 2.7) == 1
+    scene.deregister(2)
+    assert measure_outlier_ratio(scene, 1.0, 2.7) == 0
 
 
 @pytest.mark.parametrize("views", [2, 3])

@@ -14,6 +14,7 @@ from mpsfm_core.mapping.mapper import reconstruct
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import MappingResult, Reconstruction
 from mpsfm_core.optimize import bundle_problem
+from mpsfm_core.testing.synthetic.halls import CALIBRATED_PRIORS, make_hall_problem
 from mpsfm_core.testing.synthetic.problems import SyntheticNoise, make_mapping_problem
 from mpsfm_core.testing.synthetic.scenes import arc_poses, look_at, room_scene
 
@@ -200,3 +201,11 @@ def test_estimated_focal_length_is_refined_and_shared() -> None:
     kept = MapperOptions.model_validate({"refinement": {"refine_focal": False}})
     for image in reconstruct(guessed, kept).reconstructions[0].images:
         assert image.camera.fx == guess.fx
+
+
+def test_depth_that_is_wrong_in_whole_regions_loses_no_image() -> None:
+    """Where few points show that depth is wrong, it contradicts right poses."""
+    errors = replace(CALIBRATED_PRIORS, patch=0.5)
+    hall = make_hall_problem(49, errors, seed=4, points_per_view=25)
+    result = reconstruct(hall.problem)
+    assert [len(model.images) for model in result.reconstructions] == [49]

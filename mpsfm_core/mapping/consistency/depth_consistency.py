@@ -28,7 +28,11 @@ standard deviation of the prior
 contradict the prior, the standard deviation grows and the pixel is no violation. If no nearby
 points contradict the prior, the standard deviation of the whole scene applies. An image registered
 to a look-alike place observes points only on look-alike structure, so structure that differs still
-causes violations.
+causes violations. Where no points are near, wrong depth remains a violation. Therefore the limit of
+the violation ratio is raised by the share of outliers of the depth priors, which is measured at the
+points of the whole scene
+(:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_outlier_ratio`). The violation ratio sums
+over two depth maps, and about half of the outliers of each are in front of the surface.
 
 The depth of an image is compared with all overlapping images, not only with those that share
 points. Images that share points with a misregistered image look alike, so their depth may agree
@@ -49,6 +53,7 @@ from mpsfm_core.geometry import pixel_centers, unproject
 from mpsfm_core.geometry.frustum import frustum_planes
 from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.refinement.depth_noise import (
+    MIN_GAP,
     find_well_constrained_keypoints,
     measure_local_depth_noise,
 )
@@ -75,9 +80,6 @@ POINT_GROUP = 16
 """Number of points with a common bounding sphere in the count of visible points. [ours]"""
 NUM_COMPARED = 16
 """Number of most overlapping images whose depth is compared with that of an image. [ours]"""
-MIN_GAP = 0.05
-"""Smallest relative depth error of a pixel that counts as a violation of depth consistency.
-[tuned: benchmarks.symmetry]"""
 MIN_OVERLAP_RATIO = 0.05
 """Minimum share of grid pixels that project into another image for a comparison of both images.
 [ours]"""

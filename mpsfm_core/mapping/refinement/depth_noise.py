@@ -7,6 +7,9 @@ small, and how much errors of neighboring pixels correlate.
 
 Bundle adjustment treats observations as independent, so correlated observations need a larger
 variance.
+
+Depth priors are also wrong in whole regions by many standard deviations. The share of such outliers
+is measured at points that rays from three images constrain well.
 """
 
 from __future__ import annotations
@@ -34,6 +37,12 @@ POSE_UNKNOWNS = 6
 """Degrees of freedom of the pose of an additional image."""
 MULTIPLIER_RANGE = (0.1, 10.0)
 """Range of the factor between the measured and the declared standard deviation of depth. [ours]"""
+MIN_GAP = 0.05
+"""Smallest relative depth error that counts as a contradiction. [tuned: benchmarks.symmetry]"""
+MIN_OUTLIER_TRACK_LENGTH = 3
+"""Smallest number of observations of a point that measures the share of outliers. The depth of a
+misregistered image that shares points with only one image contradicts points of two observations.
+[COLMAP ignore_two_view_tracks]"""
 MIN_CONSTRAINED_ANGLE_DEG = 2.0
 """Minimum triangulation angle of a point that rays constrain well without depth. Two observations
 of a point suffice, because a wrong pose makes all points of an image contradict the depth prior,
@@ -59,6 +68,8 @@ class DepthNoise(NamedTuple):
     design_effect: float = 1.0
     """Ratio of the variances of the mean of correlated and of independent observations (Kish,
     Survey Sampling, 1965)."""
+    outlier_ratio: float = 0.0
+    """Share of well-constrained points whose depth contradicts the depth prior, in [0, 1]."""
 
     @property
     def std_factor(self) -> float:
@@ -106,6 +117,46 @@ def measure_depth_noise(scene: Scene) -> DepthNoise:
     variance = (1.0 + independent * spread**2) / (1.0 + max(independent - unknown, 0.0))
     multiplier = float(np.clip(np.sqrt(variance), *MULTIPLIER_RANGE))
     return DepthNoise(multiplier, correlation, effect)
+
+
+def measure_outlier_ratio(scene: Scene, std_factor: float, max_deviation: float) -> float:
+    """Measure the share of outliers of the depth priors at well-constrained points.
+
+    Keypoints at depth edges are left out, because they may observe either surface.
+
+    Args:
+        scene: The scene.
+        std_factor: Ratio of the measured and the declared standard deviation of depth.
+        max_deviation: Largest deviation of log depth that is no contradiction, in standard
+            deviations.
+
+    Returns:
+        The share, or 0 for fewer than ``MIN_RESIDUALS`` observations.
+    """
+    tracks, graph = scene.tracks, scene.graph
+    observations = tracks.observations()
+    points = tracks.point_of[observations]
+    is_long = np.bincount(points, minlength=len(tracks.xyz)) >= MIN_OUTLIER_TRACK_LENGTH
+    is_used = is_long & (scene.track_angles_deg() >= MIN_CONSTRAINED_ANGLE_DEG)
+    keypoints = observations[is_used[points]]
+    keypoints = keypoints[_lie_on_surfaces(scene)[keypoints]]
+    _, z = scene.project(keypoints, tracks.xyz[tracks.point_of[keypoints]])
+    prior = scene.keypoint_prior[keypoints] * scene.scales()[graph.image_of[keypoints]]
+    usable = (prior > 0) & (z > 0)
+    if np.count_nonzero(usable) < MIN_RESIDUALS:
+        return 0.0
+    errors = np.abs(np.log(z[usable] / prior[usable]))
+    max_errors = max_deviation * std_factor * scene.keypoint_log_std[keypoints[usable]]
+    return float(np.mean(errors > np.maximum(max_errors, MIN_GAP)))
+
+
+def _lie_on_surfaces(scene: Scene) -> Bool:
+    """Return a mask (k,) of the keypoints with depth of known scale that are at no depth edge."""
+    known: Bool = scene.keypoint_valid.copy()
+    for image, depth_map in enumerate(scene.maps):
+        of_image = scene.graph.keypoints_of(image)
+        known[of_image] &= depth_map.active and ~depth_map.keypoint_at_edge
+    return known
 
 
 def find_well_constrained_keypoints(

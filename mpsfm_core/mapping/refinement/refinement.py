@@ -17,7 +17,11 @@ from scipy.sparse import csr_array
 from mpsfm_core.data import Bool, DepthPrior, Float64, Int64, NormalPrior, PinholeCamera
 from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.refinement.depth_noise import DepthNoise, measure_depth_noise
+from mpsfm_core.mapping.refinement.depth_noise import (
+    DepthNoise,
+    measure_depth_noise,
+    measure_outlier_ratio,
+)
 from mpsfm_core.mapping.refinement.filtering import filter_points
 from mpsfm_core.mapping.refinement.keypoint_noise import measure_loss_scale
 from mpsfm_core.mapping.refinement.self_calibration import (
@@ -174,6 +178,7 @@ class Refiner:
         self.scene = scene
         self.options = options.refinement
         self.triangulation = options.triangulation
+        self._max_depth_deviation = options.consistency.max_deviation
         self.scores = scores
         self.fixed: Bool = np.zeros(scene.num_images, dtype=np.bool_)
         groups = scene.depth_group_of
@@ -625,6 +630,10 @@ class Refiner:
         if not self.options.measure_depth_noise:
             return
         self.noise = measure_depth_noise(self.scene)
+        outlier_ratio = measure_outlier_ratio(
+            self.scene, self.std_factor, self._max_depth_deviation
+        )
+        self.noise = self.noise._replace(outlier_ratio=outlier_ratio)
         ratio = self.noise.multiplier / self._integrator_noise.multiplier
         if not 1 / MAX_NOISE_CHANGE < ratio < MAX_NOISE_CHANGE:
             self._integrator_noise = self.noise

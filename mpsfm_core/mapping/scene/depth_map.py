@@ -3,16 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from threading import Lock
 from typing import Any, Protocol
 
+import cv2
 import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage, PinholeCamera
-from mpsfm_core.geometry import sample_bilinear, scale_pixels
+from mpsfm_core.geometry import sample_bilinear, sample_nearest, scale_pixels
 from mpsfm_core.optimize.depth_integration import NO_ANCHORS, Anchors, RefinedDepth
 from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, upsample
 from mpsfm_core.support.disk_arrays import current_store, store_fields
+
+EDGE_WIDTH = 1 / 160
+"""Distance from a depth edge at which a keypoint may observe the other surface, relative to the
+width of the depth map. [ours]"""
+MAX_EDGE_RATIO = 1.05
+"""Largest ratio of the depths around a keypoint that is not at a depth edge. [ours]"""
 
 
 class RefinesDepth(Protocol):
@@ -239,6 +247,16 @@ class DepthMap:
         """(h, w) float32 declared variance of :attr:`depth`, in squared world units."""
         variance: Float32 = (self.log_std * self.depth) ** 2
         return variance
+
+    @cached_property
+    def keypoint_at_edge(self) -> Bool:
+        """(n,) bool mask of the keypoints at edges of the depth prior, or near invalid depth."""
+        columns = self.camera.width
+        kernel = np.ones((2 * max(1, round(EDGE_WIDTH * columns)) + 1,) * 2)
+        depth = np.where(self.prior.valid, self.prior.depth, np.float32(0))
+        ratio = cv2.dilate(depth, kernel) / np.maximum(cv2.erode(depth, kernel), 1e-12)
+        at_edge: Bool = sample_nearest(ratio > MAX_EDGE_RATIO, self.keypoints)
+        return at_edge
 
     def prior_at_keypoints(self, rows: Int64 | slice = slice(None)) -> Float64:
         """Return the unscaled depth prior (m,) at keypoints with a valid depth prior."""
