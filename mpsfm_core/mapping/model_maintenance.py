@@ -125,7 +125,7 @@ class ModelMaintenance:
             self.refine_globally()
 
     def refine_new_images(self) -> bool:
-        """Refine all images if the model has more images than at its last global refinement.
+        """Run global refinement if the number of images has grown since the last one.
 
         Returns:
             True if the images were refined.

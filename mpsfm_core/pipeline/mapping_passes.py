@@ -52,8 +52,8 @@ _MIN_DISTORTION = 0.1
 """Relative displacement of the image corners by lens distortion from which depth is predicted again
 in undistorted images. [tuned: benchmarks.distortion]"""
 _MAX_JUMP_RUNS = 3
-"""Maximum number of repetitions of the mapping after a jump of the video camera. Before each
-repetition, the matches across the jump are removed. [ours]"""
+"""Maximum number of times that a video is mapped again without the matches across a camera jump.
+[ours]"""
 
 
 @dataclass(frozen=True)

@@ -109,7 +109,7 @@ def test_too_few_common_points_keep_the_declared_std() -> None:
 
 def test_outlier_ratio_is_the_share_of_wrong_depth() -> None:
     def wrong_by_half(rng: np.random.Generator, shape: tuple[int, int]) -> Float64:
-        """Return errors of the declared std, and 50 % too far depth in the upper fifth."""
+        """Return log-depth errors of the declared std, plus log(1.5) in the upper fifth."""
         errors = DECLARED * rng.normal(size=shape)
         errors[: shape[0] // 5] += np.log(1.5)
         return errors

@@ -204,7 +204,7 @@ def test_estimated_focal_length_is_refined_and_shared() -> None:
 
 
 def test_depth_that_is_wrong_in_whole_regions_loses_no_image() -> None:
-    """Where few points show that depth is wrong, it contradicts right poses."""
+    """Wrong depth in regions with few 3D points contradicts correct poses."""
     errors = replace(CALIBRATED_PRIORS, patch=0.5)
     hall = make_hall_problem(49, errors, seed=4, points_per_view=25)
     result = reconstruct(hall.problem)

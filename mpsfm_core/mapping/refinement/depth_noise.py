@@ -38,11 +38,11 @@ POSE_UNKNOWNS = 6
 MULTIPLIER_RANGE = (0.1, 10.0)
 """Range of the factor between the measured and the declared standard deviation of depth. [ours]"""
 MIN_GAP = 0.05
-"""Smallest relative depth error that counts as a contradiction. [tuned: benchmarks.symmetry]"""
+"""Smallest relative difference between a depth prior and a 3D point, or the depth map of another
+image, that counts as a contradiction. [tuned: benchmarks.symmetry]"""
 MIN_OUTLIER_TRACK_LENGTH = 3
-"""Smallest number of observations of a point that measures the share of outliers. The depth of a
-misregistered image that shares points with only one image contradicts points of two observations.
-[COLMAP ignore_two_view_tracks]"""
+"""Minimum track length of the 3D points that measure the share of outliers. Points of two images
+may be wrong themselves, if one of the images is misregistered. [COLMAP ignore_two_view_tracks]"""
 MIN_CONSTRAINED_ANGLE_DEG = 2.0
 """Minimum triangulation angle of a point that rays constrain well without depth. Two observations
 of a point suffice, because a wrong pose makes all points of an image contradict the depth prior,

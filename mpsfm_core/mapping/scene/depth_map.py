@@ -17,10 +17,10 @@ from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample,
 from mpsfm_core.support.disk_arrays import current_store, store_fields
 
 EDGE_WIDTH = 1 / 160
-"""Distance from a depth edge at which a keypoint may observe the other surface, relative to the
-width of the depth map. [ours]"""
+"""Distance in which depth is searched for an edge around a keypoint, relative to the width of the
+depth map. [ours]"""
 MAX_EDGE_RATIO = 1.05
-"""Largest ratio of the depths around a keypoint that is not at a depth edge. [ours]"""
+"""Ratio of the largest and smallest depth around a keypoint above which there is an edge. [ours]"""
 
 
 class RefinesDepth(Protocol):
