@@ -148,6 +148,7 @@ gc.set_threshold(100_000, 20, 100)
 # A provider may print, so the messages to the first process have a file of their own.
 messages = os.fdopen(os.dup(1), "w")
 os.dup2(2, 1)
+import threadpoolctl
 import mpsfm_core.providers.registry
 
 def measure_import(modules, heavy):
@@ -172,7 +173,8 @@ def run_provider(path, folder):
         case.prepare(example, example.partner)
         case.provider
         seconds = time.perf_counter() - started
-        found = case.run_on_view(example.view, example, auxiliary=auxiliary), seconds
+        with threadpoolctl.threadpool_limits(1, user_api="blas"):
+            found = case.run_on_view(example.view, example, auxiliary=auxiliary), seconds
     path.with_suffix(".answer").write_bytes(pickle.dumps(found))
 
 for line in sys.stdin:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from threadpoolctl import threadpool_limits
 
 from mpsfm_core import ProviderContext, ProviderSpec, View
 from mpsfm_core.data.errors import InputError, ProviderError
@@ -218,3 +219,12 @@ def test_second_process_failure_is_reported_and_later_providers_are_checked(
     assert outcomes(PaintedDepth, PAINTED, "second-process")["second-process"][0] == "pass"
     # The ended process leaves no files; those of the running process are in its folder.
     assert {path.name for path in tmp_path.glob("*/*")} == {"input", "input.answer"}
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_outputs_of_processes_are_compared_with_equal_numbers_of_blas_threads(threads: int) -> None:
+    with threadpool_limits(threads, user_api="blas"):
+        results = run_checks(
+            Registry.discover(), "matcher", "mutual-nearest", only=("second-process",)
+        )
+    assert [(r.status, r.message) for r in results if r.status != "pass"] == []
