@@ -39,6 +39,7 @@ from mpsfm_core.extraction.matching.keypoint_adjustment import (
 from mpsfm_core.extraction.matching.verification import CALIBRATED, TwoViewGeometry, verify_matches
 from mpsfm_core.extraction.pairs.pairing import Pair
 from mpsfm_core.geometry import sample_nearest
+from mpsfm_core.geometry.two_view import estimate_two_view_geometry
 from mpsfm_core.providers.kinds.matcher import run_matcher
 from mpsfm_core.providers.source_hash import hash_module
 
@@ -210,7 +211,7 @@ class PairVerifier:
             std_px,
             seed,
             pycolmap.__version__,
-            hash_module(verify_matches.__module__),
+            *(hash_module(f.__module__) for f in (verify_matches, estimate_two_view_geometry)),
         ]
         key = content_key(parts, digest(xy_a), digest(xy_b))
         found = self._context.cache.load("two-view", key, TwoViewGeometry)

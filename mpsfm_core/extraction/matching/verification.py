@@ -12,7 +12,7 @@ from scipy.special import bdtrc
 from mpsfm_core.data import Float64, Int64, PinholeCamera
 from mpsfm_core.data.decisions import PairReason, Reason
 from mpsfm_core.extraction.options import VerificationOptions
-from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
+from mpsfm_core.geometry.two_view import estimate_two_view_geometry
 
 _Configuration = pycolmap.TwoViewGeometryConfiguration
 CALIBRATED = "calibrated"
@@ -25,18 +25,8 @@ _USABLE = {
 }
 _MIN_INLIER_RATIO = 0.1
 """Assumed minimum inlier ratio, which limits the number of RANSAC trials. [reference]"""
-_MAX_TRIALS = 20_000
-"""Maximum number of RANSAC trials. [reference]"""
-_CONFIDENCE = 0.999
-"""Probability that RANSAC draws an outlier-free sample. [COLMAP confidence]"""
-_MIN_E_F_RATIO = 0.95
-"""Minimum ratio of essential-matrix inliers to fundamental-matrix inliers of a calibrated pair.
-[COLMAP min_E_F_inlier_ratio]"""
 _SAMPLE_SIZE = 5
 """Number of matches in a minimal sample for an essential matrix."""
-_MAX_H_RATIO = 0.8
-"""Ratio of homography inliers to epipolar inliers above which a pair is planar or panoramic.
-[COLMAP max_H_inlier_ratio]"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,14 +84,16 @@ def verify_matches(
     """
     if len(xy_a) < options.min_inliers:
         return _dropped(PairReason.TOO_FEW_MATCHES)
-    matches = np.repeat(np.arange(len(xy_a), dtype=np.uint32)[:, None], 2, axis=1)
-    geometry = pycolmap.estimate_calibrated_two_view_geometry(
-        colmap_from_pinhole(camera_a),
+    max_error_px = options.max_error_px * max(1.0, std_px)
+    geometry = estimate_two_view_geometry(
+        camera_a,
+        camera_b,
         xy_a,
-        colmap_from_pinhole(camera_b),
         xy_b,
-        matches,
-        _colmap_options(options, std_px, seed),
+        max_error_px=max_error_px,
+        min_inlier_ratio=_MIN_INLIER_RATIO,
+        min_inliers=options.min_inliers,
+        seed=seed,
     )
     inliers = np.asarray(geometry.inlier_matches)[:, 0].astype(np.int64)
     if geometry.config not in _USABLE:
@@ -110,9 +102,7 @@ def verify_matches(
     configuration = _USABLE[geometry.config]
     if len(inliers) < options.min_inliers:
         return _dropped(PairReason.TOO_FEW_INLIERS, configuration, len(inliers))
-    chance = _chance_of_inliers(
-        len(inliers), len(xy_a), camera_b, options.max_error_px * max(1.0, std_px)
-    )
+    chance = _chance_of_inliers(len(inliers), len(xy_a), camera_b, max_error_px)
     if chance > options.max_chance:
         return _dropped(PairReason.EXPLAINED_BY_CHANCE, configuration, len(inliers))
     pose = geometry.cam2_from_cam1
@@ -140,22 +130,3 @@ def _dropped(reason: PairReason, configuration: str = "", num_inliers: int = 0) 
     """Return a two-view geometry without inliers for a dropped image pair."""
     none = np.empty(0, np.int64)
     return TwoViewGeometry(reason.value, configuration, num_inliers, none, np.eye(3), np.zeros(3))
-
-
-def _colmap_options(
-    options: VerificationOptions, std_px: float, seed: int
-) -> pycolmap.TwoViewGeometryOptions:
-    colmap = pycolmap.TwoViewGeometryOptions()
-    colmap.min_num_inliers = options.min_inliers
-    colmap.min_E_F_inlier_ratio = _MIN_E_F_RATIO
-    colmap.max_H_inlier_ratio = _MAX_H_RATIO
-    colmap.compute_relative_pose = True
-    # COLMAP detects watermarks only for photos from the internet.
-    colmap.detect_watermark = False
-    ransac = colmap.ransac
-    ransac.max_error = options.max_error_px * max(1.0, std_px)
-    ransac.min_inlier_ratio = _MIN_INLIER_RATIO
-    ransac.max_num_trials = _MAX_TRIALS
-    ransac.confidence = _CONFIDENCE
-    ransac.random_seed = seed
-    return colmap

@@ -12,7 +12,7 @@ import pycolmap
 from mpsfm_core.data import Bool, Float64, MappingImage, MappingProblem, VerifiedPair
 from mpsfm_core.data.camera_models import IntrinsicParameter, to_distortion
 from mpsfm_core.geometry.distortion import change_distortion
-from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
+from mpsfm_core.geometry.two_view import estimate_two_view_geometry
 from mpsfm_core.mapping.initialization.camera_splitting import (
     find_deviating_focals,
     split_cameras,
@@ -31,6 +31,8 @@ MIN_INLIER_RATIO = 0.25
 """Assumed inlier ratio from which RANSAC computes its number of trials. [COLMAP two-view
 min_inlier_ratio]
 """
+MIN_INLIERS = 15
+"""Number of inliers below which a pair keeps its relative pose. [COLMAP min_num_inliers]"""
 
 
 def apply_refined_focal_lengths(
@@ -115,9 +117,6 @@ def _estimate_relative_pose(
 ) -> VerifiedPair:
     """Return a pair with a new relative pose if COLMAP's two-view geometry has one.
 
-    The pair is calibrated if COLMAP prefers the essential matrix to fundamental matrix and
-    homography.
-
     Args:
         problem: Mapping problem that contains the pair.
         keypoints: Keypoints (k, 2) of each image without its initial distortion, in pixels.
@@ -125,17 +124,15 @@ def _estimate_relative_pose(
         seed: Seed of RANSAC.
     """
     image_a, image_b = problem.images[pair.image_a], problem.images[pair.image_b]
-    options = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True, detect_watermark=False)
-    options.ransac.max_error = MAX_ERROR_PX * max(image_a.keypoint_std_px, image_b.keypoint_std_px)
-    options.ransac.min_inlier_ratio = MIN_INLIER_RATIO
-    options.ransac.random_seed = seed
-    geometry = pycolmap.estimate_calibrated_two_view_geometry(
-        colmap_from_pinhole(image_a.camera),
+    geometry = estimate_two_view_geometry(
+        image_a.camera,
+        image_b.camera,
         keypoints[pair.image_a][pair.matches[:, 0]],
-        colmap_from_pinhole(image_b.camera),
         keypoints[pair.image_b][pair.matches[:, 1]],
-        np.repeat(np.arange(len(pair), dtype=np.uint32)[:, None], 2, axis=1),
-        options,
+        max_error_px=MAX_ERROR_PX * max(image_a.keypoint_std_px, image_b.keypoint_std_px),
+        min_inlier_ratio=MIN_INLIER_RATIO,
+        min_inliers=MIN_INLIERS,
+        seed=seed,
     )
     pose = geometry.cam2_from_cam1
     if pose is None:
