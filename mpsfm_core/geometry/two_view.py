@@ -1,4 +1,4 @@
-"""Two-view geometry of matched keypoints by COLMAP's LO-RANSAC."""
+"""Estimation of the two-view geometry of matched keypoints, by COLMAP's LO-RANSAC."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from mpsfm_core.data import Float64, PinholeCamera
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 
 MIN_TRIALS = 30
-"""Minimum number of RANSAC trials. With the 100 trials of COLMAP, pairs with many inliers take up
-to twice as long. [tuned: benchmarks/results/walks.md]"""
+"""Minimum number of RANSAC trials. COLMAP's default of 100 takes up to twice as long for pairs
+whose matches are nearly all inliers. [tuned: benchmarks/results/walks.md]"""
 MAX_TRIALS = 20_000
 """Maximum number of RANSAC trials. [reference]"""
 
@@ -41,7 +41,7 @@ def estimate_two_view_geometry(
         min_inliers: Number of inliers below which the geometry is degenerate.
         seed: Seed of RANSAC; the same input and seed give the same result.
     """
-    # COLMAP detects watermarks only for photos from the internet.
+    # Watermark detection is meant for photos from the internet.
     options = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True, detect_watermark=False)
     options.min_num_inliers = min_inliers
     options.ransac.max_error = max_error_px

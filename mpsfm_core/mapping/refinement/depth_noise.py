@@ -38,8 +38,8 @@ POSE_UNKNOWNS = 6
 MULTIPLIER_RANGE = (0.1, 10.0)
 """Range of the factor between the measured and the declared standard deviation of depth. [ours]"""
 MIN_GAP = 0.05
-"""Smallest relative difference between a depth prior and a 3D point, or the depth map of another
-image, that counts as a contradiction. [tuned: benchmarks.symmetry]"""
+"""Smallest relative difference at which a depth prior contradicts a 3D point or the depth map of
+another image. [tuned: benchmarks.symmetry]"""
 MIN_OUTLIER_TRACK_LENGTH = 3
 """Minimum track length of the 3D points that measure the share of outliers. Points of two images
 may be wrong themselves, if one of the images is misregistered. [COLMAP ignore_two_view_tracks]"""

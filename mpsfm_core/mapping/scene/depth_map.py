@@ -17,10 +17,11 @@ from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample,
 from mpsfm_core.support.disk_arrays import current_store, store_fields
 
 EDGE_WIDTH = 1 / 160
-"""Distance in which depth is searched for an edge around a keypoint, relative to the width of the
-depth map. [ours]"""
+"""Half width of the window around a keypoint that is searched for depth edges, relative to the
+width of the depth map. [ours]"""
 MAX_EDGE_RATIO = 1.05
-"""Ratio of the largest and smallest depth around a keypoint above which there is an edge. [ours]"""
+"""Ratio of the largest to the smallest depth in the window around a keypoint above which the
+keypoint is at a depth edge. [ours]"""
 
 
 class RefinesDepth(Protocol):
