@@ -8,7 +8,6 @@
 3. Average the relative rotations by IRLS with a Cauchy loss.
 4. Solve for the scales of the depth priors, then for the camera centers. Depth scales and camera
    centers are the solutions of linear least-squares problems, solved by IRLS with a Cauchy loss.
-   The metric scales of depth priors have a prior, because they are similar.
 5. Remove the image pairs that disagree with the estimated poses, and return the poses of the
    largest component that remains.
 
@@ -52,10 +51,6 @@ PLANAR_WEIGHT = 0.1
 """Weight of each match of a pair that a homography also explains, because a planar scene has two
 possible relative poses. [tuned: benchmarks.accuracy on rendered_kitchen]
 """
-SCALE_PRIOR_WEIGHT = 3.0
-"""Weight of the prior that a metric depth prior has the common scale, in matches of a pair. Without
-this prior, the scales beyond the weakest pairs of a loop take the errors of all its pairs. [tuned:
-benchmarks.walks]"""
 NUM_ITERATIONS = 20
 """Number of IRLS iterations of rotation averaging and of the linear solvers. [ours]"""
 DAMPING = 1e-9
@@ -118,14 +113,8 @@ def estimate_global_poses(scene: Scene, candidates: Bool) -> GlobalPoses | None:
     rotations = average_rotations(edges.a, edges.b, edges.rotation, edges.weight, num_images)
     log_ratios = edges.log_length[:, 0] - edges.log_length[:, 1]
     group = scene.depth_group_of  # depth priors of one depth group share a scale
-    is_metric = np.array([image.depth.metric for image in scene.problem.images])
     group_log_scales = average_differences(
-        group[edges.a],
-        group[edges.b],
-        log_ratios,
-        edges.weight,
-        num_images,
-        prior_weights=SCALE_PRIOR_WEIGHT * is_metric,
+        group[edges.a], group[edges.b], log_ratios, edges.weight, num_images
     )
     log_scales = group_log_scales[group]
     lengths = np.exp((log_scales[edges.a] + log_scales[edges.b] + edges.log_length.sum(axis=1)) / 2)
@@ -175,12 +164,7 @@ def average_rotations(
 
 
 def average_differences(
-    a: Int64,
-    b: Int64,
-    differences: Float64,
-    weights: Float64,
-    num_nodes: int,
-    prior_weights: Float64 | float = 0.0,
+    a: Int64, b: Int64, differences: Float64, weights: Float64, num_nodes: int
 ) -> Float64:
     """Solve ``x[b] - x[a] = differences`` for node values ``x`` by IRLS with a Cauchy loss.
 
@@ -190,7 +174,6 @@ def average_differences(
         differences: (m, ...) measured differences ``x[b] - x[a]``.
         weights: (m,) weight of each graph edge.
         num_nodes: Number of nodes.
-        prior_weights: Weights of a prior that all node values are equal, a scalar or (num_nodes,).
 
     Returns:
         (num_nodes, ...) node values with mean 0. All graph nodes without edges share one value.
@@ -198,8 +181,7 @@ def average_differences(
     measured = differences.reshape(len(differences), -1)
     robust_weights = np.ones(len(a))
     for _ in range(NUM_ITERATIONS):
-        all_weights = weights * robust_weights
-        values = _solve_differences(a, b, measured, all_weights, num_nodes, prior_weights)
+        values = _solve_differences(a, b, measured, weights * robust_weights, num_nodes)
         errors = np.linalg.norm(values[b] - values[a] - measured, axis=1)
         robust_weights = _cauchy_weights(errors)
     values -= values.mean(axis=0)
@@ -207,26 +189,12 @@ def average_differences(
 
 
 def _solve_differences(
-    a: Int64,
-    b: Int64,
-    differences: Float64,
-    weights: Float64,
-    num_nodes: int,
-    zero_weights: Float64 | float = 0.0,
+    a: Int64, b: Int64, differences: Float64, weights: Float64, num_nodes: int
 ) -> Float64:
-    """Solve for node values (n, d) by weighted linear least squares on their differences.
-
-    Args:
-        a: (m,) index of the first node of each graph edge.
-        b: (m,) index of the second node of each graph edge.
-        differences: (m, d) measured differences ``x[b] - x[a]``.
-        weights: (m,) weight of each graph edge.
-        num_nodes: Number of nodes.
-        zero_weights: Weights of the squared node values, a scalar or (num_nodes,).
-    """
+    """Solve for node values (n, d) by weighted linear least squares on their differences."""
     ends = np.concatenate([a, b])
     degree = np.bincount(ends, np.concatenate([weights, weights]), minlength=num_nodes)
-    diagonal = degree + DAMPING * degree.max() + zero_weights
+    diagonal = degree + DAMPING * degree.max()
     nodes = np.arange(num_nodes)
     entries = np.concatenate([-weights, -weights, diagonal])
     rows_and_columns = np.concatenate([a, b, nodes]), np.concatenate([b, a, nodes])

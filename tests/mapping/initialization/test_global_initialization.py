@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -173,17 +172,6 @@ def test_average_differences_with_outlier_recovers_values() -> None:
     steps[4] += 5
     values = average_differences(a, b, steps, np.ones(len(a)), 6)
     np.testing.assert_allclose(values, truth - truth.mean(axis=0), atol=1e-3)
-
-
-def test_average_differences_with_prior_rejects_a_wrong_edge() -> None:
-    """Two groups of nodes with equal values are joined by one edge, which is wrong by 2."""
-    near = np.array([(i, j) for i, j in combinations(range(10), 2) if i // 5 == j // 5])
-    a, b = np.concatenate([near, [(4, 5)]]).T
-    steps = np.random.default_rng(0).normal(size=len(a)) * 0.01
-    steps[-1] = 2.0
-    weights = np.full(len(a), 50.0)
-    assert np.ptp(average_differences(a, b, steps, weights, 10)) > 1.9
-    assert np.ptp(average_differences(a, b, steps, weights, 10, prior_weights=3.0)) < 0.05
 
 
 def test_average_rotations_with_outliers_recovers_rotations() -> None:
