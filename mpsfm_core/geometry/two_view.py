@@ -1,4 +1,4 @@
-"""Estimation of the two-view geometry of matched keypoints, by COLMAP's LO-RANSAC."""
+"""Two-view geometry of matched keypoints, estimated by COLMAP's LO-RANSAC."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from mpsfm_core.data import Float64, PinholeCamera
 from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 
 MIN_TRIALS = 30
-"""Minimum number of RANSAC trials. COLMAP's default of 100 takes up to twice as long for pairs
-whose matches are nearly all inliers. [tuned: benchmarks/results/walks.md]"""
+"""Minimum number of RANSAC trials. If nearly all matches are inliers, COLMAP's default of 100 takes
+up to twice as long. [tuned: benchmarks/results/walks.md]"""
 MAX_TRIALS = 20_000
 """Maximum number of RANSAC trials. [reference]"""
 

@@ -32,8 +32,8 @@ MIN_INLIER_RATIO = 0.25
 min_inlier_ratio]
 """
 MIN_INLIERS = 15
-"""Minimum number of inliers of a new relative pose. A pair with fewer inliers keeps its previous
-relative pose. [COLMAP min_num_inliers]"""
+"""Minimum number of inliers with which a new relative pose of a pair replaces the previous one.
+[COLMAP min_num_inliers]"""
 
 
 def apply_refined_focal_lengths(

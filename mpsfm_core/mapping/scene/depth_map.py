@@ -17,11 +17,11 @@ from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample,
 from mpsfm_core.support.disk_arrays import current_store, store_fields
 
 EDGE_WIDTH = 1 / 160
-"""Half width of the window around a keypoint that is searched for depth edges, relative to the
-width of the depth map. [ours]"""
+"""Half the width of the square window around a keypoint in which its depth is compared, relative to
+the width of the depth map. [ours]"""
 MAX_EDGE_RATIO = 1.05
-"""Ratio of the largest to the smallest depth in the window around a keypoint above which the
-keypoint is at a depth edge. [ours]"""
+"""A keypoint is at a depth edge if the largest depth in its window is more than this factor times
+the smallest. [ours]"""
 
 
 class RefinesDepth(Protocol):
