@@ -26,10 +26,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import lapack
 from scipy.sparse import bsr_array, csc_array
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 from threadpoolctl import ThreadpoolController
 
-from mpsfm_core.data import Float64
+from mpsfm_core.data import Float64, Int64
 from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.bundle_problem import (
@@ -59,12 +59,9 @@ CG_TOLERANCE = 1e-2
 minimum earlier. [tuned: benchmarks.scale]"""
 MAX_CG_ITERATIONS = 500
 """Maximum number of conjugate-gradient iterations per Levenberg-Marquardt step. [ours]"""
-MAX_FACTORIZED_POSES = 1200
-"""Maximum number of variable poses for a sparse factorization of the reduced camera system, which
-takes at most 600 MB of memory. [ours]"""
-ENOUGH_CG_ITERATIONS = 100
-"""Number of conjugate-gradient iterations that take as long as a sparse factorization, after which
-the system is factorized. [tuned: benchmarks.walks]"""
+FACTORIZATION_COST = 0.4
+"""Time of an arithmetic operation of a sparse factorization, relative to conjugate gradients.
+[tuned: benchmarks.scale]"""
 ENOUGH_FACTOR_ITERATIONS = 20
 """Number of conjugate-gradient iterations with a factorization of an earlier system as
 preconditioner, after which the system is factorized again. [tuned: benchmarks.walks]"""
@@ -245,6 +242,11 @@ class SchurComplementSolver:
         self.run = run
         self.dense = poses <= options.dense_poses
         self._factor: Callable[[Float64], Float64] | None = None
+        self._enough_iterations = (
+            MAX_CG_ITERATIONS
+            if self.dense or p.rig is not None
+            else count_enough_iterations(p.pairs, poses)
+        )
         self.tolerance = options.function_tolerance
         self.rig, self.basis = p.rig, self._build_basis(p.rig, p.state)
         self._trial_rig = p.rig
@@ -469,9 +471,10 @@ class SchurComplementSolver:
         """Solve the reduced camera system by preconditioned conjugate gradients.
 
         Conjugate gradients with block-Jacobi preconditioner converge slowly for long chains of
-        images, as in a video. If conjugate gradients do not converge soon, this system is
-        factorized. The factorization is the preconditioner of later systems, which differ less and
-        less.
+        images, as in a video or along streets. If conjugate gradients do not converge soon, this
+        system is factorized, unless a factorization takes too long
+        (:func:`count_enough_iterations`). The factorization is the preconditioner of later systems,
+        which differ less and less.
 
         Args:
             boost: (d,) Levenberg-Marquardt damping, which is added to the diagonal.
@@ -480,12 +483,10 @@ class SchurComplementSolver:
         Returns:
             (e,) or (e, k) solutions, whose length is that of the parameters of the rig if any.
         """
-        can_factorize = (
-            self.basis is None and self.p.bundle.layout.num_poses <= MAX_FACTORIZED_POSES
-        )
+        can_factorize = self._enough_iterations < MAX_CG_ITERATIONS
         solutions = []
         for column in rhs.reshape(len(rhs), -1).T:
-            solution, converged = self._iterate(boost, column, can_factorize)
+            solution, converged = self._iterate(boost, column)
             if can_factorize and not converged:
                 self._factor = None  # frees the memory before the next factorization
                 self._factor = self._factorize(boost)
@@ -507,18 +508,13 @@ class SchurComplementSolver:
     def _factorize(self, boost: Float64) -> Callable[[Float64], Float64]:
         """Factorize the reduced camera system, and return a function that solves it.
 
-        The fill-reducing order is minimum degree (SuperLU). The intrinsic parameters are eliminated
-        last, because they have dense rows. The solutions of a singular system are NaN.
+        The intrinsic parameters are eliminated last, because they have dense rows. The solutions of
+        a singular system are NaN.
         """
         total = self.total
         num_poses, border = total.border.shape[1], total.border.copy()
         try:
-            factor = splu(
-                self._assemble_poses(boost),
-                permc_spec="MMD_AT_PLUS_A",
-                diag_pivot_thresh=0.0,
-                options={"SymmetricMode": True},
-            )
+            factor = _factorize_symmetric(self._assemble_poses(boost))
         except RuntimeError:  # the matrix is singular
             return lambda rhs: np.full_like(rhs, np.nan)
         by_border = factor.solve(np.ascontiguousarray(border.T))
@@ -548,7 +544,7 @@ class SchurComplementSolver:
         matrix = bsr_array((blocks[order], columns[order], starts), shape=(num_poses, num_poses))
         return matrix.tocsr().T  # the matrix is symmetric, and transposing copies nothing
 
-    def _iterate(self, boost: Float64, rhs: Float64, can_factorize: bool) -> tuple[Float64, bool]:
+    def _iterate(self, boost: Float64, rhs: Float64) -> tuple[Float64, bool]:
         """Solve the reduced camera system by preconditioned conjugate gradients.
 
         The preconditioner is the last factorization, or else block Jacobi.
@@ -556,7 +552,6 @@ class SchurComplementSolver:
         Args:
             boost: (d,) Levenberg-Marquardt damping, which is added to the diagonal.
             rhs: (d,) right-hand side.
-            can_factorize: If true, stop if a factorization is faster than further iterations.
 
         Returns:
             The solution (d,), and whether conjugate gradients converged.
@@ -586,7 +581,6 @@ class SchurComplementSolver:
             others = total.border @ of_poses + total.corner @ of_intrinsics
             return np.concatenate([products, others + boost[poses:] * of_intrinsics])
 
-        max_iterations = ENOUGH_CG_ITERATIONS if can_factorize else MAX_CG_ITERATIONS
         if self._factor is not None:
             return _conjugate_gradients(multiply, self._factor, rhs, ENOUGH_FACTOR_ITERATIONS)
         basis = self.basis
@@ -598,7 +592,7 @@ class SchurComplementSolver:
                 lambda x: basis.matrix.T @ multiply(basis.matrix @ x),
                 basis.create_preconditioner(blocks, self.p.pairs, entries),
                 basis.matrix.T @ rhs,
-                max_iterations,
+                self._enough_iterations,
             )
         inverse = np.linalg.inv(diagonal)
 
@@ -606,7 +600,41 @@ class SchurComplementSolver:
             first = np.einsum("nab,nb->na", inverse, x[:poses].reshape(-1, size))
             return np.concatenate([first.ravel(), x[poses:] / corner])
 
-        return _conjugate_gradients(multiply, precondition, rhs, max_iterations)
+        return _conjugate_gradients(multiply, precondition, rhs, self._enough_iterations)
+
+
+def count_enough_iterations(pairs: Int64, num_poses: int) -> int:
+    """Count the iterations of conjugate gradients that take as long as a sparse factorization.
+
+    The factorization of a matrix with one entry for each block of the reduced camera system has the
+    same fill, and gives the number of arithmetic operations. The number of operations of an
+    iteration is proportional to the number of blocks.
+
+    Args:
+        pairs: (s, 2) indices of two poses of each block, among them those on the diagonal.
+        num_poses: Number of poses.
+
+    Returns:
+        Number of iterations, at most ``MAX_CG_ITERATIONS``.
+    """
+    a, b = pairs[pairs[:, 0] != pairs[:, 1]].T
+    nodes = np.arange(num_poses)
+    rows, columns = np.concatenate([a, b, nodes]), np.concatenate([b, a, nodes])
+    entries = np.where(rows == columns, num_poses, -1.0)  # diagonally dominant, thus regular
+    factor = _factorize_symmetric(csc_array((entries, (rows, columns)), shape=(num_poses,) * 2))
+    lengths = np.diff(factor.L.indptr).astype(np.float64)
+    num_operations = int(kernels.NUM_IMAGE_PARAMS) * float(lengths @ lengths) / len(rows)
+    return min(round(FACTORIZATION_COST * num_operations), MAX_CG_ITERATIONS)
+
+
+def _factorize_symmetric(matrix: csc_array) -> SuperLU:
+    """Factorize a symmetric positive definite matrix in a fill-reducing order (minimum degree)."""
+    return splu(
+        matrix,
+        permc_spec="MMD_AT_PLUS_A",
+        diag_pivot_thresh=0.0,
+        options={"SymmetricMode": True},
+    )
 
 
 def _conjugate_gradients(

@@ -12,9 +12,12 @@ from mpsfm_core.data import Float64
 from mpsfm_core.data.camera_models import CameraModel
 from mpsfm_core.data.errors import DataError
 from mpsfm_core.optimize.bundle_adjustment import (
+    FACTORIZATION_COST,
+    MAX_CG_ITERATIONS,
     BundleProblem,
     BundleResult,
     adjust_bundle,
+    count_enough_iterations,
     start_at,
 )
 from mpsfm_core.optimize.options import Loss
@@ -399,6 +402,21 @@ def test_long_chain_reaches_the_dense_optimum(plain: bool) -> None:
     assert sparse.iterations == pytest.approx(dense.iterations, abs=3)
     np.testing.assert_allclose(sparse.translations, dense.translations, atol=1e-4)
     np.testing.assert_allclose(sparse.std_intrinsics, dense.std_intrinsics, rtol=1e-4)
+
+
+@pytest.mark.parametrize("count", [2, 50, 1500])
+def test_count_of_operations_of_a_chain_is_exact(count: int) -> None:
+    """In an elimination from the ends, each column but the last has two blocks."""
+    chain = np.array([(i, j) for i in range(count) for j in (i, i + 1) if j < count])
+    operations = 7 * (4 * (count - 1) + 1) / (3 * count - 2)
+    assert count_enough_iterations(chain, count) == round(FACTORIZATION_COST * operations)
+
+
+def test_large_dense_system_is_never_factorized() -> None:
+    dense = np.stack(np.triu_indices(400), axis=1)
+    assert count_enough_iterations(dense, 400) < MAX_CG_ITERATIONS
+    dense = np.stack(np.triu_indices(800), axis=1)
+    assert count_enough_iterations(dense, 800) == MAX_CG_ITERATIONS
 
 
 def test_result_does_not_depend_on_threads() -> None:

@@ -30,6 +30,7 @@ from mpsfm_core.geometry import rotation_angle_deg
 from mpsfm_core.mapping.consistency.depth_consistency import DepthConsistencyCheck
 from mpsfm_core.mapping.initialization.global_initialization import (
     average_rotations,
+    find_short_cycle_edges,
     label_components,
 )
 from mpsfm_core.mapping.initialization.initial_pair import (
@@ -191,8 +192,10 @@ def _average_consistent_pairs(
     rotations = np.tile(np.eye(3), (num_images, 1, 1))
     for component in np.unique(label[a]):
         rows = label[a] == component
+        edges = a[rows], b[rows]
+        is_confirmed = find_short_cycle_edges(*edges, num_images)
         averaged = average_rotations(
-            a[rows], b[rows], b_from_a[rows], 1.0 * weights[rows], num_images
+            *edges, b_from_a[rows], 1.0 * weights[rows], num_images, is_confirmed
         )
         rotations[label == component] = averaged[label == component]
     return match_graph, rotations

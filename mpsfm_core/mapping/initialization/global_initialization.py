@@ -8,6 +8,8 @@
 3. Average the relative rotations by IRLS with a Cauchy loss.
 4. Solve for the scales of the depth priors, then for the camera centers. Depth scales and camera
    centers are the solutions of linear least-squares problems, solved by IRLS with a Cauchy loss.
+   IRLS starts from the edges on cycles of three or four images, because a few wrong edges between
+   distant images would bend the first solution of a large view graph.
 5. Remove the image pairs that disagree with the estimated poses, and return the poses of the
    largest component that remains.
 
@@ -51,6 +53,9 @@ PLANAR_WEIGHT = 0.1
 """Weight of each match of a pair that a homography also explains, because a planar scene has two
 possible relative poses. [tuned: benchmarks.accuracy on rendered_kitchen]
 """
+UNCONFIRMED_WEIGHT = 1e-3
+"""First IRLS weight of a pair on no cycle of three or four images, relative to the weight of other
+pairs. [tuned: benchmarks.scale on streets]"""
 NUM_ITERATIONS = 20
 """Number of IRLS iterations of rotation averaging and of the linear solvers. [ours]"""
 DAMPING = 1e-9
@@ -110,16 +115,22 @@ def estimate_global_poses(scene: Scene, candidates: Bool) -> GlobalPoses | None:
     edges = edges.select(_select_largest_cyclic_component(edges, num_images))
     if not len(edges.a):
         return None
-    rotations = average_rotations(edges.a, edges.b, edges.rotation, edges.weight, num_images)
+    is_confirmed = find_short_cycle_edges(edges.a, edges.b, num_images)
+    rotations = average_rotations(
+        edges.a, edges.b, edges.rotation, edges.weight, num_images, is_confirmed
+    )
+    first_weights = np.where(is_confirmed, 1.0, UNCONFIRMED_WEIGHT)
     log_ratios = edges.log_length[:, 0] - edges.log_length[:, 1]
     group = scene.depth_group_of  # depth priors of one depth group share a scale
     group_log_scales = average_differences(
-        group[edges.a], group[edges.b], log_ratios, edges.weight, num_images
+        group[edges.a], group[edges.b], log_ratios, edges.weight, num_images, first_weights
     )
     log_scales = group_log_scales[group]
     lengths = np.exp((log_scales[edges.a] + log_scales[edges.b] + edges.log_length.sum(axis=1)) / 2)
     baselines = -np.einsum("nji,nj->ni", rotations[edges.b], edges.translation) * lengths[:, None]
-    centers = average_differences(edges.a, edges.b, baselines, edges.weight / lengths, num_images)
+    centers = average_differences(
+        edges.a, edges.b, baselines, edges.weight / lengths, num_images, first_weights
+    )
     relative = rotations[edges.b] @ rotations[edges.a].transpose(0, 2, 1)
     rotation_errors_deg = rotation_angle_deg(relative.transpose(0, 2, 1) @ edges.rotation)
     center_errors = np.linalg.norm(centers[edges.b] - centers[edges.a] - baselines, axis=1)
@@ -135,13 +146,18 @@ def estimate_global_poses(scene: Scene, candidates: Bool) -> GlobalPoses | None:
 
 
 def average_rotations(
-    a: Int64, b: Int64, b_from_a: Float64, weights: Float64, num_images: int
+    a: Int64,
+    b: Int64,
+    b_from_a: Float64,
+    weights: Float64,
+    num_images: int,
+    is_confirmed: Bool,
 ) -> Float64:
     """Average relative rotations by IRLS in the tangent space with a Cauchy loss.
 
     The rotations are averaged by IRLS as in Chatterjee and Govindu, Efficient and Robust
     Large-Scale Rotation Averaging, ICCV 2013, but with a Cauchy loss. The maximum spanning tree
-    gives the initial rotations. The edges of the view graph must form one connected component.
+    gives the initial rotations, in which edges on no short cycle only connect its parts. The edges of the view graph must form one connected component.
 
     Args:
         a: (m,) index of the first image of each view-graph edge.
@@ -149,11 +165,15 @@ def average_rotations(
         b_from_a: (m, 3, 3) relative rotations ``R[b] @ R[a].T``.
         weights: (m,) weight of each graph edge.
         num_images: Number of images.
+        is_confirmed: (m,) bool mask of the edges that the tree prefers, see
+            :func:`find_short_cycle_edges`.
 
     Returns:
         (num_images, 3, 3) rotations ``cam_from_world``.
     """
-    rotations = _chain_rotations(a, b, b_from_a, weights, num_images)
+    costs = 1 / weights
+    costs += costs.max() * ~is_confirmed
+    rotations = _chain_rotations(a, b, b_from_a, costs, num_images)
     for _ in range(NUM_ITERATIONS):
         residuals = rotations[b].transpose(0, 2, 1) @ b_from_a @ rotations[a]
         rotvecs = -Rotation.from_matrix(residuals).as_rotvec()
@@ -164,7 +184,12 @@ def average_rotations(
 
 
 def average_differences(
-    a: Int64, b: Int64, differences: Float64, weights: Float64, num_nodes: int
+    a: Int64,
+    b: Int64,
+    differences: Float64,
+    weights: Float64,
+    num_nodes: int,
+    first_weights: Float64,
 ) -> Float64:
     """Solve ``x[b] - x[a] = differences`` for node values ``x`` by IRLS with a Cauchy loss.
 
@@ -174,12 +199,13 @@ def average_differences(
         differences: (m, ...) measured differences ``x[b] - x[a]``.
         weights: (m,) weight of each graph edge.
         num_nodes: Number of nodes.
+        first_weights: (m,) weights that replace those of the loss in the first iteration.
 
     Returns:
         (num_nodes, ...) node values with mean 0. All graph nodes without edges share one value.
     """
     measured = differences.reshape(len(differences), -1)
-    robust_weights = np.ones(len(a))
+    robust_weights = first_weights
     for _ in range(NUM_ITERATIONS):
         values = _solve_differences(a, b, measured, weights * robust_weights, num_nodes)
         errors = np.linalg.norm(values[b] - values[a] - measured, axis=1)
@@ -214,15 +240,13 @@ def _cauchy_weights(errors: Float64) -> Float64:
 
 
 def _chain_rotations(
-    a: Int64, b: Int64, b_from_a: Float64, weights: Float64, num_images: int
+    a: Int64, b: Int64, b_from_a: Float64, costs: Float64, num_images: int
 ) -> Float64:
-    """Chain relative rotations along the maximum spanning tree of the view graph.
+    """Chain relative rotations along the minimum spanning tree of the view graph.
 
-    Edges on no cycle of three or four images are only in the tree if they connect the view graph.
     One wrong edge in the tree rotates a whole part, from which the robust loss cannot recover.
+    Edges that may be wrong should therefore have higher costs (m,) than all other edges.
     """
-    costs = 1 / weights
-    costs += costs.max() * ~find_short_cycle_edges(a, b, num_images)
     graph = coo_matrix((costs, (a, b)), shape=(num_images, num_images)).tocsr()
     tree = minimum_spanning_tree(graph)
     order, parents = breadth_first_order(tree, int(a[0]), directed=False)

@@ -141,7 +141,9 @@ def test_rotations_of_a_circle_are_averaged_despite_heavy_wrong_edges() -> None:
     relative = truth[b] @ truth[a].transpose(0, 2, 1)
     relative[len(near) :] = Rotation.random(len(wrong), rng=rng).as_matrix()
     weights = np.where(np.arange(len(a)) < len(near), 50.0, 400.0)
-    averaged = average_rotations(a, b, relative, weights, count)
+    averaged = average_rotations(
+        a, b, relative, weights, count, find_short_cycle_edges(a, b, count)
+    )
     gauge = truth[0].T @ averaged[0]
     assert np.abs(truth @ gauge - averaged).max() < 1e-6
 
@@ -170,8 +172,32 @@ def test_average_differences_with_outlier_recovers_values() -> None:
     a, b = (np.array(ends) for ends in np.tril_indices(6, -1))
     steps = truth[b] - truth[a]
     steps[4] += 5
-    values = average_differences(a, b, steps, np.ones(len(a)), 6)
+    ones = np.ones(len(a))
+    values = average_differences(a, b, steps, ones, 6, ones)
     np.testing.assert_allclose(values, truth - truth.mean(axis=0), atol=1e-3)
+
+
+def test_average_differences_start_from_confirmed_edges() -> None:
+    """A street of 400 nodes with true steps to the next two nodes, and wrong steps across it.
+
+    With equal first weights, the wrong steps bend the street so that a true step looks wrong.
+    """
+    count, rng = 400, np.random.default_rng(0)
+    near = np.array([(i, i + step) for step in (1, 2) for i in range(count - step)])
+    wrong = np.array([(i, i + 150) for i in range(0, 240, 12)])
+    a, b = np.concatenate([near, wrong]).T
+    steps = (b - a + rng.normal(0, 0.02, len(a)))[:, None]
+    steps[len(near) :] = 1.0
+    weights = np.where(np.arange(len(a)) < len(near), 1.0, 3.0)
+    is_confirmed = find_short_cycle_edges(a, b, count)
+    np.testing.assert_array_equal(is_confirmed, np.arange(len(a)) < len(near))
+
+    def measure_length(first_weights: Float64) -> float:
+        values = average_differences(a, b, steps, weights, count, first_weights)
+        return float(values[-1, 0] - values[0, 0])
+
+    assert abs(measure_length(np.where(is_confirmed, 1.0, 1e-3)) - 399) < 2
+    assert measure_length(np.ones(len(a))) < 300
 
 
 def test_average_rotations_with_outliers_recovers_rotations() -> None:
@@ -184,7 +210,9 @@ def test_average_rotations_with_outliers_recovers_rotations() -> None:
     turns = noise.as_matrix() @ truth[b] @ truth[a].transpose(0, 2, 1)
     wrong = rng.random(len(a)) < 0.33
     turns[wrong] = Rotation.random(int(wrong.sum()), rng).as_matrix()
-    rotations = average_rotations(a, b, turns, np.where(wrong, 30.0, 100.0), count)
+    is_confirmed = np.ones(len(a), dtype=np.bool_)
+    weights = np.where(wrong, 30.0, 100.0)
+    rotations = average_rotations(a, b, turns, weights, count, is_confirmed)
     world = rotations[0].T @ truth[0]
     off = rotation_angle_deg(rotations @ world @ truth.transpose(0, 2, 1))
     assert off.max() < 2.5
