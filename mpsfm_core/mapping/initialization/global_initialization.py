@@ -157,7 +157,8 @@ def average_rotations(
 
     The rotations are averaged by IRLS as in Chatterjee and Govindu, Efficient and Robust
     Large-Scale Rotation Averaging, ICCV 2013, but with a Cauchy loss. The maximum spanning tree
-    gives the initial rotations, in which edges on no short cycle only connect its parts. The edges of the view graph must form one connected component.
+    gives the initial rotations, in which edges on no short cycle only connect the parts of the
+    tree. The edges of the view graph must form one connected component.
 
     Args:
         a: (m,) index of the first image of each view-graph edge.
