@@ -341,7 +341,7 @@ def count_visible_points(
     Args:
         points: (p, 3) points in the world frame. Neighbors should be close to each other, because
             groups of ``POINT_GROUP`` points are skipped if an image does not see their bounding
-            sphere.
+            sphere, and all points if an image does not see that of all points.
         rotations: (n, 3, 3) rotations ``cam_from_world``.
         translations: (n, 3) ``cam_from_world``.
         intrinsics: (n, 4) intrinsics fx, fy, cx, cy of each image in pixels.
@@ -364,32 +364,17 @@ def _count_visible_points(
     frusta: Float64,
 ) -> Int64:
     """Count the points that project into each image, with the planes (n, 5, 4) of its frustum."""
-    num_groups = (len(points) + POINT_GROUP - 1) // POINT_GROUP
-    spheres = np.zeros((num_groups, 4))  # center and radius
-    for group in range(num_groups):
-        first, end = group * POINT_GROUP, min((group + 1) * POINT_GROUP, len(points))
-        for k in range(first, end):
-            for a in range(3):
-                spheres[group, a] += points[k, a] / (end - first)
-        for k in range(first, end):
-            x, y, z = points[k]
-            x, y, z = x - spheres[group, 0], y - spheres[group, 1], z - spheres[group, 2]
-            radius = math.sqrt(x * x + y * y + z * z) * (1.0 + 1e-9)
-            spheres[group, 3] = max(spheres[group, 3], radius)
+    spheres = _bound_points(points)
+    num_groups = len(spheres) - 1
     counts = np.zeros(len(rotations), np.int64)
     for image in range(len(rotations)):
         r, t, planes = rotations[image], translations[image], frusta[image]
+        if _is_outside(spheres[num_groups], planes):
+            continue
         fx, fy, cx, cy = intrinsics[image]
         width, height = sizes[image]
         for group in range(num_groups):
-            x, y, z, radius = spheres[group]
-            is_outside = False
-            for a in range(5):
-                nx, ny, nz, offset = planes[a]
-                if nx * x + ny * y + nz * z + offset < -radius:
-                    is_outside = True
-                    break
-            if is_outside:
+            if _is_outside(spheres[group], planes):
                 continue
             for k in range(group * POINT_GROUP, min((group + 1) * POINT_GROUP, len(points))):
                 x, y, z = points[k]
@@ -400,6 +385,37 @@ def _count_visible_points(
                 v = fy * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) / depth + cy
                 counts[image] += 0 <= u < width and 0 <= v < height
     return counts
+
+
+@jit.helper()
+def _bound_points(points: Float64) -> Float64:
+    """Return center and radius of the bounding spheres of groups of points, then of all points."""
+    num_groups = (len(points) + POINT_GROUP - 1) // POINT_GROUP
+    spheres = np.zeros((num_groups + 1, 4))
+    for group in range(num_groups + 1):
+        first, end = group * POINT_GROUP, min((group + 1) * POINT_GROUP, len(points))
+        if group == num_groups:
+            first, end = 0, len(points)
+        for k in range(first, end):
+            for a in range(3):
+                spheres[group, a] += points[k, a] / (end - first)
+        for k in range(first, end):
+            x, y, z = points[k]
+            x, y, z = x - spheres[group, 0], y - spheres[group, 1], z - spheres[group, 2]
+            radius = math.sqrt(x * x + y * y + z * z) * (1.0 + 1e-9)
+            spheres[group, 3] = max(spheres[group, 3], radius)
+    return spheres
+
+
+@jit.helper()
+def _is_outside(sphere: Float64, planes: Float64) -> bool:
+    """Return True if a sphere is outside of a plane (5, 4) of a frustum."""
+    x, y, z, radius = sphere
+    for a in range(5):
+        nx, ny, nz, offset = planes[a]
+        if nx * x + ny * y + nz * z + offset < -radius:
+            return True
+    return False
 
 
 class _DepthGrid(NamedTuple):

@@ -34,21 +34,16 @@ def rank_next_images(scene: Scene, scores: csr_array, candidates: Bool) -> list[
     Returns:
         Candidate images, best first, each with its best matching registered image.
     """
-    frame_of, is_candidate = scene.rigs.frame_of, candidates & ~scene.registered
-    ranked = []
-    for frame in map(int, np.unique(frame_of[is_candidate])):
-        images = [k for k in scene.rigs.images_of(frame) if is_candidate[k]]
-        rows = [slice(*scores.indptr[k : k + 2]) for k in images]
-        owners = np.repeat(images, [row.stop - row.start for row in rows])
-        matching, values = (
-            np.concatenate([array[row] for row in rows]) for array in (scores.indices, scores.data)
-        )
-        usable = scene.registered[matching] & (values > 0)
-        if usable.any():
-            owners, matching, values = owners[usable], matching[usable], values[usable]
-            _, frame_rows = np.unique(frame_of[matching], return_inverse=True)
-            totals = np.bincount(frame_rows, values)
-            best_frame = int(totals.argmax())
-            best = int(np.where(frame_rows == best_frame, values, 0).argmax())
-            ranked.append((-float(totals[best_frame]), int(owners[best]), int(matching[best])))
-    return [(image, best_match) for _, image, best_match in sorted(ranked)]
+    frame_of = scene.rigs.frame_of
+    is_candidate = candidates & ~scene.registered
+    owners = np.repeat(np.arange(len(frame_of)), np.diff(scores.indptr))
+    usable = is_candidate[owners] & scene.registered[scores.indices] & (scores.data > 0)
+    owners, matching, values = owners[usable], scores.indices[usable], scores.data[usable]
+    frames = frame_of[owners]
+    keys = frames * len(frame_of) + frame_of[matching]
+    _, frame_pairs = np.unique(keys, return_inverse=True)
+    totals = np.bincount(frame_pairs, values)[frame_pairs]
+    order = np.lexsort((-values, keys, -totals, frames))
+    best = order[np.unique(frames[order], return_index=True)[1]]
+    ranked = best[np.lexsort((matching[best], owners[best], -totals[best]))]
+    return [(int(owners[k]), int(matching[k])) for k in ranked]
