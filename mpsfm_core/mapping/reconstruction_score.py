@@ -29,7 +29,7 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera
 from mpsfm_core.geometry import pixel_centers, project, transform, unproject
-from mpsfm_core.mapping.consistency.depth_consistency import count_visible_points
+from mpsfm_core.mapping.consistency.depth_consistency import measure_visibility
 from mpsfm_core.mapping.refinement.depth_noise import CELLS
 from mpsfm_core.mapping.scene.depth_map import DepthMap
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
@@ -203,7 +203,9 @@ def _score_depth(scene: Scene) -> Iterator[float]:
     for row, grid in enumerate(grids):
         local, log_std = _sample_points(grid)
         points = (local - translations[row]) @ rotations[row]
-        counts = count_visible_points(points, rotations, translations, intrinsics, sizes)
+        counts, _ = measure_visibility(
+            points, local[:, 2], rotations, translations, intrinsics, sizes
+        )
         for other in map(int, np.flatnonzero(counts)):
             if other != row:
                 seen = transform(rotations[other], translations[other], points)

@@ -299,6 +299,10 @@ class DepthConsistencyCheck:
 def find_overlapping_images(scene: Scene, image: int, candidates: Int64 | None = None) -> list[int]:
     """Return the ``NUM_COMPARED`` images into which most pixels of a depth map project.
 
+    Pixels that are much farther from one camera than from the other count less, as far as the
+    ratio of the two depths. Otherwise all images that are far behind walls would come first in a
+    large scene.
+
     Args:
         scene: The scene.
         image: Registered image with the depth map.
@@ -313,17 +317,18 @@ def find_overlapping_images(scene: Scene, image: int, candidates: Int64 | None =
     at = xy[..., 1].astype(np.int64), xy[..., 0].astype(np.int64)
     depth = depth_map.scale * depth_map.prior.depth[at].astype(np.float64)
     points = unproject(depth_map.camera, xy, depth)
-    world = (points[depth_map.valid[at]] - scene.translations[image]) @ scene.rotations[image]
-    counts = count_visible_points(
-        world,
+    is_valid = depth_map.valid[at]
+    counts, similarities = measure_visibility(
+        (points[is_valid] - scene.translations[image]) @ scene.rotations[image],
+        depth[is_valid],
         scene.rotations[others],
         scene.translations[others],
         scene.intrinsics[others],
         scene.image_sizes[others],
     )
-    overlap = counts / OVERLAP_GRID**2
-    order = np.argsort(-overlap, kind="stable")[:NUM_COMPARED]
-    return [int(others[k]) for k in order if overlap[k] >= MIN_OVERLAP_RATIO]
+    order = np.argsort(-similarities, kind="stable")
+    order = order[counts[order] >= MIN_OVERLAP_RATIO * OVERLAP_GRID**2]
+    return [int(others[k]) for k in order[:NUM_COMPARED]]
 
 
 def _select_images_with_depth(scene: Scene) -> Int64:
@@ -333,40 +338,49 @@ def _select_images_with_depth(scene: Scene) -> Int64:
     return registered[np.array(is_active, dtype=np.bool_)]
 
 
-def count_visible_points(
-    points: Float64, rotations: Float64, translations: Float64, intrinsics: Float64, sizes: Float64
-) -> Int64:
-    """Count the 3D points that project into each image.
+def measure_visibility(
+    points: Float64,
+    depths: Float64,
+    rotations: Float64,
+    translations: Float64,
+    intrinsics: Float64,
+    sizes: Float64,
+) -> tuple[Int64, Float64]:
+    """Count the 3D points that project into each image, and compare their depths with ``depths``.
 
     Args:
         points: (p, 3) points in the world frame. Neighbors should be close to each other, because
             groups of ``POINT_GROUP`` points are skipped if an image does not see their bounding
             sphere, and all points if an image does not see that of all points.
+        depths: (p,) depth of each point in another image, in world units.
         rotations: (n, 3, 3) rotations ``cam_from_world``.
         translations: (n, 3) ``cam_from_world``.
         intrinsics: (n, 4) intrinsics fx, fy, cx, cy of each image in pixels.
         sizes: (n, 2) width and height of each image in pixels.
 
     Returns:
-        (n,) int64.
+        Number (n,) of visible points, and sum (n,) of the ratios in [0, 1] of the smaller and the
+        larger depth of each visible point.
     """
     frusta = frustum_planes(rotations, translations, intrinsics, sizes)
-    return _count_visible_points(points, rotations, translations, intrinsics, sizes, frusta)
+    return _compare_depths(points, depths, rotations, translations, intrinsics, sizes, frusta)
 
 
 @jit.kernel()
-def _count_visible_points(
+def _compare_depths(
     points: Float64,
+    depths: Float64,
     rotations: Float64,
     translations: Float64,
     intrinsics: Float64,
     sizes: Float64,
     frusta: Float64,
-) -> Int64:
-    """Count the points that project into each image, with the planes (n, 5, 4) of its frustum."""
+) -> tuple[Int64, Float64]:
+    """Implement :func:`measure_visibility`, with the planes (n, 5, 4) of each frustum."""
     spheres = _bound_points(points)
     num_groups = len(spheres) - 1
     counts = np.zeros(len(rotations), np.int64)
+    similarities = np.zeros(len(rotations))
     for image in range(len(rotations)):
         r, t, planes = rotations[image], translations[image], frusta[image]
         if _is_outside(spheres[num_groups], planes):
@@ -383,8 +397,10 @@ def _count_visible_points(
                     continue
                 u = fx * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]) / depth + cx
                 v = fy * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) / depth + cy
-                counts[image] += 0 <= u < width and 0 <= v < height
-    return counts
+                if 0 <= u < width and 0 <= v < height:
+                    counts[image] += 1
+                    similarities[image] += min(depth, depths[k]) / max(depth, depths[k])
+    return counts, similarities
 
 
 @jit.helper()

@@ -23,8 +23,8 @@ import numpy as np
 from mpsfm_core.data import Int64, MappingProblem
 from mpsfm_core.mapping.consistency.depth_consistency import (
     DepthConsistencyCheck,
-    count_visible_points,
     find_overlapping_images,
+    measure_visibility,
 )
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts.alignment import Alignment, align_reconstructions, find_agreeing
@@ -212,20 +212,26 @@ def _rank_joins(models: Sequence[Reconstruction]) -> list[tuple[int, int]]:
 def _select_near(model: Reconstruction, other: Reconstruction) -> set[int]:
     """Select the images of a reconstruction that see most points of another reconstruction.
 
-    Images of both reconstructions are not selected.
+    Points that are much farther from an image, or nearer, than from the images that observe them
+    count less. Images of both reconstructions are not selected.
     """
     shared = {image.index for image in other.images}
     images = [image for image in model.images if image.index not in shared]
+    depths = np.ones(len(other.points))
+    for image in other.images:
+        observed = image.point_ids[image.point_ids >= 0]
+        depths[observed] = other.points[observed] @ image.rotation[2] + image.translation[2]
     step = max(1, len(other.points) // MAX_SAMPLED_POINTS)
-    counts = count_visible_points(
+    _, similarities = measure_visibility(
         np.ascontiguousarray(other.points[::step]),
+        np.ascontiguousarray(depths[::step]),
         np.array([image.rotation for image in images]).reshape(-1, 3, 3),
         np.array([image.translation for image in images]).reshape(-1, 3),
         np.array([image.camera.params for image in images]).reshape(-1, 4),
         np.array([image.camera.size for image in images], dtype=np.float64).reshape(-1, 2),
     )
-    best = np.argsort(-counts, kind="stable")[:MAX_COMPARED_IMAGES]
-    return {images[row].index for row in best if counts[row]}
+    best = np.argsort(-similarities, kind="stable")[:MAX_COMPARED_IMAGES]
+    return {images[row].index for row in best if similarities[row] > 0}
 
 
 def _create_scene(

@@ -19,8 +19,8 @@ from mpsfm_core.data import (
 )
 from mpsfm_core.mapping.consistency.depth_consistency import (
     DepthConsistencyCheck,
-    count_visible_points,
     find_overlapping_images,
+    measure_visibility,
 )
 from mpsfm_core.mapping.options import ConsistencyOptions, MapperOptions, TriangulationOptions
 from mpsfm_core.mapping.refinement.refinement import Refiner
@@ -42,7 +42,7 @@ SMALL = PinholeCamera(40, 30, 40.0, 40.0, 20.0, 15.0)
 
 
 @pytest.mark.parametrize("num_points", [0, 1, 16, 100])
-def test_visible_points_are_counted_as_by_projection(num_points: int) -> None:
+def test_visible_points_and_depth_ratios_are_those_of_projection(num_points: int) -> None:
     rng, count = np.random.default_rng(num_points), 300
     points = rng.normal(0, 1.5, (num_points, 3))
     rotations = Rotation.random(count, rng=rng).as_matrix()
@@ -53,8 +53,14 @@ def test_visible_points_are_counted_as_by_projection(num_points: int) -> None:
     depth = local[..., 2:]
     xy = intrinsics[:, None, :2] * local[..., :2] / depth + intrinsics[:, None, 2:]
     is_inside = ((xy >= 0) & (xy < sizes[:, None]) & (depth > 0)).all(axis=-1)
-    counts = count_visible_points(points, rotations, translations, intrinsics, sizes)
+    other = rng.uniform(1, 8, num_points)
+    counts, similarities = measure_visibility(
+        points, other, rotations, translations, intrinsics, sizes
+    )
     np.testing.assert_array_equal(counts, is_inside.sum(axis=1))
+    z = depth[..., 0]
+    ratios = np.where(is_inside, np.minimum(z, other) / np.maximum(z, other), 0)
+    np.testing.assert_allclose(similarities, ratios.sum(axis=1))
 
 
 def posed_scene(
@@ -79,6 +85,16 @@ def posed_scene(
         scene.register(number, pose[:, :3], pose[:, 3])
         scene.maps[number].set_scale(1.0)
     return scene
+
+
+def test_near_images_are_compared_before_images_far_behind_walls() -> None:
+    """Sixteen cameras 60 m behind a camera see all of its pixels, and a camera beside it most."""
+    far = [np.column_stack([np.eye(3), [0.1 * k, 0, 60.0]]) for k in range(16)]
+    poses = [np.eye(3, 4), *far, np.column_stack([np.eye(3), [0.5, 0, 0]])]
+    scene = posed_scene([np.full((30, 40), 4.0, np.float32)] * len(poses), poses, SMALL)
+    compared = find_overlapping_images(scene, 0)
+    assert compared[0] == len(poses) - 1
+    assert len(compared) == 16
 
 
 def wall(depth: float) -> Float32:
