@@ -34,9 +34,9 @@ points of the whole scene
 (:func:`~mpsfm_core.mapping.refinement.depth_noise.measure_outlier_ratio`). The violation ratio sums
 over two depth maps, and about half of the outliers of each are in front of the surface.
 
-The depth of an image is compared with all overlapping images, not only with those that share
-points. Images that share points with a misregistered image look alike, so their depth may agree
-with the wrong pose.
+The depth of an image is compared with the overlapping images of similar depth, not only with those
+that share points. Images that share points with a misregistered image look alike, so their depth
+may agree with the wrong pose.
 """
 
 from __future__ import annotations
@@ -299,9 +299,9 @@ class DepthConsistencyCheck:
 def find_overlapping_images(scene: Scene, image: int, candidates: Int64 | None = None) -> list[int]:
     """Return the ``NUM_COMPARED`` images into which most pixels of a depth map project.
 
-    Pixels that are much farther from one camera than from the other count less, as far as the
-    ratio of the two depths. Otherwise all images that are far behind walls would come first in a
-    large scene.
+    A pixel counts by the ratio of the smaller and the larger of its depths in the two images.
+    Without this ratio, images that are far away behind walls would come first in a large scene,
+    because they see all pixels.
 
     Args:
         scene: The scene.
