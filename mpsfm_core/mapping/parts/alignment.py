@@ -37,6 +37,11 @@ class Alignment(NamedTuple):
     num_common_images: int
     """Number of images with common observations."""
 
+    @property
+    def is_supported(self) -> bool:
+        """True if most common images agree."""
+        return 2 * self.num_images > self.num_common_images
+
 
 class _CommonObservations(NamedTuple):
     """Keypoints that observe a point in both reconstructions."""

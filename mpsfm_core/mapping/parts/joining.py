@@ -1,11 +1,13 @@
 """Joining of the reconstructions of overlapping parts along a tree.
 
-Two reconstructions are joined if most common images agree with one similarity transform, and the
-depth maps of both reconstructions do not contradict each other
-(:mod:`~mpsfm_core.mapping.consistency.depth_consistency`). Parts that look alike have the same
-structure at the common images, but other structure around them. Matches between both
-reconstructions are no evidence, because the matches of two places that look alike support the wrong
-transform.
+Two reconstructions are joined if most common images of two of their parts agree with one similarity
+transform, and the depth maps of both reconstructions do not contradict each other
+(:mod:`~mpsfm_core.mapping.consistency.depth_consistency`). Where a loop of parts closes, common
+images at one of both ends disagree because of drift, which the refinement of all parts corrects.
+
+Parts that look alike have the same structure at the common images, but other structure around them.
+Matches between both reconstructions are no evidence, because the matches of two places that look
+alike support the wrong transform.
 
 Pairs of reconstructions with the most common points are joined first.
 """
@@ -27,7 +29,7 @@ from mpsfm_core.mapping.consistency.depth_consistency import (
     measure_visibility,
 )
 from mpsfm_core.mapping.options import MapperOptions
-from mpsfm_core.mapping.parts.alignment import Alignment, align_reconstructions, find_agreeing
+from mpsfm_core.mapping.parts.alignment import align_reconstructions, find_agreeing
 from mpsfm_core.mapping.refinement.depth_noise import measure_depth_noise
 from mpsfm_core.mapping.scene.reconstruction import (
     Reconstruction,
@@ -49,13 +51,9 @@ MAX_SAMPLED_POINTS = 4096
 _log = logging.getLogger(__name__)
 
 
-class JoinEvidence(NamedTuple):
-    """Evidence for and against the join of two reconstructions."""
+class DepthEvidence(NamedTuple):
+    """Agreement of the depth maps of two reconstructions."""
 
-    num_agreeing: int
-    """Number of common images in which most common observations agree."""
-    num_common: int
-    """Number of common images with common observations."""
     num_overlapping: int
     """Number of compared images of the smaller reconstruction that overlap images of the larger
     one."""
@@ -64,9 +62,8 @@ class JoinEvidence(NamedTuple):
 
     @property
     def supports_join(self) -> bool:
-        """True if most common images agree, and the depth of few images contradicts the join."""
-        is_consistent = self.num_conflicting <= MAX_CONFLICT_RATIO * self.num_overlapping
-        return 2 * self.num_agreeing > self.num_common and is_consistent
+        """True if the depth of few images contradicts the join."""
+        return self.num_conflicting <= MAX_CONFLICT_RATIO * self.num_overlapping
 
 
 def join_reconstructions(
@@ -91,7 +88,7 @@ def join_reconstructions(
         key = int(group_of[row_a]), int(group_of[row_b])
         if key[0] == key[1] or key in refused:
             continue
-        joined = join_pair(problem, groups[key[0]], groups[key[1]], options)
+        joined = _join_groups(problem, groups[key[0]], groups[key[1]], options)
         if joined is None:
             refused |= {key, key[::-1]}
             continue
@@ -104,7 +101,14 @@ def join_reconstructions(
 def join_pair(
     problem: MappingProblem, a: Reconstruction, b: Reconstruction, options: MapperOptions
 ) -> Reconstruction | None:
-    """Join two reconstructions in the frame of the larger one, or return None if refused."""
+    """Join two parts in the frame of the larger one, or return None if refused."""
+    return _join_groups(problem, a, b, options) if _rank_joins([a, b]) else None
+
+
+def _join_groups(
+    problem: MappingProblem, a: Reconstruction, b: Reconstruction, options: MapperOptions
+) -> Reconstruction | None:
+    """Join two joined reconstructions in the frame of the larger one, or return None if refused."""
     a, b = sorted((a, b), key=lambda model: -len(model.images))
     alignment = align_reconstructions(a, b)
     if alignment is None:
@@ -113,38 +117,30 @@ def join_pair(
     b = transform_reconstruction(
         b, transform.scale, transform.rotation, transform.translation, a.metric
     )
-    evidence = collect_evidence(problem, a, b, alignment, options)
-    _log.debug("join of %d and %d images: %s", len(a.images), len(b.images), evidence)
+    evidence = _compare_depth(problem, a, b, options)
+    _log.debug(
+        "join of %d and %d images, of which %d of %d agree: %s",
+        len(a.images),
+        len(b.images),
+        alignment.num_images,
+        alignment.num_common_images,
+        evidence,
+    )
     return merge_reconstructions(a, b) if evidence.supports_join else None
 
 
-def collect_evidence(
-    problem: MappingProblem,
-    a: Reconstruction,
-    b: Reconstruction,
-    alignment: Alignment,
-    options: MapperOptions,
-) -> JoinEvidence:
-    """Collect the evidence for and against the join of two reconstructions in the same frame.
-
-    Args:
-        problem: Mapping problem of both reconstructions.
-        a: Larger reconstruction.
-        b: Smaller reconstruction, in the frame of ``a``.
-        alignment: Agreement of the common images.
-        options: Options of the mapper.
-    """
+def _compare_depth(
+    problem: MappingProblem, a: Reconstruction, b: Reconstruction, options: MapperOptions
+) -> DepthEvidence:
+    """Compare the depth of two reconstructions in the same frame, the larger one first."""
     near_a, near_b = _select_near(a, b), _select_near(b, a)
-    num_overlapping = num_conflicting = 0
-    if options.consistency.enabled and near_a and near_b:
-        joined = merge_reconstructions(a, b)
-        scene, row_of = _create_scene(problem, joined, near_a | near_b, options)
-        in_a = np.array([row_of[index] for index in sorted(near_a)], dtype=np.int64)
-        in_b = [row_of[index] for index in sorted(near_b)]
-        num_overlapping, num_conflicting = _count_depth_conflicts(scene, in_a, in_b, options)
-    return JoinEvidence(
-        alignment.num_images, alignment.num_common_images, num_overlapping, num_conflicting
-    )
+    if not (options.consistency.enabled and near_a and near_b):
+        return DepthEvidence(0, 0)
+    joined = merge_reconstructions(a, b)
+    scene, row_of = _create_scene(problem, joined, near_a | near_b, options)
+    in_a = np.array([row_of[index] for index in sorted(near_a)], dtype=np.int64)
+    in_b = [row_of[index] for index in sorted(near_b)]
+    return _count_depth_conflicts(scene, in_a, in_b, options)
 
 
 def merge_reconstructions(a: Reconstruction, b: Reconstruction) -> Reconstruction:
@@ -198,13 +194,13 @@ def _merge_image(a: RegisteredImage, b: RegisteredImage) -> RegisteredImage:
 
 
 def _rank_joins(models: Sequence[Reconstruction]) -> list[tuple[int, int]]:
-    """Return pairs of reconstructions with common points, those with most common points first."""
+    """Return pairs of parts in which most common images agree, those with most points first."""
     ranked = []
     images = [{image.index for image in model.images} for model in models]
     for row_a, row_b in combinations(range(len(models)), 2):
         if images[row_a] & images[row_b]:
             alignment = align_reconstructions(models[row_a], models[row_b])
-            if alignment is not None:
+            if alignment is not None and alignment.is_supported:
                 ranked.append((-alignment.num_points, row_a, row_b))
     return [(row_a, row_b) for _, row_a, row_b in sorted(ranked)]
 
@@ -256,7 +252,7 @@ def _create_scene(
 
 def _count_depth_conflicts(
     scene: Scene, in_a: Int64, in_b: Sequence[int], options: MapperOptions
-) -> tuple[int, int]:
+) -> DepthEvidence:
     """Count images ``in_b`` that overlap images ``in_a``, and those with contradicting depth."""
     consistency = options.consistency
     check = DepthConsistencyCheck(scene, consistency)
@@ -272,7 +268,7 @@ def _count_depth_conflicts(
         ]
         num_overlapping += bool(others)
         num_conflicting += max(ratios, default=0.0) > consistency.max_violations
-    return num_overlapping, num_conflicting
+    return DepthEvidence(num_overlapping, num_conflicting)
 
 
 def _remove_repeated_images(models: Sequence[Reconstruction]) -> list[Reconstruction]:

@@ -14,7 +14,11 @@ from mpsfm_core.geometry.similarity import SimilarityTransform
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts.alignment import align_reconstructions
-from mpsfm_core.mapping.parts.joining import join_pair, merge_reconstructions
+from mpsfm_core.mapping.parts.joining import (
+    join_pair,
+    join_reconstructions,
+    merge_reconstructions,
+)
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, transform_reconstruction
 from mpsfm_core.testing.synthetic.halls import HallProblem, make_hall_problem
 from mpsfm_core.testing.synthetic.two_rooms import make_twin_room_problem, shift_pose
@@ -91,6 +95,25 @@ def test_merged_reconstruction_has_all_images_and_common_points_once(
     truth = np.array([camera_center(*pose) for pose in hall.truth.values()])
     centers = np.array([camera_center(i.rotation, i.translation) for i in joined.images])
     assert np.abs(centers - MOTION.apply(truth)).max() < 0.05 * MOTION.scale
+
+
+def test_part_that_closes_a_loop_is_joined_despite_drift(hall: HallProblem) -> None:
+    """Half of the common images of the last part agree with the joined part, and half have drift.
+
+    The common images of each two parts agree.
+    """
+    poses = list(hall.truth.values())
+
+    def map_images(first: int, end: int) -> Reconstruction:
+        return map_at_poses(hall.problem, {i: poses[i] for i in range(first, end)})
+
+    drift = SimilarityTransform(1.0, np.eye(3), np.array([1.0, 0.0, 0.0]))
+    last = merge_reconstructions(map_images(19, 24), move(map_images(0, 4), drift))
+    parts = [map_images(0, 14), map_images(10, 23), last]
+    alignment = align_reconstructions(merge_reconstructions(*parts[:2]), last)
+    assert alignment is not None and not alignment.is_supported
+    (joined,) = join_reconstructions(hall.problem, parts, OPTIONS)
+    assert [image.index for image in joined.images] == list(range(24))
 
 
 def test_merging_a_reconstruction_with_itself_changes_nothing(
