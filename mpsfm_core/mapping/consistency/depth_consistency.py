@@ -346,7 +346,7 @@ def measure_visibility(
     intrinsics: Float64,
     sizes: Float64,
 ) -> tuple[Int64, Float64]:
-    """Count the 3D points that project into each image, and compare their depths with ``depths``.
+    """Count the 3D points that project into each image, and compare their depths.
 
     Args:
         points: (p, 3) points in the world frame. Neighbors should be close to each other, because
