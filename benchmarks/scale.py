@@ -46,7 +46,7 @@ from mpsfm_core.evaluation.pose_auc import pose_auc, pose_errors_deg
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts import part_mapping
-from mpsfm_core.mapping.parts.joining import join_pair
+from mpsfm_core.mapping.parts.joining import join_reconstructions
 from mpsfm_core.mapping.problem_state import problem_from_state, problem_to_state
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, compute_depth_maps
 from mpsfm_core.mapping.state import flatten_state, unflatten_state
@@ -307,7 +307,7 @@ def _false_parts(case: SymmetricProblem, num_common: int) -> tuple[Poses, Poses]
 def _joins(case: SymmetricProblem, first: Poses, second: Poses) -> bool:
     """Map two parts with fixed poses, and return True if the reconstructions are joined."""
     models = [_map_at_poses(case.problem, poses) for poses in (first, second)]
-    return join_pair(case.problem, *models, MapperOptions()) is not None
+    return len(join_reconstructions(case.problem, models, MapperOptions())) == 1
 
 
 def _map_at_poses(problem: MappingProblem, poses: Poses) -> Reconstruction:

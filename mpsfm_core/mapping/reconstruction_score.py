@@ -203,9 +203,8 @@ def _score_depth(scene: Scene) -> Iterator[float]:
     for row, grid in enumerate(grids):
         local, log_std = _sample_points(grid)
         points = (local - translations[row]) @ rotations[row]
-        counts, _ = measure_visibility(
-            points, local[:, 2], rotations, translations, intrinsics, sizes
-        )
+        depths = np.ascontiguousarray(local[:, 2])  # kernels compile again for other layouts
+        counts, _ = measure_visibility(points, depths, rotations, translations, intrinsics, sizes)
         for other in map(int, np.flatnonzero(counts)):
             if other != row:
                 seen = transform(rotations[other], translations[other], points)

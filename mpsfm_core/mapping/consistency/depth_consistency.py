@@ -338,6 +338,7 @@ def _select_images_with_depth(scene: Scene) -> Int64:
     return registered[np.array(is_active, dtype=np.bool_)]
 
 
+@jit.kernel()
 def measure_visibility(
     points: Float64,
     depths: Float64,
@@ -363,27 +364,16 @@ def measure_visibility(
         larger depth of each visible point.
     """
     frusta = frustum_planes(rotations, translations, intrinsics, sizes)
-    return _compare_depths(points, depths, rotations, translations, intrinsics, sizes, frusta)
-
-
-@jit.kernel()
-def _compare_depths(
-    points: Float64,
-    depths: Float64,
-    rotations: Float64,
-    translations: Float64,
-    intrinsics: Float64,
-    sizes: Float64,
-    frusta: Float64,
-) -> tuple[Int64, Float64]:
-    """Implement :func:`measure_visibility`, with the planes (n, 5, 4) of each frustum."""
-    spheres = _bound_points(points)
-    num_groups = len(spheres) - 1
+    num_groups = (len(points) + POINT_GROUP - 1) // POINT_GROUP
+    spheres, whole = np.zeros((num_groups, 4)), np.zeros(4)
+    for group in range(num_groups):
+        _bound_points(points[group * POINT_GROUP : (group + 1) * POINT_GROUP], spheres[group])
+    _bound_points(points, whole)
     counts = np.zeros(len(rotations), np.int64)
     similarities = np.zeros(len(rotations))
     for image in range(len(rotations)):
         r, t, planes = rotations[image], translations[image], frusta[image]
-        if _is_outside(spheres[num_groups], planes):
+        if _is_outside(whole, planes):
             continue
         fx, fy, cx, cy = intrinsics[image]
         width, height = sizes[image]
@@ -404,28 +394,21 @@ def _compare_depths(
 
 
 @jit.helper()
-def _bound_points(points: Float64) -> Float64:
-    """Return center and radius of the bounding spheres of groups of points, then of all points."""
-    num_groups = (len(points) + POINT_GROUP - 1) // POINT_GROUP
-    spheres = np.zeros((num_groups + 1, 4))
-    for group in range(num_groups + 1):
-        first, end = group * POINT_GROUP, min((group + 1) * POINT_GROUP, len(points))
-        if group == num_groups:
-            first, end = 0, len(points)
-        for k in range(first, end):
-            for a in range(3):
-                spheres[group, a] += points[k, a] / (end - first)
-        for k in range(first, end):
-            x, y, z = points[k]
-            x, y, z = x - spheres[group, 0], y - spheres[group, 1], z - spheres[group, 2]
-            radius = math.sqrt(x * x + y * y + z * z) * (1.0 + 1e-9)
-            spheres[group, 3] = max(spheres[group, 3], radius)
-    return spheres
+def _bound_points(points: Float64, sphere: Float64) -> None:
+    """Write center and radius of a bounding sphere of points to ``sphere`` (4,), initially 0."""
+    for k in range(len(points)):
+        for a in range(3):
+            sphere[a] += points[k, a] / len(points)
+    for k in range(len(points)):
+        x, y, z = points[k]
+        x, y, z = x - sphere[0], y - sphere[1], z - sphere[2]
+        radius = math.sqrt(x * x + y * y + z * z) * (1.0 + 1e-9)
+        sphere[3] = max(sphere[3], radius)
 
 
 @jit.helper()
 def _is_outside(sphere: Float64, planes: Float64) -> bool:
-    """Return True if a sphere is outside of a plane (5, 4) of a frustum."""
+    """Return True if a sphere (4,) is behind one of the planes (5, 4) of a frustum."""
     x, y, z, radius = sphere
     for a in range(5):
         nx, ny, nz, offset = planes[a]

@@ -98,17 +98,10 @@ def join_reconstructions(
     return _remove_repeated_images([groups[number] for number in np.unique(group_of)])
 
 
-def join_pair(
-    problem: MappingProblem, a: Reconstruction, b: Reconstruction, options: MapperOptions
-) -> Reconstruction | None:
-    """Join two parts in the frame of the larger one, or return None if refused."""
-    return _join_groups(problem, a, b, options) if _rank_joins([a, b]) else None
-
-
 def _join_groups(
     problem: MappingProblem, a: Reconstruction, b: Reconstruction, options: MapperOptions
 ) -> Reconstruction | None:
-    """Join two joined reconstructions in the frame of the larger one, or return None if refused."""
+    """Align and merge two reconstructions, or return None if depth contradicts the join."""
     a, b = sorted((a, b), key=lambda model: -len(model.images))
     alignment = align_reconstructions(a, b)
     if alignment is None:
@@ -132,7 +125,7 @@ def _join_groups(
 def _compare_depth(
     problem: MappingProblem, a: Reconstruction, b: Reconstruction, options: MapperOptions
 ) -> DepthEvidence:
-    """Compare the depth of two reconstructions in the same frame, the larger one first."""
+    """Count the images of ``b`` whose depth contradicts ``a``, both in the same frame."""
     near_a, near_b = _select_near(a, b), _select_near(b, a)
     if not (options.consistency.enabled and near_a and near_b):
         return DepthEvidence(0, 0)
@@ -194,7 +187,7 @@ def _merge_image(a: RegisteredImage, b: RegisteredImage) -> RegisteredImage:
 
 
 def _rank_joins(models: Sequence[Reconstruction]) -> list[tuple[int, int]]:
-    """Return pairs of parts in which most common images agree, those with most points first."""
+    """Rank the pairs of parts whose common images mostly agree, most common points first."""
     ranked = []
     images = [{image.index for image in model.images} for model in models]
     for row_a, row_b in combinations(range(len(models)), 2):

@@ -178,9 +178,9 @@ def test_average_differences_with_outlier_recovers_values() -> None:
 
 
 def test_average_differences_start_from_confirmed_edges() -> None:
-    """A street of 400 nodes with true steps to the next two nodes, and wrong steps across it.
+    """Right differences connect neighbors on a line, and wrong ones connect distant nodes.
 
-    With equal first weights, the wrong steps bend the street so that a true step looks wrong.
+    With equal first weights, the wrong differences shorten the line.
     """
     count, rng = 400, np.random.default_rng(0)
     near = np.array([(i, i + step) for step in (1, 2) for i in range(count - step)])

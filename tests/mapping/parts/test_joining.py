@@ -14,11 +14,7 @@ from mpsfm_core.geometry.similarity import SimilarityTransform
 from mpsfm_core.mapping import mapper
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts.alignment import align_reconstructions
-from mpsfm_core.mapping.parts.joining import (
-    join_pair,
-    join_reconstructions,
-    merge_reconstructions,
-)
+from mpsfm_core.mapping.parts.joining import join_reconstructions, merge_reconstructions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, transform_reconstruction
 from mpsfm_core.testing.synthetic.halls import HallProblem, make_hall_problem
 from mpsfm_core.testing.synthetic.two_rooms import make_twin_room_problem, shift_pose
@@ -85,8 +81,7 @@ def test_merged_reconstruction_has_all_images_and_common_points_once(
     hall: HallProblem, halves: tuple[Reconstruction, Reconstruction]
 ) -> None:
     first, second = halves
-    joined = join_pair(hall.problem, move(first), second, OPTIONS)
-    assert joined is not None
+    (joined,) = join_reconstructions(hall.problem, [move(first), second], OPTIONS)
     assert [image.index for image in joined.images] == list(range(24))
     assert len(joined.points) < len(first.points) + len(second.points)
     for image in joined.images:
@@ -98,10 +93,7 @@ def test_merged_reconstruction_has_all_images_and_common_points_once(
 
 
 def test_part_that_closes_a_loop_is_joined_despite_drift(hall: HallProblem) -> None:
-    """Half of the common images of the last part agree with the joined part, and half have drift.
-
-    The common images of each two parts agree.
-    """
+    """The last part agrees with each of two joined parts, but not with both at once."""
     poses = list(hall.truth.values())
 
     def map_images(first: int, end: int) -> Reconstruction:
@@ -132,12 +124,12 @@ def test_look_alike_rooms_are_not_joined_and_the_same_room_is(seed: int) -> None
     poses: list[Pose] = [(pose[:, :3], pose[:, 3]) for pose in case.poses]
     first = {int(i): poses[i] for i in np.flatnonzero(rooms <= 0)}
     second = {int(i): poses[i] for i in np.flatnonzero(rooms != 0)}
-    a, b = (map_at_poses(case.problem, part) for part in (first, second))
-    assert join_pair(case.problem, a, b, OPTIONS) is not None
+    models = [map_at_poses(case.problem, part) for part in (first, second)]
+    assert len(join_reconstructions(case.problem, models, OPTIONS)) == 1
     # three images of the second room in the first room, where the same furniture stands
     only_first = {int(i): poses[i] for i in np.flatnonzero(rooms == 0)}
     only_second = {int(i): poses[i] for i in np.flatnonzero(rooms == 1)}
     shifted = {i: shift_pose(case.poses[i], 1) for i in list(only_second)[:3]}
     false = {i: (pose[:, :3], pose[:, 3]) for i, pose in shifted.items()}
-    a, b = (map_at_poses(case.problem, part) for part in (only_first | false, only_second))
-    assert join_pair(case.problem, a, b, OPTIONS) is None
+    models = [map_at_poses(case.problem, part) for part in (only_first | false, only_second)]
+    assert len(join_reconstructions(case.problem, models, OPTIONS)) == 2
