@@ -29,7 +29,7 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera
 from mpsfm_core.geometry import pixel_centers, project, transform, unproject
-from mpsfm_core.mapping.consistency.depth_consistency import measure_visibility
+from mpsfm_core.mapping.consistency.visibility import Views, measure_visibility
 from mpsfm_core.mapping.refinement.depth_noise import CELLS
 from mpsfm_core.mapping.scene.depth_map import DepthMap
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
@@ -198,13 +198,13 @@ def _score_depth(scene: Scene) -> Iterator[float]:
     registered = scene.registered_images().tolist()
     images = np.array([i for i in registered if scene.maps[i].active], dtype=np.int64)
     grids = [_make_grid(scene.maps[image]) for image in images.tolist()]
-    rotations, translations = scene.rotations[images], scene.translations[images]
-    intrinsics, sizes = scene.intrinsics[images], scene.image_sizes[images]
+    views = Views.of_scene(scene, images)
+    rotations, translations = views.rotations, views.translations
     for row, grid in enumerate(grids):
         local, log_std = _sample_points(grid)
         points = (local - translations[row]) @ rotations[row]
         depths = np.ascontiguousarray(local[:, 2])  # kernels compile again for other layouts
-        counts, _ = measure_visibility(points, depths, rotations, translations, intrinsics, sizes)
+        counts, _ = measure_visibility(points, depths, views, num_best=len(images), min_count=1)
         for other in map(int, np.flatnonzero(counts)):
             if other != row:
                 seen = transform(rotations[other], translations[other], points)

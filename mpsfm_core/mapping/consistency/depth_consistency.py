@@ -50,7 +50,7 @@ import numpy as np
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera
 from mpsfm_core.geometry import pixel_centers, unproject
-from mpsfm_core.geometry.frustum import frustum_planes
+from mpsfm_core.mapping.consistency.visibility import Views
 from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.refinement.depth_noise import (
     MIN_GAP,
@@ -76,8 +76,6 @@ CACHED_BYTES = 1 << 29
 """Size limit of the cached subsampled depth maps in memory, bytes. [ours]"""
 OVERLAP_GRID = 16
 """Columns and rows of the pixel grid that measures the overlap of two images. [ours]"""
-POINT_GROUP = 16
-"""Number of points with a common bounding sphere in the count of visible points. [ours]"""
 NUM_COMPARED = 16
 """Number of most overlapping images whose depth is compared with that of an image. [ours]"""
 MIN_OVERLAP_RATIO = 0.05
@@ -157,14 +155,14 @@ class DepthConsistencyCheck:
             Images to deregister, each with its largest violation ratio.
         """
         scene = self._scene
-        candidates = _select_images_with_depth(scene)
+        views = find_views_with_depth(scene)
         self._angles_deg = scene.track_angles_deg()
         measured: dict[tuple[int, int], float] = {}
         in_set = np.zeros((len(compared), scene.num_images), dtype=np.bool_)
         for members, is_member in zip(compared, in_set, strict=True):
             is_member[members] = True
         for image in map(int, images):
-            for other in find_overlapping_images(scene, image, candidates):
+            for other in find_overlapping_images(scene, image, views):
                 pair = min(image, other), max(image, other)
                 if pair not in measured and not (in_set[:, image] & in_set[:, other]).any():
                     measured[pair] = self.measure_violation_ratio(
@@ -296,7 +294,7 @@ class DepthConsistencyCheck:
         return _DepthGrid(depth, np.maximum(std, np.float32(1e-6)), valid, nearest, intrinsics)
 
 
-def find_overlapping_images(scene: Scene, image: int, candidates: Int64 | None = None) -> list[int]:
+def find_overlapping_images(scene: Scene, image: int, views: Views | None = None) -> list[int]:
     """Return the ``NUM_COMPARED`` images into which most pixels of a depth map project.
 
     A pixel counts by the ratio of the smaller and the larger of its depths in the two images.
@@ -306,10 +304,9 @@ def find_overlapping_images(scene: Scene, image: int, candidates: Int64 | None =
     Args:
         scene: The scene.
         image: Registered image with the depth map.
-        candidates: Registered images with depth to choose from, by default all.
+        views: Registered images with depth to choose from, by default all.
     """
-    others = _select_images_with_depth(scene) if candidates is None else candidates
-    others = others[others != image]
+    views = find_views_with_depth(scene) if views is None else views
     depth_map = scene.maps[image]
     rows, columns = depth_map.prior.shape
     tiles = pixel_centers(OVERLAP_GRID, OVERLAP_GRID).reshape(4, OVERLAP_GRID // 4, 4, -1, 2)
@@ -318,103 +315,20 @@ def find_overlapping_images(scene: Scene, image: int, candidates: Int64 | None =
     depth = depth_map.scale * depth_map.prior.depth[at].astype(np.float64)
     points = unproject(depth_map.camera, xy, depth)
     is_valid = depth_map.valid[at]
-    counts, similarities = measure_visibility(
+    best = views.find_best(
         (points[is_valid] - scene.translations[image]) @ scene.rotations[image],
         depth[is_valid],
-        scene.rotations[others],
-        scene.translations[others],
-        scene.intrinsics[others],
-        scene.image_sizes[others],
+        num_best=NUM_COMPARED + 1,  # the image itself may be among them
+        min_count=math.ceil(MIN_OVERLAP_RATIO * OVERLAP_GRID**2),
     )
-    order = np.argsort(-similarities, kind="stable")
-    order = order[counts[order] >= MIN_OVERLAP_RATIO * OVERLAP_GRID**2]
-    return [int(others[k]) for k in order[:NUM_COMPARED]]
+    return [int(other) for other in best[best != image][:NUM_COMPARED]]
 
 
-def _select_images_with_depth(scene: Scene) -> Int64:
+def find_views_with_depth(scene: Scene) -> Views:
     """Return the registered images whose depth scale is known."""
     registered = scene.registered_images()
     is_active = [scene.maps[image].active for image in registered.tolist()]
-    return registered[np.array(is_active, dtype=np.bool_)]
-
-
-@jit.kernel()
-def measure_visibility(
-    points: Float64,
-    depths: Float64,
-    rotations: Float64,
-    translations: Float64,
-    intrinsics: Float64,
-    sizes: Float64,
-) -> tuple[Int64, Float64]:
-    """Count the 3D points that project into each image, and compare their depths.
-
-    Args:
-        points: (p, 3) points in the world frame. Neighbors should be close to each other, because
-            groups of ``POINT_GROUP`` points are skipped if an image does not see their bounding
-            sphere, and all points if an image does not see that of all points.
-        depths: (p,) depth of each point in another image, in world units.
-        rotations: (n, 3, 3) rotations ``cam_from_world``.
-        translations: (n, 3) ``cam_from_world``.
-        intrinsics: (n, 4) intrinsics fx, fy, cx, cy of each image in pixels.
-        sizes: (n, 2) width and height of each image in pixels.
-
-    Returns:
-        Number (n,) of visible points, and sum (n,) of the ratios in [0, 1] of the smaller and the
-        larger depth of each visible point.
-    """
-    frusta = frustum_planes(rotations, translations, intrinsics, sizes)
-    num_groups = (len(points) + POINT_GROUP - 1) // POINT_GROUP
-    spheres, whole = np.zeros((num_groups, 4)), np.zeros(4)
-    for group in range(num_groups):
-        _bound_points(points[group * POINT_GROUP : (group + 1) * POINT_GROUP], spheres[group])
-    _bound_points(points, whole)
-    counts = np.zeros(len(rotations), np.int64)
-    similarities = np.zeros(len(rotations))
-    for image in range(len(rotations)):
-        r, t, planes = rotations[image], translations[image], frusta[image]
-        if _is_outside(whole, planes):
-            continue
-        fx, fy, cx, cy = intrinsics[image]
-        width, height = sizes[image]
-        for group in range(num_groups):
-            if _is_outside(spheres[group], planes):
-                continue
-            for k in range(group * POINT_GROUP, min((group + 1) * POINT_GROUP, len(points))):
-                x, y, z = points[k]
-                depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
-                if depth <= 1e-9:
-                    continue
-                u = fx * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]) / depth + cx
-                v = fy * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) / depth + cy
-                if 0 <= u < width and 0 <= v < height:
-                    counts[image] += 1
-                    similarities[image] += min(depth, depths[k]) / max(depth, depths[k])
-    return counts, similarities
-
-
-@jit.helper()
-def _bound_points(points: Float64, sphere: Float64) -> None:
-    """Write center and radius of a bounding sphere of points to ``sphere`` (4,), initially 0."""
-    for k in range(len(points)):
-        for a in range(3):
-            sphere[a] += points[k, a] / len(points)
-    for k in range(len(points)):
-        x, y, z = points[k]
-        x, y, z = x - sphere[0], y - sphere[1], z - sphere[2]
-        radius = math.sqrt(x * x + y * y + z * z) * (1.0 + 1e-9)
-        sphere[3] = max(sphere[3], radius)
-
-
-@jit.helper()
-def _is_outside(sphere: Float64, planes: Float64) -> bool:
-    """Return True if a sphere (4,) is behind one of the planes (5, 4) of a frustum."""
-    x, y, z, radius = sphere
-    for a in range(5):
-        nx, ny, nz, offset = planes[a]
-        if nx * x + ny * y + nz * z + offset < -radius:
-            return True
-    return False
+    return Views.of_scene(scene, registered[np.array(is_active, dtype=np.bool_)])
 
 
 class _DepthGrid(NamedTuple):

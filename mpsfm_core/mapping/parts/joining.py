@@ -26,8 +26,8 @@ from mpsfm_core.data import Int64, MappingProblem
 from mpsfm_core.mapping.consistency.depth_consistency import (
     DepthConsistencyCheck,
     find_overlapping_images,
-    measure_visibility,
 )
+from mpsfm_core.mapping.consistency.visibility import Views
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts.alignment import align_reconstructions, find_agreeing
 from mpsfm_core.mapping.refinement.depth_noise import measure_depth_noise
@@ -211,16 +211,15 @@ def _select_near(model: Reconstruction, other: Reconstruction) -> set[int]:
         observed = image.point_ids[image.point_ids >= 0]
         depths[observed] = other.points[observed] @ image.rotation[2] + image.translation[2]
     step = max(1, len(other.points) // MAX_SAMPLED_POINTS)
-    _, similarities = measure_visibility(
-        np.ascontiguousarray(other.points[::step]),
-        np.ascontiguousarray(depths[::step]),
+    views = Views.of_cameras(
+        np.array([image.index for image in images], dtype=np.int64),
         np.array([image.rotation for image in images]).reshape(-1, 3, 3),
         np.array([image.translation for image in images]).reshape(-1, 3),
         np.array([image.camera.params for image in images]).reshape(-1, 4),
         np.array([image.camera.size for image in images], dtype=np.float64).reshape(-1, 2),
     )
-    best = np.argsort(-similarities, kind="stable")[:MAX_COMPARED_IMAGES]
-    return {images[row].index for row in best if similarities[row] > 0}
+    points, depths = (np.ascontiguousarray(values[::step]) for values in (other.points, depths))
+    return set(views.find_best(points, depths, num_best=MAX_COMPARED_IMAGES).tolist())
 
 
 def _create_scene(
@@ -250,9 +249,10 @@ def _count_depth_conflicts(
     consistency = options.consistency
     check = DepthConsistencyCheck(scene, consistency)
     std_factor = max(1.0, measure_depth_noise(scene).multiplier)
+    views_a = Views.of_scene(scene, in_a)
     num_overlapping = num_conflicting = 0
     for image in in_b:
-        others = find_overlapping_images(scene, image, in_a)
+        others = find_overlapping_images(scene, image, views_a)
         ratios = [
             check.measure_violation_ratio(
                 image, other, std_factor, consistency.max_violations, by_target_area=True

@@ -6,7 +6,6 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from mpsfm_core.data import (
     DepthPrior,
@@ -20,7 +19,6 @@ from mpsfm_core.data import (
 from mpsfm_core.mapping.consistency.depth_consistency import (
     DepthConsistencyCheck,
     find_overlapping_images,
-    measure_visibility,
 )
 from mpsfm_core.mapping.options import ConsistencyOptions, MapperOptions, TriangulationOptions
 from mpsfm_core.mapping.refinement.refinement import Refiner
@@ -39,28 +37,6 @@ from mpsfm_core.testing.synthetic.two_rooms import (
 
 OPTIONS = ConsistencyOptions()
 SMALL = PinholeCamera(40, 30, 40.0, 40.0, 20.0, 15.0)
-
-
-@pytest.mark.parametrize("num_points", [0, 1, 16, 100])
-def test_visible_points_and_depth_ratios_are_those_of_projection(num_points: int) -> None:
-    rng, count = np.random.default_rng(num_points), 300
-    points = rng.normal(0, 1.5, (num_points, 3))
-    rotations = Rotation.random(count, rng=rng).as_matrix()
-    translations = rng.normal(0, 4, (count, 3))
-    intrinsics = rng.uniform(20, 60, (count, 4))
-    sizes = rng.uniform(40, 80, (count, 2))
-    local = np.einsum("nij,pj->npi", rotations, points) + translations[:, None]
-    depth = local[..., 2:]
-    xy = intrinsics[:, None, :2] * local[..., :2] / depth + intrinsics[:, None, 2:]
-    is_inside = ((xy >= 0) & (xy < sizes[:, None]) & (depth > 0)).all(axis=-1)
-    other = rng.uniform(1, 8, num_points)
-    counts, similarities = measure_visibility(
-        points, other, rotations, translations, intrinsics, sizes
-    )
-    np.testing.assert_array_equal(counts, is_inside.sum(axis=1))
-    z = depth[..., 0]
-    ratios = np.where(is_inside, np.minimum(z, other) / np.maximum(z, other), 0)
-    np.testing.assert_allclose(similarities, ratios.sum(axis=1))
 
 
 def posed_scene(
