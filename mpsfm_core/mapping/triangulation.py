@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from mpsfm_core.data import Bool, Float64, Int64
-from mpsfm_core.geometry import triangulation_angle_deg
+from mpsfm_core.geometry import camera_center, triangulation_angle_deg
 from mpsfm_core.mapping.options import TriangulationOptions
 from mpsfm_core.mapping.scene.scene import Scene
 
@@ -141,23 +141,25 @@ def triangulate_or_lift(
         Points (m, 3) in the world frame, and a mask (m,) of points in front of both cameras with
         small reprojection errors.
     """
-    image_of = scene.graph.image_of
-    centers = scene.centers()
-    center_a, center_b = centers[image_of[source]], centers[image_of[target]]
+    images_a, images_b = scene.graph.image_of[source], scene.graph.image_of[target]
+    center_a = camera_center(scene.rotations[images_a], scene.translations[images_a])
+    center_b = camera_center(scene.rotations[images_b], scene.translations[images_b])
     ray_a, ray_b = scene.world_rays(source), scene.world_rays(target)
     points = triangulate_midpoints(center_a, ray_a, center_b, ray_b)
-    lifts = ~(triangulation_angle_deg(center_a, center_b, points) >= options.min_angle_deg)
-    lifts |= ~_reprojects(scene, source, target, points, max_error_px)
-    from_source, source_valid = scene.lift(source[lifts])
-    from_target, target_valid = scene.lift(target[lifts])
-    points[lifts] = np.where(target_valid[:, None], from_target, from_source)
-    has_depth = np.zeros_like(lifts)
-    has_depth[lifts] = source_valid | target_valid
-    angle_deg = triangulation_angle_deg(center_a, center_b, points)
-    valid = _reprojects(scene, source, target, points, max_error_px) & (~lifts | has_depth)
+    valid = triangulation_angle_deg(center_a, center_b, points) >= options.min_angle_deg
+    valid &= _reprojects(scene, source, target, points, max_error_px)
+    lifts = np.flatnonzero(~valid)
+    source, target = source[lifts], target[lifts]
+    from_source, source_valid = scene.lift(source)
+    from_target, target_valid = scene.lift(target)
+    lifted = np.where(target_valid[:, None], from_target, from_source)
+    angle_deg = triangulation_angle_deg(center_a[lifts], center_b[lifts], lifted)
     # A point lifted from depth must not replace the point of two rays that miss each other at a
     # wide angle.
-    valid &= ~lifts | (angle_deg < 2 * options.min_angle_deg) | ~np.isfinite(angle_deg)
+    is_narrow = (angle_deg < 2 * options.min_angle_deg) | ~np.isfinite(angle_deg)
+    reprojects = _reprojects(scene, source, target, lifted, max_error_px)
+    valid[lifts] = reprojects & is_narrow & (source_valid | target_valid)
+    points[lifts] = lifted
     return points, valid
 
 
