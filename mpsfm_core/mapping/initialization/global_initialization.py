@@ -33,6 +33,7 @@ from scipy.spatial.transform import Rotation
 from mpsfm_core.data import Bool, Float64, Int64, VerifiedPair
 from mpsfm_core.geometry import camera_center, rotation_angle_deg, triangulation_angle_deg
 from mpsfm_core.geometry.statistics import MAD_TO_STD, group_medians
+from mpsfm_core.mapping.scene.graph import BLOCK_MATCHES
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.triangulation import triangulate_midpoints
 
@@ -266,15 +267,43 @@ def _chain_rotations(
 def _measure_relative_poses(scene: Scene, pairs: list[VerifiedPair]) -> _RelativePoses:
     """Measure the baseline of each image pair by the depth priors of both images.
 
-    The log baseline is the median over the matches of ``log(depth prior / triangulated depth)``.
     The median absolute deviation from the log baseline gives the Cauchy weight of the pair.
     """
-    empty = np.zeros(0, np.int64)
     a = np.array([pair.image_a for pair in pairs], dtype=np.int64)
     b = np.array([pair.image_b for pair in pairs], dtype=np.int64)
     rotation = np.array([pair.rotation for pair in pairs]).reshape(-1, 3, 3)
     translation = np.array([pair.translation for pair in pairs]).reshape(-1, 3)
     translation = translation / np.maximum(np.linalg.norm(translation, axis=1), 1e-12)[:, None]
+    log_lengths, deviations = np.zeros((len(pairs), 2)), np.zeros(len(pairs))
+    counts = np.zeros(len(pairs), dtype=np.int64)
+    num_blocks = 1 + sum(map(len, pairs)) // BLOCK_MATCHES
+    for rows in np.array_split(np.arange(len(pairs)), num_blocks):
+        block = [pairs[row] for row in rows.tolist()]
+        measured = _measure_log_baselines(scene, block, rotation[rows], translation[rows])
+        log_lengths[rows], deviations[rows], counts[rows] = measured
+    weight = np.array([len(p) * (1.0 if p.calibrated else PLANAR_WEIGHT) for p in pairs])
+    is_measured = counts >= MIN_MATCHES
+    if is_measured.any():
+        weight[is_measured] *= _cauchy_weights(deviations[is_measured])
+    return _RelativePoses(a, b, rotation, translation, log_lengths, weight).select(is_measured)
+
+
+def _measure_log_baselines(
+    scene: Scene, pairs: list[VerifiedPair], rotation: Float64, translation: Float64
+) -> tuple[Float64, Float64, Int64]:
+    """Measure log baselines as the medians of ``log(depth prior / triangulated depth)``.
+
+    Args:
+        scene: The scene.
+        pairs: The m image pairs.
+        rotation: (m, 3, 3) relative rotations ``b_from_a``.
+        translation: (m, 3) relative translations ``b_from_a``, of length 1.
+
+    Returns:
+        Log baselines (m, 2) by the depth priors of ``a`` and ``b``, their median absolute
+        deviations (m,), and numbers (m,) of usable matches.
+    """
+    empty = np.zeros(0, np.int64)
     pair_of = np.repeat(np.arange(len(pairs)), [len(pair) for pair in pairs])
     offsets = scene.graph.offsets
     source = np.concatenate([empty, *(p.matches[:, 0] + offsets[p.image_a] for p in pairs)])
@@ -291,18 +320,13 @@ def _measure_relative_poses(scene: Scene, pairs: list[VerifiedPair]) -> _Relativ
         log_ratios = np.log(
             np.stack([scene.keypoint_prior[source] / z_a, scene.keypoint_prior[target] / z_b])
         )
-    counts = np.bincount(pair_of[usable], minlength=len(pairs))
     log_lengths = np.stack(
         [group_medians(ratios[usable], pair_of[usable], len(pairs)) for ratios in log_ratios],
         axis=1,
     )
     deviations = np.max(np.abs(log_ratios - log_lengths[pair_of].T), axis=0)
     pair_deviations = group_medians(deviations[usable], pair_of[usable], len(pairs))
-    weight = np.array([len(p) * (1.0 if p.calibrated else PLANAR_WEIGHT) for p in pairs])
-    is_measured = counts >= MIN_MATCHES
-    if is_measured.any():
-        weight[is_measured] *= _cauchy_weights(pair_deviations[is_measured])
-    return _RelativePoses(a, b, rotation, translation, log_lengths, weight).select(is_measured)
+    return log_lengths, pair_deviations, np.bincount(pair_of[usable], minlength=len(pairs))
 
 
 def _select_largest_cyclic_component(edges: _RelativePoses, num_images: int) -> Bool:

@@ -21,8 +21,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64
-from mpsfm_core.geometry import pixel_centers
+from mpsfm_core.geometry import camera_center, pixel_centers
 from mpsfm_core.geometry.statistics import MAD_TO_STD, group_medians
+from mpsfm_core.mapping.scene.graph import BLOCK_MATCHES
 from mpsfm_core.mapping.scene.scene import Scene
 
 CELLS = 4
@@ -228,37 +229,54 @@ def _cross_view_residuals(scene: Scene) -> tuple[Float64, Int64]:
     A group contains the matches between one grid cell of the first image of a pair and the second
     image.
     """
+    scales = scene.scales()
+    is_active = np.array([depth_map.active for depth_map in scene.maps])
+    num_edges = len(scene.graph.source)
+    blocks = [
+        _measure_residuals(scene, edges, scales, is_active)
+        for edges in np.array_split(np.arange(num_edges), 1 + num_edges // BLOCK_MATCHES)
+    ]
+    residuals, groups = zip(*blocks, strict=True)
+    return np.concatenate(residuals), np.concatenate(groups)
+
+
+def _measure_residuals(
+    scene: Scene, edges: Int64, scales: Float64, is_active: Bool
+) -> tuple[Float64, Int64]:
+    """Return the residuals and groups of :func:`_cross_view_residuals` of some matches.
+
+    Args:
+        scene: The scene.
+        edges: (e,) edges of the correspondence graph.
+        scales: (n,) scales of the depth priors.
+        is_active: (n,) bool mask of the images with depth of known scale.
+    """
     graph, tracks = scene.graph, scene.tracks
-    point = tracks.point_of[graph.source]
-    is_same = (point >= 0) & (point == tracks.point_of[graph.target])
-    is_same &= graph.source < graph.target
-    source, target = graph.source[is_same], graph.target[is_same]
-    active = np.array([depth_map.active for depth_map in scene.maps])[graph.image_of]
-    prior = scene.keypoint_prior * scene.scales()[graph.image_of]
-    known = scene.keypoint_valid & active & (prior > 0)
-    has_depth = known[source] & known[target]
-    source, target = source[has_depth], target[has_depth]
+    source, target = graph.source[edges], graph.target[edges]
+    point = tracks.point_of[source]
+    is_used = (point >= 0) & (point == tracks.point_of[target]) & (source < target)
+    for keypoints in (source, target):
+        is_known = scene.keypoint_valid[keypoints] & is_active[graph.image_of[keypoints]]
+        is_used &= is_known & (scene.keypoint_prior[keypoints] > 0)
+    source, target = source[is_used], target[is_used]
     a, b = graph.image_of[source], graph.image_of[target]
-    camera_points = scene.rays(source) * prior[source, None]
+    prior_a, prior_b = (
+        scene.keypoint_prior[source] * scales[a],
+        scene.keypoint_prior[target] * scales[b],
+    )
+    camera_points = scene.rays(source) * prior_a[:, None]
     world = np.einsum("nji,nj->ni", scene.rotations[a], camera_points - scene.translations[a])
     projected = np.einsum("nj,nj->n", scene.rotations[b, 2], world) + scene.translations[b, 2]
-    centers = scene.centers()
-    origin = np.einsum("nj,nj->n", scene.rotations[b, 2], centers[a]) + scene.translations[b, 2]
-    front = projected > 1e-9
-    source, target, projected, origin = (
-        source[front],
-        target[front],
-        projected[front],
-        origin[front],
-    )
-    gain = (projected - origin) / projected
+    centers = camera_center(scene.rotations[a], scene.translations[a])
+    origin = np.einsum("nj,nj->n", scene.rotations[b, 2], centers) + scene.translations[b, 2]
+    gain = (projected - origin) / np.maximum(projected, 1e-9)
     variance = (gain * scene.keypoint_log_std[source]) ** 2 + scene.keypoint_log_std[target] ** 2
-    residuals = np.log(projected / prior[target]) / np.sqrt(np.maximum(variance, 1e-12))
-    size = np.array([image.camera.size for image in scene.problem.images])
-    cell = np.floor(CELLS * scene.keypoints[source] / size[graph.image_of[source]])
+    residuals = np.log(np.maximum(projected, 1e-9) / prior_b) / np.sqrt(np.maximum(variance, 1e-12))
+    cell = np.floor(CELLS * scene.keypoints[source] / scene.image_sizes[a])
     row, column = np.clip(cell, 0, CELLS - 1).astype(np.int64).T
-    pair = graph.image_of[source] * scene.num_images + graph.image_of[target]
-    return residuals, (pair * CELLS + row) * CELLS + column
+    pair = a * scene.num_images + b
+    front = projected > 1e-9
+    return residuals[front], ((pair * CELLS + row) * CELLS + column)[front]
 
 
 def _clustering(values: Float64, groups: Int64) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Compiled kernels that sort the observations of tracks and compute triangulation angles."""
+"""Compiled kernels for projection, the observations of tracks, and triangulation angles."""
 
 from __future__ import annotations
 
@@ -31,6 +31,45 @@ def sort_keypoints_by_point(point_of: Int64, num_points: int) -> Int64:
             keypoints[first[point]] = keypoint
             first[point] += 1
     return keypoints
+
+
+@jit.kernel()
+def project_to_keypoints(
+    points: Float64,
+    keypoints: Int64,
+    xy: Float64,
+    image_of: Int64,
+    rotations: Float64,
+    translations: Float64,
+    intrinsics: Float64,
+) -> tuple[Float64, Float64]:
+    """Project world points into the images of keypoints.
+
+    Args:
+        points: (m, 3) float64 points in the world frame.
+        keypoints: (m,) int64 keypoint that each point is compared with.
+        xy: (k, 2) float64 positions of all keypoints in pixels.
+        image_of: (k,) int64 image of each keypoint.
+        rotations: (n, 3, 3) float64 rotations ``cam_from_world``.
+        translations: (n, 3) float64 ``cam_from_world``.
+        intrinsics: (n, 4) float64 intrinsics fx, fy, cx, cy in pixels.
+
+    Returns:
+        Reprojection errors (m,) in pixels, inf behind the camera, and depth (m,) of the points.
+    """
+    errors_px, depth = np.full(len(points), np.inf), np.empty(len(points))
+    for m in range(len(points)):
+        x, y, z = points[m]
+        image = image_of[keypoints[m]]
+        r, t = rotations[image], translations[image]
+        depth[m] = (r[2, 0] * x + r[2, 2] * z) + r[2, 1] * y + t[2]
+        if depth[m] > 1e-9:
+            fx, fy, cx, cy = intrinsics[image]
+            column, row = xy[keypoints[m]]
+            u = (r[0, 0] * x + r[0, 2] * z) + r[0, 1] * y + t[0]
+            v = (r[1, 0] * x + r[1, 2] * z) + r[1, 1] * y + t[1]
+            errors_px[m] = math.hypot(fx * u / depth[m] + cx - column, fy * v / depth[m] + cy - row)
+    return errors_px, depth
 
 
 @jit.kernel()

@@ -14,7 +14,10 @@ from mpsfm_core.geometry.distortion import distort_rays, undistort_rays
 from mpsfm_core.mapping.scene.depth_map import DepthMap, DepthRefinement
 from mpsfm_core.mapping.scene.estimated_intrinsics import EstimatedIntrinsics
 from mpsfm_core.mapping.scene.graph import CorrespondenceGraph
-from mpsfm_core.mapping.scene.kernels import compute_max_triangulation_angles
+from mpsfm_core.mapping.scene.kernels import (
+    compute_max_triangulation_angles,
+    project_to_keypoints,
+)
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction
 from mpsfm_core.mapping.scene.rig_frames import RigFrames
 from mpsfm_core.mapping.scene.tracks import Tracks
@@ -309,15 +312,16 @@ class Scene:
         Returns:
             Reprojection errors (m,) in pixels, inf behind the camera, and depth (m,) of the points.
         """
-        images = self.graph.image_of[keypoints]
-        camera = np.einsum("nij,nj->ni", self.rotations[images], points)
-        camera += self.translations[images]
-        fx, fy, cx, cy = self.intrinsics[images].T
-        front = camera[:, 2] > 1e-9
-        z = np.where(front, camera[:, 2], 1.0)
-        dx = fx * camera[:, 0] / z + cx - self.keypoints[keypoints, 0]
-        dy = fy * camera[:, 1] / z + cy - self.keypoints[keypoints, 1]
-        return np.where(front, np.hypot(dx, dy), np.inf), camera[:, 2]
+        errors_px, depth = project_to_keypoints(
+            np.ascontiguousarray(points),
+            keypoints,
+            self.keypoints,
+            self.graph.image_of,
+            self.rotations,
+            self.translations,
+            self.intrinsics,
+        )
+        return errors_px, depth
 
     def scales(self) -> Float64:
         """Return the scales (n,) of the depth priors of all images, 1 without an estimate."""
