@@ -11,6 +11,7 @@ import pytest
 
 from mpsfm_core.data import DepthPrior, Float64, MappingProblem, PinholeCamera
 from mpsfm_core.mapping.options import TriangulationOptions
+from mpsfm_core.mapping.refinement import depth_noise
 from mpsfm_core.mapping.refinement.depth_noise import (
     DepthNoise,
     find_well_constrained_keypoints,
@@ -65,6 +66,14 @@ def smooth(rng: np.random.Generator, shape: tuple[int, int]) -> Float64:
     """Return errors with twice the declared std, correlated over an eighth of the map's width."""
     noise = cv2.GaussianBlur(rng.normal(size=shape), (0, 0), shape[1] / 8)
     return np.asarray(2 * DECLARED * noise / noise.std())
+
+
+def test_small_blocks_of_matches_give_equal_noise(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = scene_with(independent)
+    whole = measure_depth_noise(scene)
+    monkeypatch.setattr(depth_noise, "BLOCK_MATCHES", 100)
+    assert len(scene.graph.source) > 500
+    assert measure_depth_noise(scene) == whole
 
 
 def test_independent_errors_are_measured_with_size_and_low_correlation() -> None:

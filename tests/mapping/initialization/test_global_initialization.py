@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from mpsfm_core.data import Float64, Int64, MappingProblem
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_errors_deg
 from mpsfm_core.geometry import rotation_angle_deg
+from mpsfm_core.mapping.initialization import global_initialization
 from mpsfm_core.mapping.initialization.global_initialization import (
     GlobalPoses,
     average_differences,
@@ -53,6 +54,18 @@ def test_estimate_global_poses_registers_all_images_near_truth(hall: HallProblem
     assert len(placed.images) >= VIEWS - 2
     assert worst_deg(placed, hall) < 3
     assert np.log(placed.scales).std() < 0.1
+
+
+def test_small_blocks_of_matches_give_equal_poses(
+    hall: HallProblem, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = place(hall.problem)
+    monkeypatch.setattr(global_initialization, "BLOCK_MATCHES", 300)
+    in_blocks = place(hall.problem)
+    assert whole is not None
+    assert in_blocks is not None
+    for values, expected in zip(in_blocks, whole, strict=True):
+        np.testing.assert_array_equal(values, expected)
 
 
 def test_wrong_pair_is_removed(hall: HallProblem) -> None:

@@ -1,4 +1,4 @@
-"""Tests of the scene: rollback of focal lengths and distortion, and checkpoint state."""
+"""Tests of the scene: projection, rollback of focal lengths and distortion, checkpoint state."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ import pytest
 
 from mpsfm_core.data import Float64
 from mpsfm_core.data.camera_models import IntrinsicParameter
+from mpsfm_core.geometry import project
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     CalibrationOutcome,
     IntrinsicEstimate,
 )
 from mpsfm_core.mapping.scene.scene import Scene
 from mpsfm_core.mapping.state import flatten_state, unflatten_state
+from mpsfm_core.testing.synthetic.problems import make_mapping_problem
+from mpsfm_core.testing.synthetic.scenes import arc_poses, room_scene
 from tests.mapping.focal_scenes import CAMERA, guess_focals, make_room
 
 FIRST = np.array([1.0, 0.0, 0.0, 0.0])
@@ -64,3 +67,21 @@ def test_scene_restored_from_checkpoint_has_identical_keypoints(
     scene.set_shared_intrinsics(0, scene.intrinsics[0], 0.02 * FIRST)
     restored.load_state_dict(unflatten_state(flatten_state(scene.state_dict())))
     assert restored.keypoints.tobytes() == scene.keypoints.tobytes()
+
+
+def test_project_returns_errors_and_depth_of_the_pinhole_model() -> None:
+    scene = Scene(make_mapping_problem(room_scene(), CAMERA, arc_poses(3, 20.0)))
+    for image, pose in enumerate(arc_poses(3, 20.0)):
+        scene.register(image, pose[:, :3], pose[:, 3])
+    rng = np.random.default_rng(0)
+    keypoints = rng.integers(0, len(scene.keypoints), 200)
+    points = rng.normal(0, 3, (200, 3))
+    errors_px, depth = scene.project(keypoints, points)
+    for keypoint, point, error_px, z in zip(keypoints, points, errors_px, depth, strict=True):
+        image = scene.graph.image_of[keypoint]
+        local = scene.rotations[image] @ point + scene.translations[image]
+        assert z == pytest.approx(local[2])
+        xy = project(CAMERA, local[None])[0]
+        expected = np.linalg.norm(xy - scene.keypoints[keypoint]) if local[2] > 0 else np.inf
+        assert error_px == pytest.approx(expected)
+    assert np.isinf(errors_px).any()
