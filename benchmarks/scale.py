@@ -9,8 +9,8 @@ wrong matches in each pair, and 1 % of pairs between distant views that look ali
 own process with one thread, which loads compiled code before timing starts. CPU time includes the
 depth maps of our mapper, and the Dask workers, which load compiled code within that time. Memory is
 the peak of the first process without pages of mapped files, sampled ten times a second, and the
-peak of the largest worker. As in a run, the maps of many images are in mapped files. Results are
-kept in ``--folder``, so that an interrupted benchmark continues.
+peak of the largest worker with these pages. As in a run, the maps of many images are in mapped
+files. Results are kept in ``--folder``, so that an interrupted benchmark continues.
 
 The second table joins two parts of twin rooms (:mod:`mpsfm_core.testing.synthetic.two_rooms`) at
 given poses. A true join has common images in the corridor. In a false join, some images of the
@@ -173,7 +173,7 @@ def _run(scene: Path, method: str, part_images: int, path: Path) -> None:
         initialize_process()
         started, cpu_started = time.perf_counter(), _cpu_seconds()
         with watch_memory() as peaks_mib:
-            models = list(_map(problem, method, part_images))
+            models, worker_mib = _map(problem, method, part_images)
     seconds, cpu_seconds = time.perf_counter() - started, _cpu_seconds() - cpu_started
     largest = models[0] if models else {}
     errors = pose_errors_deg(largest, truth, CONVENTION)
@@ -184,7 +184,7 @@ def _run(scene: Path, method: str, part_images: int, path: Path) -> None:
         "seconds": seconds,
         "cpu_seconds": cpu_seconds,
         "peak_mib": max(peaks_mib),
-        "worker_mib": resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss / 1024,
+        "worker_mib": worker_mib,
     }
     path.write_text(json.dumps(row), encoding="utf-8")
 
@@ -209,12 +209,14 @@ def watch_memory() -> Iterator[list[float]]:
         thread.join()
 
 
-def _map(problem: MappingProblem, method: str, part_images: int) -> Iterator[Mapping[str, Pose]]:
-    """Return the poses of each model, the largest first."""
+def _map(
+    problem: MappingProblem, method: str, part_images: int
+) -> tuple[list[Mapping[str, Pose]], float]:
+    """Return the poses of each model, the largest first, and the peak memory of workers in MiB."""
     if method in PEERS:
-        yield from run_peer(method, problem)
-        return
+        return list(run_peer(method, problem)), 0.0
     options = MapperOptions(parts=None if method == ONE_PIECE else part_images)
+    worker_mib = 0.0
     with tempfile.TemporaryDirectory(prefix="mpsfm-scale-") as cache:
         part_mapper = None
         if method in WORKERS:
@@ -227,8 +229,9 @@ def _map(problem: MappingProblem, method: str, part_images: int) -> Iterator[Map
             part_mapper = PartMapper(runtime, Registry.discover(), Stages(Registry()))
         result = part_mapping.reconstruct(problem, options, map_parts=part_mapper)
         models = compute_depth_maps(result.reconstructions)
-    for model in models:
-        yield model.poses
+        if part_mapper is not None:
+            worker_mib = max(record.peak_memory_mb or 0.0 for record in part_mapper.records)
+    return [model.poses for model in models], worker_mib
 
 
 def _cpu_seconds() -> float:

@@ -104,6 +104,7 @@ class MappingCheckpoints:
         options: Options of the mapper.
         stages: Receiver of messages to the user.
         every_s: Minimum seconds between checkpoints; the interval is extended if saving is slow.
+        problem_digest: Digest of the problem, or None to compute it.
     """
 
     def __init__(
@@ -113,9 +114,10 @@ class MappingCheckpoints:
         options: MapperOptions,
         stages: Stages,
         every_s: float,
+        problem_digest: str | None = None,
     ) -> None:
         self._folder = cache_folder(cache_dir) / "mapping"
-        key = content_key(digest(problem), options.model_dump(mode="json"))
+        key = content_key(problem_digest or digest(problem), options.model_dump(mode="json"))
         self._path = self._folder / f"{key}.npz"
         self._stages = stages
         self._every_s = self._wait_s = every_s

@@ -98,7 +98,7 @@ class PartMapper:
             results, self.records = [], []
             for done, part in enumerate(parts, start=1):
                 with measure_part(part.problem) as measured:
-                    result = step.map(part.problem, stores=stores)
+                    result = step.map(part.problem, part.key, stores=stores)
                 models = compute_depth_maps(result.reconstructions)
                 results.append(replace(result, reconstructions=models))
                 self.records.append(step.read_record(part.key) or measured[0])
@@ -171,7 +171,7 @@ class MapPart:
         with limit_threads(self.threads), store_on_disk(self.cache):
             problem = problem_from_state(self.inputs.load(key))
             with measure_part(problem) as records:
-                self.map(problem)
+                self.map(problem, key)
         release_free_memory()
         if not self.record_file(key).exists():  # a repeated part only loads its checkpoint
             write_file(self.record_file(key), json.dumps(asdict(records[0])))
@@ -182,20 +182,21 @@ class MapPart:
             return PartRecord(**json.loads(self.record_file(key).read_text(encoding="utf-8")))
         return None
 
-    def map(self, problem: MappingProblem, *, stores: bool = True) -> MappingResult:
+    def map(self, problem: MappingProblem, key: str, *, stores: bool = True) -> MappingResult:
         """Map a part, or load its result if the part is complete.
 
         Args:
             problem: Mapping problem of the part.
+            key: Digest of the problem.
             stores: If true, load and write checkpoints.
         """
-        checkpoints = self.checkpoints(problem) if stores else None
+        checkpoints = self.checkpoints(problem, key) if stores else None
         return mapper.reconstruct(problem, self.options, None, checkpoints)
 
-    def checkpoints(self, problem: MappingProblem) -> MappingCheckpoints:
+    def checkpoints(self, problem: MappingProblem, key: str) -> MappingCheckpoints:
         """Return the storage of the checkpoints of a part, which shows no messages."""
         quiet = Stages(Registry())
-        return MappingCheckpoints(self.cache, problem, self.options, quiet, self.every_s)
+        return MappingCheckpoints(self.cache, problem, self.options, quiet, self.every_s, key)
 
     @property
     def inputs(self) -> TaskInputs:
@@ -213,7 +214,7 @@ class _StoredPart:
     def __init__(self, step: MapPart, problem: MappingProblem) -> None:
         self.problem, self.key = problem, digest(problem)
         self._inputs, self._record_file = step.inputs, step.record_file(self.key)
-        self._checkpoints = step.checkpoints(problem)
+        self._checkpoints = step.checkpoints(problem, self.key)
 
     def store(self) -> None:
         """Write the mapping problem for the workers.

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import math
 import zipfile
 from collections.abc import Callable
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, BinaryIO, TypeVar
 
@@ -21,6 +23,9 @@ the largest supported image [ours]."""
 _COMPRESSION_LEVEL = 1
 """Compression level of zlib for integers and masks. Floats are not compressed, because zlib makes
 maps of depth 13 % and maps of normals 24 % smaller, and takes ten times as long as writing."""
+
+_MAGIC = b"\x93NUMPY\x01\x00"
+"""First bytes of an NPY file of version 1.0, which numpy writes unless the header is large."""
 
 
 def write_npz(path: Path, **arrays: NDArray[Any]) -> None:
@@ -74,6 +79,30 @@ def parse_arrays(read: Callable[[], Parsed]) -> Parsed:
 
 
 def _read_arrays(file: BinaryIO) -> dict[str, NDArray[Any]]:
-    file.seek(0)
-    with np.load(file, allow_pickle=False) as arrays:
-        return {name: arrays[name] for name in arrays.files}
+    with zipfile.ZipFile(file) as archive:
+        return {
+            name.removesuffix(".npy"): _read_array(bytearray(archive.read(name)))
+            for name in archive.namelist()
+        }
+
+
+def _read_array(data: bytearray) -> NDArray[Any]:
+    """Parse the content of an NPY file, of which the array keeps the memory."""
+    if data[:8] != _MAGIC:
+        array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
+        return array
+    start = 10 + int.from_bytes(data[8:10], "little")
+    shape, is_fortran, dtype = _parse_header(bytes(data[:start]))
+    values = np.frombuffer(data, dtype, math.prod(shape), start)
+    return values.reshape(shape, order="F" if is_fortran else "C")
+
+
+@lru_cache(maxsize=1 << 14)
+def _parse_header(header: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Parse the header of an NPY file, which takes longer than reading a small array."""
+    stream = io.BytesIO(header)
+    np.lib.format.read_magic(stream)
+    shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    if dtype.hasobject:
+        raise ValueError("arrays of Python objects are not read")
+    return shape, is_fortran, dtype
