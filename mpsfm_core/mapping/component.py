@@ -132,9 +132,11 @@ class Component:
         """
         self.scene.resume(model, refined_map_width=self._options.refinement.map_width)
         self.refiner.adapts_reprojection_loss = True
-        self.maintenance.refine_globally(depth_maps=False)
+        self.refiner.keeps_depth_map[self.scene.registered_images()] = True
+        self.maintenance.refine_globally()
         if self.refiner.can_refine_focals():
             # each part has estimated another focal length, so poses and points were distorted
+            self.refiner.keeps_depth_map[:] = False
             self.maintenance.refine_globally()
         self.maintenance.check_all_images(MAX_FINAL_VIOLATIONS, "final-check", compared)
         if self.size < 2:

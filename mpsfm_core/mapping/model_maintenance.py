@@ -135,14 +135,10 @@ class ModelMaintenance:
             self.refine_globally()
         return is_larger
 
-    def refine_globally(self, *, depth_maps: bool = True) -> None:
-        """Refine all images and points, then deregister images with few or unconnected points.
-
-        Args:
-            depth_maps: False keeps the depth maps, and only adapts their scales.
-        """
+    def refine_globally(self) -> None:
+        """Refine all images and points, then deregister images with few or unconnected points."""
         with self.event_log.timed("global refinement"):
-            self.refiner.refine_globally(depth_maps=depth_maps)
+            self.refiner.refine_globally()
             self.scene.tracks.compact()
             release_free_memory()
         self.history.clear()
@@ -255,6 +251,7 @@ class ModelMaintenance:
             if self.refiner.fixed[image]:
                 continue
             self._checked[image] = False
+            self.refiner.keeps_depth_map[image] = False
             self.scene.deregister(image)
             self.history.clear_pose_rejections()
             self.event_log.rejected(image, reason)

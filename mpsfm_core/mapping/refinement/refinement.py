@@ -170,6 +170,8 @@ class Refiner:
         adapts_reprojection_loss: Whether global refinement may widen the reprojection loss. While
             images are registered one by one, a narrow reprojection loss protects against wrong
             matches.
+        keeps_depth_map: (n,) bool mask of the images that global refinement keeps the depth map of,
+            because they have that of a joined part.
         calibrates_with_long_tracks: Whether self-calibration estimates intrinsics from long tracks
             (see :func:`calibrate_cameras`).
     """
@@ -187,6 +189,7 @@ class Refiner:
         self.loss_scale = options.refinement.bundle.reprojection_scale
         self.adapts_reprojection_loss = False
         self.calibrates_with_long_tracks = False
+        self.keeps_depth_map: Bool = np.zeros(scene.num_images, dtype=np.bool_)
         self._integrator_noise = DepthNoise()
         self._integrators = _create_cache()
 
@@ -541,12 +544,8 @@ class Refiner:
             if changed < MAX_LOCAL_CHANGE * max(self._num_observations(), 1):
                 break
 
-    def refine_globally(self, *, depth_maps: bool = True) -> None:
-        """Adjust all images and update tracks until few tracks change, then refine depth maps.
-
-        Args:
-            depth_maps: False keeps the depth maps, and only adapts their scales.
-        """
+    def refine_globally(self) -> None:
+        """Adjust all images and update tracks until few tracks change, then refine depth maps."""
         images = [int(i) for i in self.scene.registered_images()]
         complete_and_merge_tracks(self.scene, self.triangulation, create=True)
         lift_low_parallax(self.scene, self.triangulation)
@@ -562,8 +561,7 @@ class Refiner:
             changed += complete_and_merge_tracks(self.scene, self.triangulation)
             if changed < MAX_GLOBAL_CHANGE * max(self._num_observations(), 1):
                 break
-        if depth_maps:
-            self.integrate(images)
+        self.integrate([image for image in images if not self.keeps_depth_map[image]])
 
     def reset(self) -> None:
         """Discard all noise measurements and depth integrators, for an empty scene."""
@@ -572,6 +570,7 @@ class Refiner:
         self.loss_scale = self.options.bundle.reprojection_scale
         self.adapts_reprojection_loss = False
         self.calibrates_with_long_tracks = False
+        self.keeps_depth_map[:] = False
 
     def state_dict(self) -> StateDict:
         """Return the depth noise measurements and the fixed poses for a checkpoint."""
@@ -582,6 +581,7 @@ class Refiner:
             "loss_scale": self.loss_scale,
             "adapts_reprojection_loss": self.adapts_reprojection_loss,
             "calibrates_with_long_tracks": self.calibrates_with_long_tracks,
+            "keeps_depth_map": self.keeps_depth_map,
         }
 
     def load_state_dict(self, state: StateDict) -> None:
@@ -592,6 +592,7 @@ class Refiner:
         self.loss_scale = state["loss_scale"]
         self.adapts_reprojection_loss = state["adapts_reprojection_loss"]
         self.calibrates_with_long_tracks = state["calibrates_with_long_tracks"]
+        self.keeps_depth_map = state["keeps_depth_map"]
 
     def _integrate(self, image: int, points: _MeasuredPoints) -> None:
         scene = self.scene
