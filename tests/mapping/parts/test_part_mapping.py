@@ -13,6 +13,10 @@ from mpsfm_core.data.decisions import ImageReason
 from mpsfm_core.evaluation.pose_auc import CONVENTIONS, pose_auc, pose_errors_deg
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.component import Component
+from mpsfm_core.mapping.event_log import EventLog
+from mpsfm_core.mapping.events import NullMappingEvents
+from mpsfm_core.mapping.initialization.initial_pair import InitialPairSelector
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.parts.part_mapping import reconstruct, select_parts
 from mpsfm_core.mapping.scene.reconstruction import MappingResult
@@ -88,6 +92,24 @@ def test_image_that_its_part_lost_is_registered_after_the_join(hall: HallProblem
     lost = hall.problem.images[7].name
     result = reconstruct(hall.problem, OPTIONS, map_parts=lose_an_image)
     assert lost in result.reconstructions[0].poses
+
+
+def test_depth_maps_of_parts_are_kept_unless_an_image_is_registered_again(
+    hall: HallProblem, in_parts: MappingResult
+) -> None:
+    run = mapper.Mapper(hall.problem, MapperOptions(), NullMappingEvents())
+    component = Component(
+        hall.problem, MapperOptions(), InitialPairSelector(OPTIONS), run.event_log
+    )
+    assert component.initialize_from_model(in_parts.reconstructions[0], [])
+    maps = component.scene.maps
+    before = [depth_map.refinement for depth_map in maps]
+    component.maintenance.deregister([7], ImageReason.MISREGISTERED.because(num_matches=1))
+    component.register_images(component.scene.mask([7]))
+    component.maintenance.refine_globally()
+    assert component.scene.registered[7]
+    changed = [i for i, was in enumerate(before) if maps[i].refinement is not was]
+    assert changed == [7]
 
 
 def _names(problem: MappingProblem, *images: int) -> list[str]:
