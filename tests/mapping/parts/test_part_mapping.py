@@ -97,10 +97,8 @@ def test_image_that_its_part_lost_is_registered_after_the_join(hall: HallProblem
 def test_depth_maps_of_parts_are_kept_unless_an_image_is_registered_again(
     hall: HallProblem, in_parts: MappingResult
 ) -> None:
-    run = mapper.Mapper(hall.problem, MapperOptions(), NullMappingEvents())
-    component = Component(
-        hall.problem, MapperOptions(), InitialPairSelector(OPTIONS), run.event_log
-    )
+    log = EventLog(hall.problem, NullMappingEvents())
+    component = Component(hall.problem, OPTIONS, InitialPairSelector(OPTIONS), log)
     assert component.initialize_from_model(in_parts.reconstructions[0], [])
     maps = component.scene.maps
     before = [depth_map.refinement for depth_map in maps]
