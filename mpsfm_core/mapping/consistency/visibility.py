@@ -168,13 +168,19 @@ def _measure_visibility(
                     total += min(depth, depths[k]) / max(depth, depths[k])
         if total >= needed:
             counts[image], sums[image] = count, total
-        if count >= min_count and total > best[0]:
-            rank = 0
-            while rank + 1 < num_best and best[rank + 1] < total:
-                best[rank] = best[rank + 1]
-                rank += 1
-            best[rank] = total
+        if count >= min_count:
+            _insert(best, total)
     return counts, sums
+
+
+@jit.helper()
+def _insert(best: Float64, value: float) -> None:
+    """Replace the smallest of ascending values by a larger value."""
+    rank = 0
+    while rank + 1 < len(best) and best[rank + 1] < value:
+        best[rank] = best[rank + 1]
+        rank += 1
+    best[rank] = max(best[rank], value)
 
 
 @jit.helper()
