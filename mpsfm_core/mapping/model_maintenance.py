@@ -34,6 +34,8 @@ class ModelState(NamedTuple):
     scene: Snapshot
     checked: Bool
     """(n,) bool mask of the images whose depth was compared with all other images."""
+    keeps_depth_map: Bool
+    """See :class:`Refiner`."""
     noise: DepthNoise
     loss_scale: float
     """Measured scale of the reprojection loss, in standard deviations of the keypoint position."""
@@ -78,13 +80,15 @@ class ModelMaintenance:
 
     def state(self) -> ModelState:
         """Return a copy of the model for :meth:`restore`."""
-        measured = self.refiner.noise, self.refiner.loss_scale
-        return ModelState(self.scene.snapshot(), self._checked.copy(), *measured)
+        refiner = self.refiner
+        masks = self._checked.copy(), refiner.keeps_depth_map.copy()
+        return ModelState(self.scene.snapshot(), *masks, refiner.noise, refiner.loss_scale)
 
     def restore(self, state: ModelState) -> None:
         """Roll back to an earlier model state and clear the history of later registrations."""
         self.scene.restore(state.scene)
         self._checked = state.checked.copy()
+        self.refiner.keeps_depth_map = state.keeps_depth_map.copy()
         self.refiner.noise, self.refiner.loss_scale = state.noise, state.loss_scale
         self.history.clear()
 

@@ -100,7 +100,7 @@ def test_depth_maps_of_parts_are_kept_unless_an_image_is_registered_again(
     log = EventLog(hall.problem, NullMappingEvents())
     component = Component(hall.problem, OPTIONS, InitialPairSelector(OPTIONS), log)
     assert component.initialize_from_model(in_parts.reconstructions[0], [])
-    maps = component.scene.maps
+    maps, state = component.scene.maps, component.maintenance.state()
     before = [depth_map.refinement for depth_map in maps]
     component.maintenance.deregister([7], ImageReason.MISREGISTERED.because(num_matches=1))
     component.register_images(component.scene.mask([7]))
@@ -108,6 +108,9 @@ def test_depth_maps_of_parts_are_kept_unless_an_image_is_registered_again(
     assert component.scene.registered[7]
     changed = [i for i, was in enumerate(before) if maps[i].refinement is not was]
     assert changed == [7]
+    component.maintenance.restore(state)
+    component.maintenance.refine_globally()
+    assert [depth_map.refinement for depth_map in maps] == before
 
 
 def _names(problem: MappingProblem, *images: int) -> list[str]:
