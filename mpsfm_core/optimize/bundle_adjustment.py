@@ -628,7 +628,7 @@ def count_enough_iterations(pairs: Int64, num_poses: int) -> int:
 
 
 def _factorize_symmetric(matrix: csc_array) -> SuperLU:
-    """Factorize a symmetric positive definite matrix with SuperLU, in minimum-degree order."""
+    """Factorize a symmetric positive definite matrix by SuperLU with minimum-degree ordering."""
     return splu(
         matrix,
         permc_spec="MMD_AT_PLUS_A",

@@ -8,7 +8,7 @@ import zipfile
 from collections.abc import Callable
 from functools import lru_cache, partial
 from pathlib import Path
-from typing import Any, BinaryIO, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ _COMPRESSION_LEVEL = 1
 maps of depth 13 % and maps of normals 24 % smaller, and takes ten times as long as writing."""
 
 _MAGIC = b"\x93NUMPY\x01\x00"
-"""First bytes of an NPY file of version 1.0, which numpy writes unless the header is large."""
+"""First bytes of an NPY file with format version 1.0."""
 
 
 def write_npz(path: Path, **arrays: NDArray[Any]) -> None:
@@ -54,12 +54,12 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         try:
             with zipfile.ZipFile(file) as archive:
                 size = sum(entry.file_size for entry in archive.infolist())
-            if size > max(MAX_BYTES, path.stat().st_size):
-                raise ValueError(
-                    f"the file unpacks to {size / 1e6:.0f} megabytes, but only "
-                    f"{MAX_BYTES / 1e6:.0f} are allowed"
-                )
-            return parse_arrays(partial(_read_arrays, file))
+                if size > max(MAX_BYTES, path.stat().st_size):
+                    raise ValueError(
+                        f"the file unpacks to {size / 1e6:.0f} megabytes, but only "
+                        f"{MAX_BYTES / 1e6:.0f} are allowed"
+                    )
+                return parse_arrays(partial(_read_arrays, archive))
         except (OSError, ValueError):
             raise
         except Exception as error:  # zipfile and numpy raise unrelated exception classes
@@ -78,16 +78,15 @@ def parse_arrays(read: Callable[[], Parsed]) -> Parsed:
         return read()
 
 
-def _read_arrays(file: BinaryIO) -> dict[str, NDArray[Any]]:
-    with zipfile.ZipFile(file) as archive:
-        return {
-            name.removesuffix(".npy"): _read_array(bytearray(archive.read(name)))
-            for name in archive.namelist()
-        }
+def _read_arrays(archive: zipfile.ZipFile) -> dict[str, NDArray[Any]]:
+    return {
+        name.removesuffix(".npy"): _read_array(bytearray(archive.read(name)))
+        for name in archive.namelist()
+    }
 
 
 def _read_array(data: bytearray) -> NDArray[Any]:
-    """Parse the content of an NPY file, of which the array keeps the memory."""
+    """Parse an NPY file without copying its values."""
     if data[:8] != _MAGIC:
         array: NDArray[Any] = np.lib.format.read_array(io.BytesIO(data), allow_pickle=False)
         return array

@@ -406,7 +406,7 @@ def test_long_chain_reaches_the_dense_optimum(plain: bool) -> None:
 
 @pytest.mark.parametrize("count", [2, 50, 1500])
 def test_count_of_operations_of_a_chain_is_exact(count: int) -> None:
-    """The Cholesky factor of a chain has two blocks in each column except the last."""
+    """If only successive poses share points, a column of the factor has at most two blocks."""
     chain = np.array([(i, j) for i in range(count) for j in (i, i + 1) if j < count])
     operations = 7 * (4 * (count - 1) + 1) / (3 * count - 2)
     assert count_enough_iterations(chain, count) == round(FACTORIZATION_COST * operations)

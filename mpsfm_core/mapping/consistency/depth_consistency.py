@@ -155,7 +155,7 @@ class DepthConsistencyCheck:
             Images to deregister, each with its largest violation ratio.
         """
         scene = self._scene
-        views = find_views_with_depth(scene)
+        views = _find_views_with_depth(scene)
         self._angles_deg = scene.track_angles_deg()
         measured: dict[tuple[int, int], float] = {}
         in_set = np.zeros((len(compared), scene.num_images), dtype=np.bool_)
@@ -306,7 +306,7 @@ def find_overlapping_images(scene: Scene, image: int, views: Views | None = None
         image: Registered image with the depth map.
         views: Registered images with depth to choose from, by default all.
     """
-    views = find_views_with_depth(scene) if views is None else views
+    views = _find_views_with_depth(scene) if views is None else views
     depth_map = scene.maps[image]
     rows, columns = depth_map.prior.shape
     tiles = pixel_centers(OVERLAP_GRID, OVERLAP_GRID).reshape(4, OVERLAP_GRID // 4, 4, -1, 2)
@@ -324,7 +324,7 @@ def find_overlapping_images(scene: Scene, image: int, views: Views | None = None
     return [int(other) for other in best[best != image][:NUM_COMPARED]]
 
 
-def find_views_with_depth(scene: Scene) -> Views:
+def _find_views_with_depth(scene: Scene) -> Views:
     """Return the registered images whose depth scale is known."""
     registered = scene.registered_images()
     is_active = [scene.maps[image].active for image in registered.tolist()]

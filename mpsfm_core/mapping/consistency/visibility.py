@@ -59,7 +59,7 @@ class Views(NamedTuple):
         intrinsics: Float64,
         sizes: Float64,
     ) -> Views:
-        """Return the views of the given cameras (see the attributes)."""
+        """Return the views of cameras, with arguments as the attributes of the same names."""
         centers = camera_center(rotations, translations)
         frusta = frustum_planes(rotations, translations, intrinsics, sizes)
         return cls(images, centers, rotations, translations, intrinsics, sizes, frusta)
@@ -185,9 +185,13 @@ def _insert(best: Float64, value: float) -> None:
 
 @jit.helper()
 def _bound_points(points: Float64, depths: Float64, ball: Float64) -> None:
-    """Write the bounds of points (p, 3) with depths (p,) to ``ball`` (6,), initially 0.
+    """Compute the bounding sphere and the range of depths of points.
 
-    The bounds are center and radius of a sphere, and the smallest and the largest depth.
+    Args:
+        points: (p, 3) points.
+        depths: (p,) depth of each point.
+        ball: (6,) zeros, which are overwritten by center and radius of the sphere, and by the
+            smallest and the largest depth.
     """
     for k in range(len(points)):
         for a in range(3):

@@ -170,8 +170,8 @@ class Refiner:
         adapts_reprojection_loss: Whether global refinement may widen the reprojection loss. While
             images are registered one by one, a narrow reprojection loss protects against wrong
             matches.
-        keeps_depth_map: (n,) bool mask of the images that global refinement keeps the depth map of,
-            because they have that of a joined part.
+        keeps_depth_map: (n,) bool mask of the images whose depth maps global refinement does not
+            change, because the mapper of a part has refined them.
         calibrates_with_long_tracks: Whether self-calibration estimates intrinsics from long tracks
             (see :func:`calibrate_cameras`).
     """

@@ -9,7 +9,7 @@ from mpsfm_core.data import Float64, Int64, MappingProblem, VerifiedPair
 MIN_SCORE = 0.05
 """Lower bound of match scores, because every match passed geometric verification. [ours]"""
 BLOCK_MATCHES = 2**18
-"""Number of matches of which temporary arrays are in memory at the same time. [ours]"""
+"""Number of matches that are processed together, so that temporary arrays stay small. [ours]"""
 
 
 class CorrespondenceGraph:

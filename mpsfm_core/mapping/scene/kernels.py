@@ -62,6 +62,7 @@ def project_to_keypoints(
         x, y, z = points[m]
         image = image_of[keypoints[m]]
         r, t = rotations[image], translations[image]
+        # products are summed in the order of numpy.einsum, which gives the same bits
         depth[m] = (r[2, 0] * x + r[2, 2] * z) + r[2, 1] * y + t[2]
         if depth[m] > 1e-9:
             fx, fy, cx, cy = intrinsics[image]

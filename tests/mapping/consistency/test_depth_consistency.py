@@ -64,7 +64,7 @@ def posed_scene(
 
 
 def test_near_images_are_compared_before_images_far_behind_walls() -> None:
-    """The image beside comes first, although 16 images 60 m behind see more of the pixels."""
+    """An image at 0.5 m is compared first, although 16 images at 60 m see more pixels."""
     far = [np.column_stack([np.eye(3), [0.1 * k, 0, 60.0]]) for k in range(16)]
     poses = [np.eye(3, 4), *far, np.column_stack([np.eye(3), [0.5, 0, 0]])]
     scene = posed_scene([np.full((30, 40), 4.0, np.float32)] * len(poses), poses, SMALL)

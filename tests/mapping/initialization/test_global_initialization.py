@@ -191,9 +191,9 @@ def test_average_differences_with_outlier_recovers_values() -> None:
 
 
 def test_average_differences_start_from_confirmed_edges() -> None:
-    """Right differences connect neighbors on a line, and wrong ones connect distant nodes.
+    """The differences between neighbors are correct, and those between distant nodes are wrong.
 
-    With equal first weights, the wrong differences shorten the line.
+    With equal first weights, the wrong differences make the line of nodes too short.
     """
     count, rng = 400, np.random.default_rng(0)
     near = np.array([(i, i + step) for step in (1, 2) for i in range(count - step)])

@@ -1,4 +1,4 @@
-"""Tests of the scene: projection, rollback of focal lengths and distortion, checkpoint state."""
+"""Tests of the scene: projection of points, rollback of intrinsics, and checkpoints."""
 
 from __future__ import annotations
 
