@@ -126,26 +126,19 @@ def _measure_visibility(
 
     An image is skipped as soon as its upper bound is below the smallest of the best sums so far.
     """
-    num_points = len(points)
-    num_groups = (num_points + POINT_GROUP - 1) // POINT_GROUP
-    bounds, balls, whole = np.zeros(num_groups), np.zeros((num_groups, 6)), np.zeros(6)
+    num_groups = (len(points) + POINT_GROUP - 1) // POINT_GROUP
+    bounds, balls = np.zeros(num_groups), np.zeros((num_groups + 1, 6))
     for group in range(num_groups):
         members = slice(group * POINT_GROUP, (group + 1) * POINT_GROUP)
         _bound_points(points[members], depths[members], balls[group])
-    _bound_points(points, depths, whole)
+    _bound_points(points, depths, balls[num_groups])
     counts, sums = np.zeros(len(rotations), np.int64), np.zeros(len(rotations))
     best = np.zeros(num_best)  # ascending
     for image in order:
-        planes, needed = frusta[image], best[0] * (1 - 1e-9)
-        if _is_outside(whole, planes) or num_points * _bound_ratio(whole, planes) < needed:
+        needed = best[0] * (1 - 1e-9)
+        bound = _bound_sum(balls, frusta, image, len(points), needed, bounds)
+        if bound < needed or bound == 0:
             continue
-        bound = float(num_points)
-        for group in range(num_groups):
-            size = min(POINT_GROUP, num_points - group * POINT_GROUP)
-            bounds[group] = size * _bound_ratio(balls[group], planes)
-            bound -= size - bounds[group]
-            if bound < needed:
-                break
         count, total = 0, 0.0
         r, t = rotations[image], translations[image]
         fx, fy, cx, cy = intrinsics[image]
@@ -154,10 +147,10 @@ def _measure_visibility(
             if bound + total < needed:
                 break
             bound -= bounds[group]
-            if _is_outside(balls[group], planes):
+            if bounds[group] == 0:
                 continue
-            for k in range(group * POINT_GROUP, min((group + 1) * POINT_GROUP, num_points)):
-                x, y, z = points[k]
+            for k in range(group * POINT_GROUP, min((group + 1) * POINT_GROUP, len(points))):
+                x, y, z = points[k, 0], points[k, 1], points[k, 2]
                 depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
                 if depth <= 1e-9:
                     continue
@@ -171,6 +164,42 @@ def _measure_visibility(
         if count >= min_count:
             _insert(best, total)
     return counts, sums
+
+
+@jit.helper()
+def _bound_sum(
+    balls: Float64, frusta: Float64, image: int, num_points: int, needed: float, bounds: Float64
+) -> float:
+    """Return an upper bound of the sum of depth ratios of all points that project into an image.
+
+    A bound below ``needed`` is not improved further.
+
+    Args:
+        balls: (g + 1, 6) bounds of each group of points and of all points, from
+            :func:`_bound_points`.
+        frusta: (n, 5, 4) planes of the frustum of each image.
+        image: Row of the image in ``frusta``.
+        num_points: Number of points.
+        needed: Sum of depth ratios that is needed.
+        bounds: (g,) upper bound of the sum of each group, which is overwritten.
+    """
+    bound: float = num_points * _bound_ratio(balls, len(bounds), frusta, image)
+    if bound < needed or _is_outside(balls, len(bounds), frusta, image):
+        return 0.0
+    bound = float(num_points)
+    for group in range(len(bounds)):
+        size = min(POINT_GROUP, num_points - group * POINT_GROUP)
+        bounds[group] = size * _bound_ratio(balls, group, frusta, image)
+        bound -= size - bounds[group]
+        if bound < needed:
+            return bound
+    for group in range(len(bounds)):
+        if _is_outside(balls, group, frusta, image):
+            bound -= bounds[group]
+            bounds[group] = 0.0
+            if bound < needed:
+                return bound
+    return bound
 
 
 @jit.helper()
@@ -206,30 +235,30 @@ def _bound_points(points: Float64, depths: Float64, ball: Float64) -> None:
 
 
 @jit.helper()
-def _is_outside(ball: Float64, planes: Float64) -> bool:
-    """Return True if a sphere is behind one of the planes (5, 4) of a frustum."""
-    x, y, z, radius = ball[:4]
+def _is_outside(balls: Float64, row: int, frusta: Float64, image: int) -> bool:
+    """Return True if a sphere is behind one of the planes of the frustum of an image."""
+    x, y, z, radius = balls[row, 0], balls[row, 1], balls[row, 2], balls[row, 3]
     for a in range(5):
-        nx, ny, nz, offset = planes[a]
-        if nx * x + ny * y + nz * z + offset < -radius:
+        height = frusta[image, a, 0] * x + frusta[image, a, 1] * y + frusta[image, a, 2] * z
+        if height + frusta[image, a, 3] < -radius:
             return True
     return False
 
 
 @jit.helper()
-def _bound_ratio(ball: Float64, planes: Float64) -> float:
+def _bound_ratio(balls: Float64, row: int, frusta: Float64, image: int) -> float:
     """Return an upper bound of the depth ratios of the points in a sphere.
 
-    Args:
-        ball: Bounds of the points, from :func:`_bound_points`.
-        planes: (5, 4) planes of the frustum, the first of which measures the depth in the image.
+    The first plane of the frustum measures the depth in the image. Arguments are arrays with rows,
+    because a view of a row takes longer than the computation.
     """
-    nx, ny, nz, offset = planes[0]
-    depth = nx * ball[0] + ny * ball[1] + nz * ball[2] + offset
-    nearest, farthest = depth - ball[3], depth + ball[3]
+    depth = frusta[image, 0, 0] * balls[row, 0] + frusta[image, 0, 1] * balls[row, 1]
+    depth += frusta[image, 0, 2] * balls[row, 2] + frusta[image, 0, 3]
+    nearest, farthest = depth - balls[row, 3], depth + balls[row, 3]
+    smallest, largest = balls[row, 4], balls[row, 5]
     bound = 1.0
-    if nearest > ball[5]:
-        bound = ball[5] / nearest
-    elif farthest < ball[4]:
-        bound = max(farthest, 0.0) / ball[4]
+    if nearest > largest:
+        bound = largest / nearest
+    elif farthest < smallest:
+        bound = max(farthest, 0.0) / smallest
     return bound

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
 from typing import Any, Protocol
@@ -12,7 +11,7 @@ import numpy as np
 
 from mpsfm_core.data import Bool, DepthPrior, Float32, Float64, Int64, MappingImage, PinholeCamera
 from mpsfm_core.geometry import sample_bilinear, sample_nearest, scale_pixels
-from mpsfm_core.optimize.depth_integration import NO_ANCHORS, Anchors, RefinedDepth
+from mpsfm_core.optimize.depth_integration import Anchors, RefinedDepth
 from mpsfm_core.optimize.subsampling import compute_subsampling_step, subsample, upsample
 from mpsfm_core.support.disk_arrays import current_store, store_fields
 
@@ -29,25 +28,6 @@ class RefinesDepth(Protocol):
 
     def refine(self, anchors: Anchors, *, scale: float, start: RefinedDepth | None) -> RefinedDepth:
         """Refine the depth map, see :meth:`DepthIntegrator.refine`."""
-
-
-@dataclass(frozen=True, eq=False)
-class StoredDepth:
-    """Refined depth map of an earlier reconstruction, from which a refinement starts."""
-
-    depth: DepthPrior
-    """Refined depth in world units, on the pixel grid of the depth prior."""
-    width: int
-    """Width to which depth maps are subsampled for refinement."""
-
-    def refine(self, anchors: Anchors, *, scale: float, start: RefinedDepth | None) -> RefinedDepth:
-        """Return the subsampled depth map; ``anchors`` and ``start`` have no effect."""
-        step = compute_subsampling_step(self.depth.shape[1], self.width)
-        values, valid = subsample(self.depth.depth, step), subsample(self.depth.valid, step)
-        known = values[valid].astype(np.float64)
-        log_depth = np.full(values.shape, np.log(np.median(known)) if len(known) else 0.0)
-        log_depth[valid] = np.log(known)
-        return RefinedDepth.from_log_depth(log_depth, valid, scale)
 
 
 class DepthRefinement:
@@ -103,7 +83,7 @@ class DepthRefinement:
         with self._lock:
             if self._inputs is not None:
                 integrator, anchors, previous = self._inputs
-                start = previous._result if previous else None
+                start = previous.result if previous else None
                 result = integrator.refine(anchors, scale=self.scale, start=start)
                 self._result = store_fields(result, self._store)
                 self._inputs = None
@@ -126,6 +106,35 @@ class DepthRefinement:
     def __reduce__(self) -> tuple[object, tuple[RefinedDepth]]:
         """Store only the result in a pickle."""
         return DepthRefinement.from_result, (self.result,)
+
+
+class ResumedRefinement(DepthRefinement):
+    """Refined depth map of an earlier reconstruction, from which later refinements start.
+
+    The map is subsampled whenever it is used, because that is cheaper than storing it again.
+
+    Args:
+        depth: Refined depth map, on the pixel grid of the depth prior.
+        factor: Factor from the unit of ``depth`` to world units.
+        scale: Scale of the depth prior.
+        width: Width to which depth maps are subsampled for refinement.
+    """
+
+    def __init__(self, depth: DepthPrior, factor: float, scale: float, width: int) -> None:
+        self.scale = scale
+        self._inputs, self._lock = None, Lock()
+        self._depth, self._factor, self._width = depth, np.float32(factor), width
+
+    @property
+    def result(self) -> RefinedDepth:
+        """The subsampled depth map."""
+        step = compute_subsampling_step(self._depth.shape[1], self._width)
+        values = subsample(self._depth.depth, step) * self._factor
+        valid = subsample(self._depth.valid, step)
+        known = values[valid].astype(np.float64)
+        log_depth = np.full(values.shape, np.log(np.median(known)) if len(known) else 0.0)
+        log_depth[valid] = np.log(known)
+        return RefinedDepth.from_log_depth(log_depth, valid, self.scale)
 
 
 class LazyDepth(DepthPrior):
@@ -162,6 +171,11 @@ class LazyDepth(DepthPrior):
         if lock is not None:
             with lock:
                 self._compute()
+
+    def without_scale(self) -> tuple[DepthPrior, float]:
+        """Return a depth map and its scale, of which neither is computed or stored by this call."""
+        prior, refinement, scale, _ = vars(self).get("_inputs", (self, None, 1.0, None))
+        return (prior, scale) if refinement is None else (self, 1.0)
 
     def _compute(self) -> None:
         """Scale depth to world units, with the relative variance of the prior."""
@@ -288,7 +302,8 @@ class DepthMap:
             scale: Scale of the depth prior.
             width: Width to which depth maps are subsampled for refinement.
         """
-        self.set_refinement(DepthRefinement(StoredDepth(depth, width), NO_ANCHORS, scale))
+        depth, factor = depth.without_scale() if isinstance(depth, LazyDepth) else (depth, 1.0)
+        self.set_refinement(ResumedRefinement(depth, factor, scale, width))
 
     def set_camera(self, camera: PinholeCamera) -> None:
         """Set the intrinsics of the depth map from a camera in pixels of the image."""
