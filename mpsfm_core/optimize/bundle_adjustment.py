@@ -31,6 +31,7 @@ from threadpoolctl import ThreadpoolController
 
 from mpsfm_core.data import Float64, Int64
 from mpsfm_core.data.camera_models import IntrinsicParameter
+from mpsfm_core.geometry import camera_center
 from mpsfm_core.optimize import bundle_kernels as kernels
 from mpsfm_core.optimize.bundle_problem import (
     BundleProblem,
@@ -39,6 +40,7 @@ from mpsfm_core.optimize.bundle_problem import (
     prepare_bundle,
     range_executor,
 )
+from mpsfm_core.optimize.coarse_correction import Clusters, CoarseSpace
 from mpsfm_core.optimize.options import BundleOptions
 from mpsfm_core.optimize.rig_basis import RigBasis, RigConstraint
 
@@ -242,6 +244,10 @@ class SchurComplementSolver:
         self.run = run
         self.dense = poses <= options.dense_poses
         self._factor: Callable[[Float64], Float64] | None = None
+        self._clusters: Clusters | None = None
+        if not self.dense and p.rig is None:
+            rotations, translations = self._variable_poses(p.state)
+            self._clusters = Clusters.of_cameras(camera_center(rotations, translations))
         self._enough_iterations = (
             MAX_CG_ITERATIONS
             if self.dense or p.rig is not None
@@ -258,6 +264,11 @@ class SchurComplementSolver:
         if rig is None:
             return None
         return RigBasis.build(rig, self.p.bundle.layout, self.p.rig_gauge, state.translations)
+
+    def _variable_poses(self, state: kernels.BundleParameters) -> tuple[Float64, Float64]:
+        """Return rotations (s, 3, 3) and translations (s, 3) of the variable poses."""
+        is_variable = self.p.bundle.layout.pose_slot >= 0
+        return state.rotations[is_variable], state.translations[is_variable]
 
     def accept_step(self, state: kernels.BundleParameters) -> None:
         """Update the rig to the accepted parameters ``state`` of the last step."""
@@ -284,6 +295,9 @@ class SchurComplementSolver:
             return cost
 
         cost = sum(self.run(reduce))
+        if self._clusters is not None:
+            poses = self._variable_poses(state)
+            self._coarse_space = CoarseSpace.build(self._clusters, *poses, self.p.held)
         self.total = self.parts[0]
         for part in self.parts[1:]:
             for array, summand in zip(self.total, part, strict=True):
@@ -547,7 +561,8 @@ class SchurComplementSolver:
     def _iterate(self, boost: Float64, rhs: Float64) -> tuple[Float64, bool]:
         """Solve the reduced camera system by preconditioned conjugate gradients.
 
-        The preconditioner is the last factorization, or else block Jacobi.
+        The preconditioner is the last factorization, or else block Jacobi, with a coarse correction
+        for images without rigs.
 
         Args:
             boost: (d,) Levenberg-Marquardt damping, which is added to the diagonal.
@@ -595,10 +610,12 @@ class SchurComplementSolver:
                 self._enough_iterations,
             )
         inverse = np.linalg.inv(diagonal)
+        correct = self._coarse_space.project(total.blocks, self.p.pairs, diagonal)
 
         def precondition(x: Float64) -> Float64:
-            first = np.einsum("nab,nb->na", inverse, x[:poses].reshape(-1, size))
-            return np.concatenate([first.ravel(), x[poses:] / corner])
+            of_poses = np.einsum("nab,nb->na", inverse, x[:poses].reshape(-1, size)).ravel()
+            of_poses += correct(x[:poses])
+            return np.concatenate([of_poses, x[poses:] / corner])
 
         return _conjugate_gradients(multiply, precondition, rhs, self._enough_iterations)
 
