@@ -61,6 +61,9 @@ CG_TOLERANCE = 1e-2
 minimum earlier. [tuned: benchmarks.scale]"""
 MAX_CG_ITERATIONS = 500
 """Maximum number of conjugate-gradient iterations per Levenberg-Marquardt step. [ours]"""
+MAX_FACTORIZATION_ITERATIONS = 2000
+"""Number of conjugate-gradient iterations whose time a sparse factorization may take at most.
+[tuned: benchmarks.scale]"""
 FACTORIZATION_COST = 0.4
 """Time of an arithmetic operation of a sparse factorization, relative to conjugate gradients.
 [tuned: benchmarks.scale]"""
@@ -245,14 +248,12 @@ class SchurComplementSolver:
         self.dense = poses <= options.dense_poses
         self._factor: Callable[[Float64], Float64] | None = None
         self._clusters: Clusters | None = None
+        self._enough_iterations, self._can_factorize = MAX_CG_ITERATIONS, False
         if not self.dense and p.rig is None:
-            rotations, translations = self._variable_poses(p.state)
-            self._clusters = Clusters.of_cameras(camera_center(rotations, translations))
-        self._enough_iterations = (
-            MAX_CG_ITERATIONS
-            if self.dense or p.rig is not None
-            else count_enough_iterations(p.pairs, poses)
-        )
+            self._clusters = Clusters.of_cameras(camera_center(*self._variable_poses(p.state)))
+            enough = count_enough_iterations(p.pairs, poses)
+            self._enough_iterations = min(enough, MAX_CG_ITERATIONS)
+            self._can_factorize = enough <= MAX_FACTORIZATION_ITERATIONS
         self.tolerance = options.function_tolerance
         self.rig, self.basis = p.rig, self._build_basis(p.rig, p.state)
         self._trial_rig = p.rig
@@ -485,10 +486,10 @@ class SchurComplementSolver:
         """Solve the reduced camera system by preconditioned conjugate gradients.
 
         Conjugate gradients with block-Jacobi preconditioner converge slowly for long chains of
-        images, as in a video or along streets. If conjugate gradients do not converge soon, this
-        system is factorized, unless a factorization takes too long
-        (:func:`count_enough_iterations`). The factorization is the preconditioner of later systems,
-        which differ less and less.
+        images, as in a video or along streets. If conjugate gradients do not converge in as many
+        iterations as take the time of a factorization (:func:`count_enough_iterations`), this
+        system is factorized, unless that takes longer than ``MAX_FACTORIZATION_ITERATIONS``. The
+        factorization is the preconditioner of later systems, which differ less and less.
 
         Args:
             boost: (d,) Levenberg-Marquardt damping, which is added to the diagonal.
@@ -497,11 +498,10 @@ class SchurComplementSolver:
         Returns:
             (e,) or (e, k) solutions, whose length is that of the parameters of the rig if any.
         """
-        can_factorize = self._enough_iterations < MAX_CG_ITERATIONS
         solutions = []
         for column in rhs.reshape(len(rhs), -1).T:
             solution, converged = self._iterate(boost, column)
-            if can_factorize and not converged:
+            if self._can_factorize and not converged:
                 self._factor = None  # frees the memory before the next factorization
                 self._factor = self._factorize(boost)
                 solution = self._factor(column)
@@ -632,7 +632,7 @@ def count_enough_iterations(pairs: Int64, num_poses: int) -> int:
         num_poses: Number of poses.
 
     Returns:
-        Number of iterations, at most ``MAX_CG_ITERATIONS``.
+        Number of iterations.
     """
     a, b = pairs[pairs[:, 0] != pairs[:, 1]].T
     nodes = np.arange(num_poses)
@@ -641,7 +641,7 @@ def count_enough_iterations(pairs: Int64, num_poses: int) -> int:
     factor = _factorize_symmetric(csc_array((entries, (rows, columns)), shape=(num_poses,) * 2))
     lengths = np.diff(factor.L.indptr).astype(np.float64)
     num_operations = int(kernels.NUM_IMAGE_PARAMS) * float(lengths @ lengths) / len(rows)
-    return min(round(FACTORIZATION_COST * num_operations), MAX_CG_ITERATIONS)
+    return round(FACTORIZATION_COST * num_operations)
 
 
 def _factorize_symmetric(matrix: csc_array) -> SuperLU:
