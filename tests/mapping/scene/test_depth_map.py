@@ -98,3 +98,23 @@ def test_depth_follows_scale_after_the_refinement_was_requested() -> None:
     assert np.allclose(depth_map.scaled_prior, 3.0 * depth_map.prior.depth)
     depth_map.reset()
     assert np.allclose(depth_map.depth, depth_map.prior.depth)
+
+
+def test_resumed_depth_of_a_scaled_map_is_that_of_the_computed_map() -> None:
+    """The scaled map is not stored, and a refinement starts from the resumed map."""
+    image = make_problem().images[0]
+    width = image.depth.shape[1]
+    resumed, expected = DepthMap(image), DepthMap(image)
+    scaled = LazyDepth(image.depth, None, 1.7, metric=False)
+    resumed.resume(scaled, 1.3, width)
+    assert np.allclose(resumed.depth, np.float32(1.7) * image.depth.depth, rtol=1e-5)
+    assert isinstance(scaled, LazyDepth)
+    scaled.compute()
+    expected.resume(scaled, 1.3, width)
+    assert np.array_equal(resumed.depth, expected.depth)
+    integrator = make_integrator(resumed)
+    refined = DepthRefinement(integrator, NO_ANCHORS, 1.3, resumed.refinement)
+    assert resumed.refinement is not None
+    start = resumed.refinement.result
+    expected_log = integrator.refine(NO_ANCHORS, scale=1.3, start=start).log_depth
+    assert np.array_equal(refined.result.log_depth, expected_log)
