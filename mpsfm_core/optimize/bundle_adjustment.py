@@ -297,8 +297,7 @@ class SchurComplementSolver:
 
         cost = sum(self.run(reduce))
         if self._clusters is not None:
-            poses = self._variable_poses(state)
-            self._coarse_space = CoarseSpace.build(self._clusters, *poses, self.p.held)
+            self._poses = self._variable_poses(state)
         self.total = self.parts[0]
         for part in self.parts[1:]:
             for array, summand in zip(self.total, part, strict=True):
@@ -610,7 +609,9 @@ class SchurComplementSolver:
                 self._enough_iterations,
             )
         inverse = np.linalg.inv(diagonal)
-        correct = self._coarse_space.project(total.blocks, self.p.pairs, diagonal)
+        assert self._clusters is not None  # images without rigs
+        space = CoarseSpace.build(self._clusters, *self._poses, self.p.held)
+        correct = space.project(total.blocks, self.p.pairs, diagonal)
 
         def precondition(x: Float64) -> Float64:
             of_poses = np.einsum("nab,nb->na", inverse, x[:poses].reshape(-1, size)).ravel()

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
+from scipy.sparse import bsr_array
 
 from mpsfm_core.data import Bool, Float64, Int64
 from mpsfm_core.geometry import camera_center
@@ -79,10 +80,9 @@ class CoarseSpace(NamedTuple):
         np.add.at(centroids, cluster_of, camera_center(rotations, translations))
         centroids /= np.bincount(cluster_of, minlength=num_clusters)[:, None]
         centroid = centroids[cluster_of]
-        crosses = np.cross(centroid[:, None], np.eye(3)).transpose(0, 2, 1)
         modes = np.zeros((len(rotations), NUM_IMAGE_PARAMS, NUM_IMAGE_PARAMS))
         modes[:, :3, :3] = modes[:, 3:6, 3:6] = -rotations
-        modes[:, 3:6, :3] = -rotations @ crosses
+        modes[:, 3:6, :3] = -np.cross(rotations, centroid[:, None])
         modes[:, 3:6, 6] = np.einsum("nab,nb->na", rotations, centroid) + translations
         modes[:, LOG_SCALE_IDX, 6] = 1.0
         modes[held] = 0.0
@@ -113,12 +113,15 @@ class CoarseSpace(NamedTuple):
         except LinAlgError:
             return np.zeros_like
 
+        starts = np.arange(len(cluster_of) + 1)
+        basis = bsr_array(
+            (self.modes, cluster_of, starts), shape=(NUM_IMAGE_PARAMS * len(cluster_of), size)
+        )
+        transposed = basis.T
+
         def correct(residual: Float64) -> Float64:
-            coarse = np.zeros(size)
-            _restrict(residual, self.modes, cluster_of, coarse)
-            coarse = cho_solve(factor, coarse, overwrite_b=True, check_finite=False)
-            correction = np.empty_like(residual)
-            _prolong(coarse, self.modes, cluster_of, correction)
+            coarse = cho_solve(factor, transposed @ residual, check_finite=False)
+            correction: Float64 = basis @ coarse
             return correction
 
         return correct
@@ -157,27 +160,3 @@ def _project_blocks(
                 out[row + a, column + b] += value
                 if is_pair:
                     out[column + b, row + a] += value
-
-
-@jit.kernel()
-def _restrict(residual: Float64, modes: Float64, cluster_of: Int64, out: Float64) -> None:
-    """Add the residual (7 s,) of each pose, multiplied by its transposed modes, to ``out``."""
-    size = modes.shape[-1]
-    for i in range(len(modes)):
-        row = size * cluster_of[i]
-        for a in range(size):
-            for b in range(size):
-                out[row + b] += modes[i, a, b] * residual[size * i + a]
-
-
-@jit.kernel()
-def _prolong(coarse: Float64, modes: Float64, cluster_of: Int64, out: Float64) -> None:
-    """Compute the steps (7 s,) of all poses for a step of each cluster."""
-    size = modes.shape[-1]
-    for i in range(len(modes)):
-        row = size * cluster_of[i]
-        for a in range(size):
-            value = 0.0
-            for b in range(size):
-                value += modes[i, a, b] * coarse[row + b]
-            out[size * i + a] = value

@@ -39,7 +39,7 @@ def build_space(count: int, held: np.ndarray | None = None) -> CoarseSpace:
 
 
 def expand(space: CoarseSpace) -> np.ndarray:
-    """Return the coarse space as a dense matrix (7 s, 7 c)."""
+    """Return the matrix (7 s, 7 c) from steps of c clusters to steps of s poses."""
     cluster_of, num_clusters = space.clusters
     matrix = np.zeros((len(cluster_of), 7, num_clusters, 7))
     matrix[np.arange(len(cluster_of)), :, cluster_of] = space.modes
@@ -48,7 +48,7 @@ def expand(space: CoarseSpace) -> np.ndarray:
 
 @pytest.mark.parametrize("mode", range(7))
 def test_modes_move_cameras_by_a_similarity_transform(mode: int) -> None:
-    """Points that move with their cameras keep their coordinates in each camera, up to scale."""
+    """If points move with the cameras, their camera coordinates change only by the scale."""
     rotations, translations = make_poses(4)
     space = build_space(4)
     assert space.clusters.num_clusters == 1

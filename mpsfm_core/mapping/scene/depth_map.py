@@ -173,7 +173,7 @@ class LazyDepth(DepthPrior):
                 self._compute()
 
     def without_scale(self) -> tuple[DepthPrior, float]:
-        """Return a depth map and its scale, of which neither is computed or stored by this call."""
+        """Return a depth map, and the factor that scales it to this one; nothing is computed."""
         prior, refinement, scale, _ = vars(self).get("_inputs", (self, None, 1.0, None))
         return (prior, scale) if refinement is None else (self, 1.0)
 
