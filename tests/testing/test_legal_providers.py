@@ -336,3 +336,30 @@ def test_legal_provider_passes_all_checks(
     results = run_checks(registry, kind, "legal", setup, only=only)
     assert {r.id: r.message for r in results if r.status == "fail"} == {}
     assert sum(r.status == "pass" for r in results) > len(results) / 2
+
+
+def test_threads_that_a_library_starts_once_are_no_leak() -> None:
+    stop = threading.Event()
+
+    class StartsPool(PaintedDepth):
+        """Slow depth provider whose second call in the check starts three threads."""
+
+        def predict(self, view: View) -> DepthPrior:
+            if view.name == "memory/1.png":
+                for _ in range(3):
+                    threading.Thread(target=stop.wait, daemon=True).start()
+            started = time.process_time()
+            while time.process_time() - started < 0.15:
+                pass
+            return super().predict(view)
+
+    registry = Registry()
+    registry.add(*builtin_providers(), ProviderSpec("depth", "legal", StartsPool))
+    setup = ContractSetup(truth_source="painted")
+    before = threading.active_count()
+    try:
+        (result,) = run_checks(registry, "depth", "legal", setup, only={"memory-released"})
+        assert threading.active_count() == before + 3
+    finally:
+        stop.set()
+    assert result.status == "pass", result.message
