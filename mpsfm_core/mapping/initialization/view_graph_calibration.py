@@ -13,8 +13,11 @@ the same way. Without distortion, relative poses of pairs with small overlap wou
 degrees, because such pairs match at the image borders.
 """
 
+# mypy: allow-untyped-decorators
+
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -30,8 +33,9 @@ from mpsfm_core.mapping.initialization.refined_focal_lengths import (
 )
 from mpsfm_core.mapping.refinement.self_calibration import PRINCIPAL_POINT_PRIOR_STD
 from mpsfm_core.mapping.registration.pose_hypotheses import sample_focal_lengths
+from mpsfm_core.support.jit import helper, kernel
 
-MAX_PAIRS, MAX_MATCHES = 30, 100
+MAX_PAIRS, MAX_MATCHES = 60, 100
 """Number of image pairs with the largest total displacement of matches, and approximate number of
 matches of each pair, that estimate a focal length; the run time is proportional to both.
 [tuned: benchmarks.walks]"""
@@ -362,30 +366,30 @@ def _refine_poses(
         The refined relative poses, and the cost (p,) of each pair.
     """
     damping = np.full(len(matches.std_px), 1e-3)
-    prior, is_free = matches.lens_stds**-2, np.ones((8, 1))
+    prior = matches.lens_stds**-2
     if division is not None:
         poses = poses.with_division(division)
-        prior[-1], is_free[-1] = 0.0, 0.0
+        prior[-1] = 0.0
     diagonal_prior = np.diag([0.0] * 5 + prior.tolist())
-    errors, jacobian = _linearize(poses, matches, focal_px)
-    jacobian *= is_free
-    cost = np.log1p(errors**2).sum(axis=1) + poses.lenses**2 @ prior
+
+    def linearize(poses: _RelativePoses) -> tuple[Float64, Float64, Float64]:
+        system = _linearize(poses, matches, focal_px, has_fixed_division=division is not None)
+        return system.cost + poses.lenses**2 @ prior, system.hessian, system.gradient
+
+    cost, hessian, gradient = linearize(poses)
     for _ in range(NUM_ITERATIONS):
-        weighted = jacobian / (1.0 + errors**2)[:, None]
-        hessian = weighted @ jacobian.transpose(0, 2, 1) + diagonal_prior
-        gradient = np.einsum("pkm,pm->pk", weighted, errors)
-        gradient[:, 5:] += prior * poses.lenses
-        diagonal = np.einsum("pii->pi", hessian) + 1e-9
-        hessian += (damping[:, None] * diagonal)[:, :, None] * np.eye(8)
-        moved = poses.moved(-np.linalg.solve(hessian, gradient[:, :, None])[:, :, 0])
-        moved_errors, moved_jacobian = _linearize(moved, matches, focal_px)
-        moved_jacobian *= is_free
-        moved_cost = np.log1p(moved_errors**2).sum(axis=1) + moved.lenses**2 @ prior
+        descent = gradient.copy()
+        descent[:, 5:] += prior * poses.lenses
+        damped = hessian + diagonal_prior
+        diagonal = np.einsum("pii->pi", damped) + 1e-9
+        damped += (damping[:, None] * diagonal)[:, :, None] * np.eye(8)
+        moved = poses.moved(-np.linalg.solve(damped, descent[:, :, None])[:, :, 0])
+        moved_cost, moved_hessian, moved_gradient = linearize(moved)
         decrease = cost - moved_cost
         is_better = decrease > 0
         poses = moved.where(is_better, poses)
-        errors = np.where(is_better[:, None], moved_errors, errors)
-        jacobian = np.where(is_better[:, None, None], moved_jacobian, jacobian)
+        hessian = np.where(is_better[:, None, None], moved_hessian, hessian)
+        gradient = np.where(is_better[:, None], moved_gradient, gradient)
         damping = np.where(is_better, damping / 5, damping * 10)
         cost = np.minimum(cost, moved_cost)
         if (np.abs(decrease) <= MIN_DECREASE * cost).all():
@@ -393,51 +397,150 @@ def _refine_poses(
     return poses, cost
 
 
+class _NormalEquations(NamedTuple):
+    """Cost and normal equations of the relative poses of p image pairs."""
+
+    cost: Float64
+    """(p,) Cauchy losses of the Sampson errors of all matches."""
+    hessian: Float64
+    """(p, 8, 8) approximate Hessian by rotation, translation direction and lens."""
+    gradient: Float64
+    """(p, 8) gradient."""
+
+
 def _linearize(
-    poses: _RelativePoses, matches: _Matches, focal_px: float
-) -> tuple[Float64, Float64]:
-    """Measure and differentiate the Sampson errors of all matches.
+    poses: _RelativePoses, matches: _Matches, focal_px: float, *, has_fixed_division: bool
+) -> _NormalEquations:
+    """Compute the normal equations of the Cauchy loss of the Sampson errors.
 
-    Returns:
-        Sampson errors (p, m) in standard deviations of the keypoints, and their derivatives (p, 8,
-        m) by rotation, translation direction and lens, with constant norms of the gradients.
+    Args:
+        poses: Relative poses.
+        matches: Matches of the pairs.
+        focal_px: Focal length in pixels.
+        has_fixed_division: Whether the coefficient of the division model is constant.
     """
-    rays_a, by_lens_a = _undistort(matches.offsets_a, poses.lenses, matches.radius, focal_px)
-    rays_b, by_lens_b = _undistort(matches.offsets_b, poses.lenses, matches.radius, focal_px)
-    rotated = rays_a @ poses.rotations.transpose(0, 2, 1)
+    count = len(matches.std_px)
+    system = _NormalEquations(np.zeros(count), np.zeros((count, 8, 8)), np.zeros((count, 8)))
     essential = _cross_matrices(poses.translations) @ poses.rotations
-    lines_b = rays_a @ essential.transpose(0, 2, 1)
-    lines_a = rays_b @ essential
-    norms = np.sqrt((lines_b[..., :2] ** 2).sum(axis=2) + (lines_a[..., :2] ** 2).sum(axis=2))
-    slopes = focal_px / matches.std_px / np.maximum(norms, 1e-12)
-    # ``x_b . (t x (w x q))`` is linear in the rotation vector w: ``w . (q x (x_b x t))``.
-    normals = np.cross(rays_b, poses.translations[:, None])
-    by_rotation = np.cross(rotated, normals).transpose(0, 2, 1)
-    by_translation = poses.tangents() @ np.cross(rotated, rays_b).transpose(0, 2, 1)
-    by_lens = np.einsum("pmi,pkmi->pkm", lines_a[..., :2], by_lens_a)
-    by_lens += np.einsum("pmi,pkmi->pkm", lines_b[..., :2], by_lens_b)
-    jacobian = np.concatenate([by_rotation, by_translation, by_lens], axis=1)
-    return slopes * (rays_b * lines_b).sum(axis=2), jacobian * slopes[:, None]
+    scale = 1.0 / matches.radius**2
+    _add_matches(*poses, poses.tangents(), essential, *matches[1:4], scale, focal_px, *system)
+    if has_fixed_division:
+        system.hessian[:, 7] = system.hessian[:, :, 7] = system.gradient[:, 7] = 0.0
+    return system
 
 
+@kernel()
+def _add_matches(
+    rotations: Float64,
+    translations: Float64,
+    lenses: Float64,
+    tangents: Float64,
+    essential: Float64,
+    offsets_a: Float64,
+    offsets_b: Float64,
+    std_px: Float64,
+    radius_factor: float,
+    focal_px: float,
+    cost: Float64,
+    hessian: Float64,
+    gradient: Float64,
+) -> None:
+    """Add the Sampson errors of all matches to the normal equations.
+
+    The derivatives regard the norms of the gradients of the epipolar constraint as constant.
+
+    Args:
+        rotations: (p, 3, 3) rotations ``cam_b_from_cam_a``.
+        translations: (p, 3) unit translations.
+        lenses: (p, 3) lenses, see :class:`_RelativePoses`.
+        tangents: (p, 2, 3) unit vectors that are orthogonal to the translations.
+        essential: (p, 3, 3) essential matrices.
+        offsets_a: (p, m, 2) keypoints of the first images.
+        offsets_b: (p, m, 2) keypoints of the second images.
+        std_px: (p, m) standard deviations of the keypoints, infinite for unused elements.
+        radius_factor: Factor from squared pixels to squared radii of the division model.
+        focal_px: Focal length in pixels.
+        cost: (p,) output.
+        hessian: (p, 8, 8) output.
+        gradient: (p, 8) output.
+    """
+    slopes = np.empty(8)
+    for pair in range(len(std_px)):
+        rotation, matrix, shift = rotations[pair], essential[pair], translations[pair]
+        for row in range(std_px.shape[1]):
+            if not np.isfinite(std_px[pair, row]):
+                continue
+            lens = lenses[pair, 0], lenses[pair, 1], lenses[pair, 2]
+            xy_a, xy_b = offsets_a[pair, row], offsets_b[pair, row]
+            xa, ya, scale_a, bend_a = _undistort(xy_a, lens, radius_factor, focal_px)
+            xb, yb, scale_b, bend_b = _undistort(xy_b, lens, radius_factor, focal_px)
+            ray_a, ray_b = (xa, ya, 1.0), (xb, yb, 1.0)
+            line_b = _multiply(matrix, ray_a)
+            line_a = _multiply(matrix.T, ray_b)
+            norm = math.sqrt(line_b[0] ** 2 + line_b[1] ** 2 + line_a[0] ** 2 + line_a[1] ** 2)
+            factor = focal_px / std_px[pair, row] / max(norm, 1e-12)
+            error = factor * (xb * line_b[0] + yb * line_b[1] + line_b[2])
+            # ``x_b . (t x (w x q))`` is linear in the rotation vector w: ``w . (q x (x_b x t))``.
+            rotated = _multiply(rotation, ray_a)
+            by_rotation = _cross(rotated, _cross(ray_b, (shift[0], shift[1], shift[2])))
+            by_translation = _cross(rotated, ray_b)
+            slopes[0], slopes[1], slopes[2] = by_rotation
+            for k in range(2):
+                axis = tangents[pair, k]
+                slopes[3 + k] = 0.0
+                for i in range(3):
+                    slopes[3 + k] += axis[i] * by_translation[i]
+                slopes[5 + k] = -(line_a[k] * scale_a + line_b[k] * scale_b)
+            slopes[7] = -bend_a * (line_a[0] * xa + line_a[1] * ya)
+            slopes[7] -= bend_b * (line_b[0] * xb + line_b[1] * yb)
+            weight = 1.0 / (1.0 + error**2)
+            cost[pair] += math.log1p(error**2)
+            for i in range(8):
+                gradient[pair, i] += weight * factor * slopes[i] * error
+                for j in range(8):
+                    hessian[pair, i, j] += weight * factor**2 * slopes[i] * slopes[j]
+
+
+@helper()
 def _undistort(
-    offsets: Float64, lenses: Float64, radius_px: float, focal_px: float
-) -> tuple[Float64, Float64]:
-    """Undistort offsets from the image center by the division model.
+    offset: Float64, lens: tuple[float, float, float], radius_factor: float, focal_px: float
+) -> tuple[float, float, float, float]:
+    """Undistort an offset from the image center by the division model.
 
     The undistorted offset is ``d / (1 + c r^2)`` with the distorted offset d from the principal
-    point, its length r in units of ``radius_px``, and the coefficient c (Fitzgibbon, CVPR 2001).
+    point, its length r in radii, and the coefficient c (Fitzgibbon, CVPR 2001).
 
     Returns:
-        Rays (p, m, 3) with z = 1, and the derivatives (p, 3, m, 2) of their x and y by the lens.
+        x and y of the ray with z = 1, and minus their derivatives by the principal point (equal for
+        x and y) and by the coefficient (relative to x and y).
     """
-    shifted = offsets - lenses[:, None, :2]
-    squared = (shifted**2).sum(axis=2, keepdims=True) / radius_px**2
-    divisor = np.maximum(1.0 + lenses[:, None, 2:] * squared, MIN_DIVISOR)
-    rays = np.concatenate([shifted / divisor / focal_px, np.ones_like(squared)], axis=2)
-    by_center = -np.eye(2)[None, :, None] / (divisor * focal_px)[:, None]
-    by_coefficient = -rays[:, None, :, :2] * (squared / divisor)[:, None]
-    return rays, np.concatenate([by_center, by_coefficient], axis=1)
+    x, y = offset[0] - lens[0], offset[1] - lens[1]
+    squared = (x**2 + y**2) * radius_factor
+    divisor = max(1.0 + lens[2] * squared, MIN_DIVISOR)
+    scale = 1.0 / (divisor * focal_px)
+    return x * scale, y * scale, scale, squared / divisor
+
+
+@helper()
+def _multiply(matrix: Float64, v: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Multiply a matrix (3, 3) with a vector."""
+    return (
+        matrix[0, 0] * v[0] + matrix[0, 1] * v[1] + matrix[0, 2] * v[2],
+        matrix[1, 0] * v[0] + matrix[1, 1] * v[1] + matrix[1, 2] * v[2],
+        matrix[2, 0] * v[0] + matrix[2, 1] * v[1] + matrix[2, 2] * v[2],
+    )
+
+
+@helper()
+def _cross(
+    a: tuple[float, float, float], b: tuple[float, float, float]
+) -> tuple[float, float, float]:
+    """Return the cross product of two vectors."""
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
 
 
 def _exclude_images(by_pair: Float64, images: Int64) -> float:
