@@ -385,12 +385,27 @@ class Scene:
             if refined_map_width is not None:
                 self.maps[image.index].resume(image.depth, image.scale, refined_map_width)
             self.tracks.point_of[self.graph.keypoints_of(image.index)] = image.point_ids
-            self.set_shared_intrinsics(image.index, image.camera.params, image.distortion)
             for parameter, calibrated in image.calibration.items():
                 if calibrated.is_refined:
                     self.estimated_intrinsics.set(
                         self.shares_camera(image.index), parameter, calibrated.estimate
                     )
+        self._resume_intrinsics(reconstruction)
+
+    def _resume_intrinsics(self, reconstruction: Reconstruction) -> None:
+        """Set the intrinsics of all images whose camera took an image of a reconstruction.
+
+        The images of a reconstruction keep their own intrinsics, which may differ if the mapper
+        split a camera, or if the mapper of each part refined the camera.
+        """
+        by_camera = {int(self.camera_of[image.index]): image for image in reconstruction.images}
+        for image in by_camera.values():
+            self.set_shared_intrinsics(image.index, image.camera.params, image.distortion)
+        for image in reconstruction.images:
+            own = image.camera.params, image.distortion
+            current = self.intrinsics[image.index], self.distortion[image.index]
+            if any((a != b).any() for a, b in zip(own, current, strict=True)):
+                self.set_intrinsics(image.index, *own)
 
     def _distort_keypoints(self) -> None:
         """Distort the keypoints by the distortion that was removed from them."""

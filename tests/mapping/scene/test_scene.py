@@ -10,6 +10,7 @@ import pytest
 from mpsfm_core.data import Float64
 from mpsfm_core.data.camera_models import IntrinsicParameter
 from mpsfm_core.geometry import project
+from mpsfm_core.mapping.scene.conversion import convert_scene
 from mpsfm_core.mapping.scene.estimated_intrinsics import (
     CalibrationOutcome,
     IntrinsicEstimate,
@@ -43,6 +44,21 @@ def test_restore_undoes_focal_lengths_and_outcomes() -> None:
         outcome, value, std = scene.estimated_intrinsics.get(4, parameter)
         assert outcome == CalibrationOutcome.NOT_ESTIMATED
         assert np.isnan([value, std]).all()
+
+
+def test_resumed_images_keep_their_own_focal_lengths() -> None:
+    """A mapper run may split a shared camera, if photos have different zooms."""
+    problem = guess_focals(make_room(), [1.1] * 5)
+    scene, resumed = Scene(problem), Scene(problem)
+    for image, focal_px in enumerate((400.0, 400.0, 600.0, 400.0)):
+        scene.register(image, np.eye(3), np.array([0.1 * image, 0.0, 0.0]))
+        scene.maps[image].set_scale(1.0)
+        scene.set_intrinsics(image, with_focal(focal_px), 1e-4 * focal_px * FIRST)
+    resumed.resume(convert_scene(scene))
+    np.testing.assert_array_equal(resumed.intrinsics[:, 0], [400.0, 400.0, 600.0, 400.0, 400.0])
+    np.testing.assert_allclose(resumed.distortion[:, 0], [0.04, 0.04, 0.06, 0.04, 0.04])
+    of_registered = scene.registered[scene.graph.image_of]
+    np.testing.assert_array_equal(resumed.keypoints[of_registered], scene.keypoints[of_registered])
 
 
 @pytest.mark.parametrize("radial", [0.0, 0.05])
