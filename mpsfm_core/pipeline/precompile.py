@@ -25,6 +25,7 @@ from mpsfm_core.dense.fusion import fuse_depth_maps
 from mpsfm_core.dense.options import DenseOptions
 from mpsfm_core.geometry.patch_alignment import align_patches
 from mpsfm_core.mapping import mapper
+from mpsfm_core.mapping.initialization.view_graph_calibration import estimate_shared_lens
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.optimize.bundle_kernels import update_points
@@ -102,6 +103,7 @@ def compile_kernels(first: str) -> None:
         height, width = depth.shape
         DepthIntegrator(depth, normals, _CAMERA.resized(width, height)).refine()
         _compile_dense(_known_reconstruction(problem, poses), views)
+        estimate_shared_lens(problem, problem.pairs)
     for is_global in (True, False):
         options = MapperOptions(global_initialization=is_global)
         mapping = mapper.reconstruct(problem, options)

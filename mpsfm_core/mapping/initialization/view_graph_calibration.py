@@ -366,67 +366,68 @@ def _refine_poses(
         The refined relative poses, and the cost (p,) of each pair.
     """
     damping = np.full(len(matches.std_px), 1e-3)
-    prior = matches.lens_stds**-2
+    precisions = matches.lens_stds**-2
     if division is not None:
         poses = poses.with_division(division)
-        prior[-1] = 0.0
-    diagonal_prior = np.diag([0.0] * 5 + prior.tolist())
-
-    def linearize(poses: _RelativePoses) -> tuple[Float64, Float64, Float64]:
-        system = _linearize(poses, matches, focal_px, has_fixed_division=division is not None)
-        return system.cost + poses.lenses**2 @ prior, system.hessian, system.gradient
-
-    cost, hessian, gradient = linearize(poses)
+        precisions[-1] = 0.0
+    system = _linearize(poses, matches, focal_px, precisions)
     for _ in range(NUM_ITERATIONS):
-        descent = gradient.copy()
-        descent[:, 5:] += prior * poses.lenses
-        damped = hessian + diagonal_prior
-        diagonal = np.einsum("pii->pi", damped) + 1e-9
-        damped += (damping[:, None] * diagonal)[:, :, None] * np.eye(8)
-        moved = poses.moved(-np.linalg.solve(damped, descent[:, :, None])[:, :, 0])
-        moved_cost, moved_hessian, moved_gradient = linearize(moved)
-        decrease = cost - moved_cost
+        diagonal = damping[:, None] * (np.einsum("pii->pi", system.hessian) + 1e-9)
+        damped = system.hessian + diagonal[:, :, None] * np.eye(8)
+        moved = poses.moved(-np.linalg.solve(damped, system.gradient[:, :, None])[:, :, 0])
+        moved_system = _linearize(moved, matches, focal_px, precisions)
+        decrease = system.cost - moved_system.cost
         is_better = decrease > 0
-        poses = moved.where(is_better, poses)
-        hessian = np.where(is_better[:, None, None], moved_hessian, hessian)
-        gradient = np.where(is_better[:, None], moved_gradient, gradient)
+        poses, system = moved.where(is_better, poses), moved_system.where(is_better, system)
         damping = np.where(is_better, damping / 5, damping * 10)
-        cost = np.minimum(cost, moved_cost)
-        if (np.abs(decrease) <= MIN_DECREASE * cost).all():
+        if (np.abs(decrease) <= MIN_DECREASE * system.cost).all():
             break
-    return poses, cost
+    return poses, system.cost
 
 
 class _NormalEquations(NamedTuple):
     """Cost and normal equations of the relative poses of p image pairs."""
 
     cost: Float64
-    """(p,) Cauchy losses of the Sampson errors of all matches."""
+    """(p,) Cauchy losses of the Sampson errors of all matches, and cost of the lens prior."""
     hessian: Float64
     """(p, 8, 8) approximate Hessian by rotation, translation direction and lens."""
     gradient: Float64
     """(p, 8) gradient."""
 
+    def where(self, mask: Bool, other: _NormalEquations) -> _NormalEquations:
+        """Return the equations of the pairs in the mask (p,), and those of ``other`` elsewhere."""
+        return _NormalEquations(
+            np.where(mask, self.cost, other.cost),
+            np.where(mask[:, None, None], self.hessian, other.hessian),
+            np.where(mask[:, None], self.gradient, other.gradient),
+        )
+
 
 def _linearize(
-    poses: _RelativePoses, matches: _Matches, focal_px: float, *, has_fixed_division: bool
+    poses: _RelativePoses, matches: _Matches, focal_px: float, precisions: Float64
 ) -> _NormalEquations:
-    """Compute the normal equations of the Cauchy loss of the Sampson errors.
+    """Compute the normal equations of the Sampson errors and of the prior on the lens.
 
     Args:
         poses: Relative poses.
         matches: Matches of the pairs.
         focal_px: Focal length in pixels.
-        has_fixed_division: Whether the coefficient of the division model is constant.
+        precisions: (3,) inverse variances of the prior on the lens, 0 if the coefficient of the
+            division model is constant.
     """
     count = len(matches.std_px)
     system = _NormalEquations(np.zeros(count), np.zeros((count, 8, 8)), np.zeros((count, 8)))
     essential = _cross_matrices(poses.translations) @ poses.rotations
     scale = 1.0 / matches.radius**2
-    _add_matches(*poses, poses.tangents(), essential, *matches[1:4], scale, focal_px, *system)
-    if has_fixed_division:
+    observed = matches.offsets_a, matches.offsets_b, matches.std_px
+    _add_matches(*poses, poses.tangents(), essential, *observed, scale, focal_px, *system)
+    if precisions[-1] == 0.0:
         system.hessian[:, 7] = system.hessian[:, :, 7] = system.gradient[:, 7] = 0.0
-    return system
+    lens = np.arange(5, 8)
+    system.hessian[:, lens, lens] += precisions
+    system.gradient[:, lens] += precisions * poses.lenses
+    return system._replace(cost=system.cost + poses.lenses**2 @ precisions)
 
 
 @kernel()
