@@ -97,7 +97,7 @@ def find_deviating_focals(
         cost = _measure_cost(camera, shared[:2], xy, xyz, max_error_px) if shared else 1.0
         if cost < MIN_COST:
             return None
-        # A pose that is accepted below has more inliers, so RANSAC needs fewer trials to find it.
+        # RANSAC may assume this share of inliers: a pose with fewer inliers is rejected below.
         min_inlier_ratio = max(options.min_inlier_ratio, 1.0 - MAX_COST_RATIO * cost)
         strict = options.model_copy(update={"min_inlier_ratio": min_inlier_ratio})
         own = estimate_pose_with_focal(camera, xy, xyz, strict, seed)

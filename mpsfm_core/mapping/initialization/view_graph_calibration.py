@@ -386,7 +386,7 @@ def _refine_poses(
 
 
 class _NormalEquations(NamedTuple):
-    """Cost and normal equations of the relative poses of p image pairs."""
+    """Cost of p image pairs, and the Gauss-Newton system of the relative pose of each pair."""
 
     cost: Float64
     """(p,) Cauchy losses of the Sampson errors of all matches, and cost of the lens prior."""
@@ -396,7 +396,7 @@ class _NormalEquations(NamedTuple):
     """(p, 8) gradient."""
 
     def where(self, mask: Bool, other: _NormalEquations) -> _NormalEquations:
-        """Return the equations of the pairs in the mask (p,), and those of ``other`` elsewhere."""
+        """Take the pairs in the mask (p,) from these systems, and all others from ``other``."""
         return _NormalEquations(
             np.where(mask, self.cost, other.cost),
             np.where(mask[:, None, None], self.hessian, other.hessian),
@@ -407,7 +407,7 @@ class _NormalEquations(NamedTuple):
 def _linearize(
     poses: _RelativePoses, matches: _Matches, focal_px: float, precisions: Float64
 ) -> _NormalEquations:
-    """Compute the normal equations of the Sampson errors and of the prior on the lens.
+    """Compute cost, gradient and Hessian of the Sampson errors and of the prior on the lens.
 
     Args:
         poses: Relative poses.
@@ -481,7 +481,7 @@ def _add_matches(
             norm = math.sqrt(line_b[0] ** 2 + line_b[1] ** 2 + line_a[0] ** 2 + line_a[1] ** 2)
             factor = focal_px / std_px[pair, row] / max(norm, 1e-12)
             error = factor * (xb * line_b[0] + yb * line_b[1] + line_b[2])
-            # ``x_b . (t x (w x q))`` is linear in the rotation vector w: ``w . (q x (x_b x t))``.
+            # A rotation vector w changes the constraint by ``ray_b . (shift x (w x rotated))``.
             rotated = _multiply(rotation, ray_a)
             by_rotation = _cross(rotated, _cross(ray_b, (shift[0], shift[1], shift[2])))
             by_translation = _cross(rotated, ray_b)
@@ -524,7 +524,7 @@ def _undistort(
 
 @helper()
 def _multiply(matrix: Float64, v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Multiply a matrix (3, 3) with a vector."""
+    """Return the product of a matrix (3, 3) and a vector of length 3."""
     return (
         matrix[0, 0] * v[0] + matrix[0, 1] * v[1] + matrix[0, 2] * v[2],
         matrix[1, 0] * v[0] + matrix[1, 1] * v[1] + matrix[1, 2] * v[2],

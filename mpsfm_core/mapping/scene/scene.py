@@ -238,11 +238,18 @@ class Scene:
             intrinsics: (4,) camera parameters fx, fy, cx, cy in pixels.
             distortion: (4,) distortion coefficients.
         """
+        shared = self.shares_camera(image)[:, None]
+        self._change_intrinsics(
+            np.where(shared, intrinsics, self.intrinsics),
+            np.where(shared, distortion, self.distortion),
+        )
+
+    def _change_intrinsics(self, intrinsics: Float64, distortion: Float64) -> None:
+        """Set the intrinsics and distortion (n, 4) of all images in which they differ."""
         changed = (self.intrinsics != intrinsics).any(axis=1)
         changed |= (self.distortion != distortion).any(axis=1)
-        intrinsics, distortion = intrinsics.copy(), distortion.copy()
-        for other in np.flatnonzero(self.shares_camera(image) & changed):
-            self.set_intrinsics(int(other), intrinsics, distortion)
+        for image in map(int, np.flatnonzero(changed)):
+            self.set_intrinsics(image, intrinsics[image], distortion[image])
 
     def shares_camera(self, image: int) -> Bool:
         """Return a bool mask (n,) of the images that share the camera of an image."""
@@ -393,19 +400,19 @@ class Scene:
         self._resume_intrinsics(reconstruction)
 
     def _resume_intrinsics(self, reconstruction: Reconstruction) -> None:
-        """Set the intrinsics of all images whose camera took an image of a reconstruction.
+        """Set the intrinsics of the images of a reconstruction, and of images that share a camera.
 
-        The images of a reconstruction keep their own intrinsics, which may differ if the mapper
-        split a camera, or if the mapper of each part refined the camera.
+        Images of one camera have different intrinsics in the reconstruction if the mapper split
+        the camera, or if each part of the images has its own estimate.
         """
         by_camera = {int(self.camera_of[image.index]): image for image in reconstruction.images}
         for image in by_camera.values():
             self.set_shared_intrinsics(image.index, image.camera.params, image.distortion)
+        intrinsics, distortion = self.intrinsics.copy(), self.distortion.copy()
         for image in reconstruction.images:
-            own = image.camera.params, image.distortion
-            current = self.intrinsics[image.index], self.distortion[image.index]
-            if any((a != b).any() for a, b in zip(own, current, strict=True)):
-                self.set_intrinsics(image.index, *own)
+            intrinsics[image.index] = image.camera.params
+            distortion[image.index] = image.distortion
+        self._change_intrinsics(intrinsics, distortion)
 
     def _distort_keypoints(self) -> None:
         """Distort the keypoints by the distortion that was removed from them."""
@@ -439,12 +446,7 @@ class Scene:
         self.translations = snapshot.translations.copy()
         self.registered = snapshot.registered.copy()
         self.rigs.load_state_dict(snapshot.rigs)
-        changed = (self.intrinsics != snapshot.intrinsics).any(axis=1)
-        changed |= (self.distortion != snapshot.distortion).any(axis=1)
-        for image in np.flatnonzero(changed):
-            self.set_intrinsics(
-                int(image), snapshot.intrinsics[image], snapshot.distortion[image].copy()
-            )
+        self._change_intrinsics(snapshot.intrinsics, snapshot.distortion)
         self.estimated_intrinsics.load_state_dict(snapshot.estimated_intrinsics)
         self.tracks.xyz = snapshot.xyz.copy()
         self.tracks.point_of = snapshot.point_of.copy()

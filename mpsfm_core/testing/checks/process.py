@@ -127,7 +127,7 @@ def check_memory_released(case: ContractCase) -> str:
     finally:
         tracemalloc.stop()
         gc.unfreeze()
-    # A library may allocate memory or start its threads once, in any call; leaks are in both.
+    # A library may allocate memory or start its threads once. A leak occurs in both halves.
     count, retained = sum(counts), min(sizes)
     if retained > _MAX_RETAINED_BYTES:
         raise CheckFailed(f"the provider retains {retained / 1000:.0f} kB per view")
