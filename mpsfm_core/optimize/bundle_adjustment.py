@@ -48,6 +48,9 @@ __all__ = ["BundleProblem", "BundleResult", "adjust_bundle"]
 
 INITIAL_DAMPING = 1e-4
 """Levenberg-Marquardt damping of the first step. [Ceres 1 / initial_trust_region_radius]"""
+INITIAL_DAMPING_MANY_POSES = 1e-6
+"""Levenberg-Marquardt damping of the first step with more than ``BundleOptions.dense_poses`` poses,
+where damping slows down the correction of drift. [tuned: benchmarks.scale]"""
 MIN_DAMPING = 1e-10
 """Minimum Levenberg-Marquardt damping, which keeps unobserved parameters constant. [ours]"""
 MAX_DAMPING = 1e16
@@ -165,7 +168,8 @@ def _minimize(p: PreparedBundle, options: BundleOptions, run: RangeExecutor) -> 
     """Minimize the cost by Levenberg-Marquardt with Nielsen's damping schedule, as Ceres does."""
     state, trial = p.state, kernels.BundleParameters(*(np.empty_like(array) for array in p.state))
     normal = SchurComplementSolver(p, options, run)
-    damping, growth, relaxation = INITIAL_DAMPING, 2.0, 1.0
+    damping = INITIAL_DAMPING if normal.dense else INITIAL_DAMPING_MANY_POSES
+    growth, relaxation = 2.0, 1.0
     initial_cost = np.inf
     converged, message = False, "iteration limit reached"
     for iteration in range(1, options.max_iterations + 1):
