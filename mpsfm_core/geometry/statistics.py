@@ -33,7 +33,9 @@ def group_medians(values: Float64, groups: Int64, count: int) -> Float64:
     Returns:
         (count,) medians of the groups, NaN for empty groups.
     """
-    order = np.lexsort((values, groups))
+    ranks = np.empty(len(values), dtype=np.int64)
+    ranks[np.argsort(values)] = np.arange(len(values))
+    order = np.argsort(groups * len(values) + ranks)  # faster than a sort by two keys
     sizes = np.bincount(groups, minlength=count)
     first = np.cumsum(sizes) - sizes
     medians = np.full(count, np.nan)

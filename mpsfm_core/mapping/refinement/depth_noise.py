@@ -252,9 +252,12 @@ def _measure_residuals(
         is_active: (n,) bool mask of the images with depth of known scale.
     """
     graph, tracks = scene.graph, scene.tracks
+    edges = edges[graph.source[edges] < graph.target[edges]]
     source, target = graph.source[edges], graph.target[edges]
     point = tracks.point_of[source]
-    is_used = (point >= 0) & (point == tracks.point_of[target]) & (source < target)
+    is_used = (point >= 0) & (point == tracks.point_of[target])
+    source, target = source[is_used], target[is_used]
+    is_used = np.ones(len(source), dtype=np.bool_)
     for keypoints in (source, target):
         is_known = scene.keypoint_valid[keypoints] & is_active[graph.image_of[keypoints]]
         is_used &= is_known & (scene.keypoint_prior[keypoints] > 0)
@@ -266,9 +269,10 @@ def _measure_residuals(
     )
     camera_points = scene.rays(source) * prior_a[:, None]
     world = np.einsum("nji,nj->ni", scene.rotations[a], camera_points - scene.translations[a])
-    projected = np.einsum("nj,nj->n", scene.rotations[b, 2], world) + scene.translations[b, 2]
-    centers = camera_center(scene.rotations[a], scene.translations[a])
-    origin = np.einsum("nj,nj->n", scene.rotations[b, 2], centers) + scene.translations[b, 2]
+    axes, offsets = scene.rotations[b, 2], scene.translations[b, 2]
+    projected = np.einsum("nj,nj->n", axes, world) + offsets
+    centers = camera_center(scene.rotations, scene.translations)[a]
+    origin = np.einsum("nj,nj->n", axes, centers) + offsets
     gain = (projected - origin) / np.maximum(projected, 1e-9)
     variance = (gain * scene.keypoint_log_std[source]) ** 2 + scene.keypoint_log_std[target] ** 2
     residuals = np.log(np.maximum(projected, 1e-9) / prior_b) / np.sqrt(np.maximum(variance, 1e-12))
