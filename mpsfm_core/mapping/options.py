@@ -137,7 +137,7 @@ class MappingOptions(Options):
     depth is metric."""
     parts: Annotated[int, Field(ge=20)] | Literal["auto"] | None = "auto"
     """Number of images per part, to map more images in overlapping parts that are joined. Parts run
-    on the workers of ``runtime.executor``. ``auto`` maps more than 2000 images in parts of 500, if
+    on the workers of ``runtime.executor``. ``auto`` maps more than 2000 images in parts of 1000, if
     an executor with workers is set. null maps all images in one piece, as images with known poses
     that are no guesses. [tuned: benchmarks.scale]"""
     min_model_size: int = Field(2, ge=2)

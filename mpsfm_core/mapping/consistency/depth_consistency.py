@@ -47,9 +47,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from mpsfm_core.data import Bool, Float32, Float64, Int64, PinholeCamera
-from mpsfm_core.geometry import pixel_centers, unproject
+from mpsfm_core.geometry import camera_center, pixel_centers, unproject
 from mpsfm_core.mapping.consistency.visibility import Views
 from mpsfm_core.mapping.options import ConsistencyOptions
 from mpsfm_core.mapping.refinement.depth_noise import (
@@ -78,6 +79,9 @@ OVERLAP_GRID = 16
 """Columns and rows of the pixel grid that measures the overlap of two images. [ours]"""
 NUM_COMPARED = 16
 """Number of most overlapping images whose depth is compared with that of an image. [ours]"""
+NUM_SURROUNDING = 64
+"""Number of nearest images that surround an image. If their depth was compared with that of the
+image, farther images are not searched. [ours]"""
 MIN_OVERLAP_RATIO = 0.05
 """Minimum share of grid pixels that project into another image for a comparison of both images.
 [ours]"""
@@ -161,7 +165,7 @@ class DepthConsistencyCheck:
         in_set = np.zeros((len(compared), scene.num_images), dtype=np.bool_)
         for members, is_member in zip(compared, in_set, strict=True):
             is_member[members] = True
-        for image in map(int, images):
+        for image in map(int, _select_near_other_sets(scene, np.asarray(images), views, in_set)):
             for other in find_overlapping_images(scene, image, views):
                 pair = min(image, other), max(image, other)
                 if pair not in measured and not (in_set[:, image] & in_set[:, other]).any():
@@ -322,6 +326,28 @@ def find_overlapping_images(scene: Scene, image: int, views: Views | None = None
         min_count=math.ceil(MIN_OVERLAP_RATIO * OVERLAP_GRID**2),
     )
     return [int(other) for other in best[best != image][:NUM_COMPARED]]
+
+
+def _select_near_other_sets(scene: Scene, images: Int64, views: Views, in_set: Bool) -> Int64:
+    """Select the images near images with which they share no set.
+
+    The images that overlap most with an image are mostly among the ``NUM_SURROUNDING`` nearest.
+
+    Args:
+        scene: The scene.
+        images: (m,) registered images.
+        views: Registered images with depth.
+        in_set: (s, n) bool membership of the images of the scene in each set. Without sets, all
+            images are selected.
+    """
+    if not len(in_set) or len(views.images) <= NUM_SURROUNDING:
+        return images
+    centers = camera_center(scene.rotations[images], scene.translations[images])
+    nearest = views.images[cKDTree(views.centers).query(centers, NUM_SURROUNDING)[1]]
+    shares_set = np.zeros(nearest.shape, dtype=np.bool_)
+    for is_member in in_set:
+        shares_set |= is_member[images, None] & is_member[nearest]
+    return images[~shares_set.all(axis=1)]
 
 
 def _find_views_with_depth(scene: Scene) -> Views:

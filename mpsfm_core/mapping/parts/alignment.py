@@ -22,6 +22,8 @@ MAX_ERROR_PX = 8.0
 ReconstructionAligner max_reproj_error]"""
 MIN_COMMON_POINTS = 30
 """Smallest number of common points that agree. [COLMAP abs_pose_min_num_inliers]"""
+MAX_SAMPLED_OBSERVATIONS = 2048
+"""Maximum number of common observations by which hypotheses are compared. [ours]"""
 NUM_REFINEMENTS = 3
 """Number of least-squares refinements of the best hypothesis. [ours]"""
 
@@ -71,9 +73,12 @@ def align_reconstructions(a: Reconstruction, b: Reconstruction) -> Alignment | N
         return None
     images_a = [image for image, _ in common]
     hypotheses = [_transform_from_image(*pair) for pair in common]
-    support = [_find_inliers(images_a, observations, h) for h in hypotheses]
-    best = int(np.argmax([inliers.sum() for inliers in support]))
-    transform, inliers = hypotheses[best], support[best]
+    step = max(1, len(observations.image) // MAX_SAMPLED_OBSERVATIONS)
+    image, points_a, points_b = observations
+    sample = _CommonObservations(image[::step], points_a[::step], points_b[::step])
+    support = [_find_inliers(images_a, sample, hypothesis).sum() for hypothesis in hypotheses]
+    transform = hypotheses[int(np.argmax(support))]
+    inliers = _find_inliers(images_a, observations, transform)
     for _ in range(NUM_REFINEMENTS):
         if inliers.sum() < MIN_COMMON_POINTS:
             return None

@@ -136,6 +136,11 @@ class ResumedRefinement(DepthRefinement):
         log_depth[valid] = np.log(known)
         return RefinedDepth.from_log_depth(log_depth, valid, self.scale)
 
+    def depth(self, prior: DepthPrior) -> Float32:
+        """Return the refined depth, which is on the pixel grid of the prior, in world units."""
+        depth: Float32 = self._depth.depth * self._factor
+        return depth
+
 
 class LazyDepth(DepthPrior):
     """Depth map of a reconstruction, which is refined when its depth is first read.
