@@ -38,7 +38,7 @@ MAX_WHOLE_IMAGES = 2000
 """Largest number of images that are mapped in one piece if ``mapping.parts`` is ``auto`` and an
 executor is set. Above it, four workers save time, including their start.
 [tuned: benchmarks.scale]"""
-AUTO_PART_IMAGES = 500
+AUTO_PART_IMAGES = 1000
 """Number of images in each part if ``mapping.parts`` is ``auto``. [tuned: benchmarks.scale]"""
 _STEP = "parts"
 _NEVER_S = 1e9

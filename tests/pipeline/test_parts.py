@@ -146,7 +146,7 @@ def test_run_without_checkpoints_writes_no_file(
 @pytest.mark.parametrize(
     ("parts", "executor", "num_images", "expected"),
     [
-        ("auto", "dask", 2001, 500),
+        ("auto", "dask", 2001, 1000),
         ("auto", "dask", 2000, None),
         ("auto", "threads", 5000, None),
         (None, "dask", 5000, None),
