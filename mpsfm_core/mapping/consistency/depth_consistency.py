@@ -81,7 +81,7 @@ NUM_COMPARED = 16
 """Number of most overlapping images whose depth is compared with that of an image. [ours]"""
 NUM_SURROUNDING = 64
 """Number of nearest images that surround an image. If their depth was compared with that of the
-image, farther images are not searched. [ours]"""
+image, farther images are not searched. [tuned: benchmarks.scale]"""
 MIN_OVERLAP_RATIO = 0.05
 """Minimum share of grid pixels that project into another image for a comparison of both images.
 [ours]"""

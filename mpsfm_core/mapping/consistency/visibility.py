@@ -154,6 +154,7 @@ def _measure_visibility(
                 depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + t[2]
                 if depth <= 1e-9:
                     continue
+                # u and v are pixels times depth, because divisions are slow
                 u = fx * (r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + t[0]) + cx * depth
                 v = fy * (r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + t[1]) + cy * depth
                 if 0 <= u < width * depth and 0 <= v < height * depth:
