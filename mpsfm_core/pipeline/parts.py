@@ -36,7 +36,7 @@ from mpsfm_core.support.threads import limit_threads
 
 MAX_WHOLE_IMAGES = 2000
 """Largest number of images that are mapped in one piece if ``mapping.parts`` is ``auto`` and an
-executor is set. Above it, four workers save time, including their start.
+executor is set. Above it, at least three workers can share the parts.
 [tuned: benchmarks.scale]"""
 AUTO_PART_IMAGES = 1000
 """Number of images in each part if ``mapping.parts`` is ``auto``. [tuned: benchmarks.scale]"""

@@ -39,7 +39,7 @@ def build_space(count: int, held: np.ndarray | None = None) -> CoarseSpace:
 
 
 def expand(space: CoarseSpace) -> np.ndarray:
-    """Return the matrix (7 s, 7 c) that converts steps of c clusters to steps of s poses."""
+    """Return the prolongation (7 s, 7 c), by which steps of c clusters move s poses."""
     cluster_of, num_clusters = space.clusters
     matrix = np.zeros((len(cluster_of), 7, num_clusters, 7))
     matrix[np.arange(len(cluster_of)), :, cluster_of] = space.modes

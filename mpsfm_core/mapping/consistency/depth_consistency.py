@@ -80,8 +80,8 @@ OVERLAP_GRID = 16
 NUM_COMPARED = 16
 """Number of most overlapping images whose depth is compared with that of an image. [ours]"""
 NUM_SURROUNDING = 64
-"""Number of nearest images that surround an image. If their depth was compared with that of the
-image, farther images are not searched. [tuned: benchmarks.scale]"""
+"""Number of images with the nearest camera centers. If an image was compared with each of them, its
+depth is not compared with farther images either. [tuned: benchmarks.scale]"""
 MIN_OVERLAP_RATIO = 0.05
 """Minimum share of grid pixels that project into another image for a comparison of both images.
 [ours]"""
@@ -329,16 +329,16 @@ def find_overlapping_images(scene: Scene, image: int, views: Views | None = None
 
 
 def _select_near_other_sets(scene: Scene, images: Int64, views: Views, in_set: Bool) -> Int64:
-    """Select the images near images with which they share no set.
+    """Select the images with a near image whose depth was not compared with theirs.
 
-    The images that overlap most with an image are mostly among the ``NUM_SURROUNDING`` nearest.
+    The images that overlap most with an image are mostly among its ``NUM_SURROUNDING`` nearest.
 
     Args:
         scene: The scene.
         images: (m,) registered images.
         views: Registered images with depth.
-        in_set: (s, n) bool membership of the images of the scene in each set. Without sets, all
-            images are selected.
+        in_set: (s, n) bool membership of the images of the scene in sets of compared images.
+            Without sets, all images are selected.
     """
     if not len(in_set) or len(views.images) <= NUM_SURROUNDING:
         return images

@@ -286,25 +286,26 @@ def test_find_conflicting_images_removes_image_with_most_conflicts() -> None:
     assert removed[0][1] == pytest.approx(1.0)
 
 
-def test_images_surrounded_by_their_set_are_not_compared_again() -> None:
-    """Of two rows of images, only those near the other row are compared with it."""
-    count = 100  # per row
+def test_images_surrounded_by_their_set_are_not_compared_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """In a line of images in two sets, only images near the border of the sets are compared."""
+    count = 100  # per set
     poses = [np.column_stack([np.eye(3), [-0.5 * k, 0, 0]]) for k in range(2 * count)]
     maps = [wall(4.0)] * (2 * count)
-    maps[count - 1] = wall(2.0)  # contradicts its neighbors in both rows
+    maps[count - 1] = wall(2.0)  # contradicts its neighbors in both sets
     scene = posed_scene(maps, poses, SMALL)
     images = scene.registered_images()
-    rows = [images[:count], images[count:]]
+    sets = [images[:count], images[count:]]
     searched: list[int] = []
 
     def search(scene: Scene, image: int, views: Views) -> list[int]:
         searched.append(image)
         return find_overlapping_images(scene, image, views)
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(depth_consistency, "find_overlapping_images", search)
-        check = DepthConsistencyCheck(scene, OPTIONS)
-        removed = check.find_conflicting_images(images, OPTIONS.max_violations, compared=rows)
+    monkeypatch.setattr(depth_consistency, "find_overlapping_images", search)
+    check = DepthConsistencyCheck(scene, OPTIONS)
+    removed = check.find_conflicting_images(images, OPTIONS.max_violations, compared=sets)
     assert [image for image, _ in removed] == [count - 1]
     assert min(searched) > count / 2
     assert max(searched) < 1.5 * count
