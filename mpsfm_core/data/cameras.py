@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Callable
+from dataclasses import dataclass, field, fields
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -77,7 +78,7 @@ class View:
     """(H, W, 3) uint8 RGB pixels of the view."""
     camera: PinholeCamera
     """Intrinsics of the view."""
-    mask: Bool | None = None
+    mask: Bool | None = field(default_factory=lambda: None)
     """(H, W) bool, False at pixels outside the undistorted image or masked by the user (None for
     all True)."""
     orientation: int = 1
@@ -89,6 +90,36 @@ class View:
         require_array(self, "image", np.uint8, (height, width, 3))
         if self.mask is not None:
             require_array(self, "mask", np.bool_, (height, width))
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any:
+            """Decode the image and the mask of a view of :func:`defer_decoding`."""
+            decode = vars(self).get("_decode")
+            if decode is None or name not in ("image", "mask"):
+                raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+            decoded = decode()
+            vars(self).update(image=decoded.image, mask=decoded.mask)
+            return getattr(decoded, name)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+def defer_decoding(
+    name: str, camera: PinholeCamera, orientation: int, decode: Callable[[], View]
+) -> View:
+    """Return a view whose image and mask are decoded when they are first used.
+
+    Args:
+        name: See :class:`View`.
+        camera: See :class:`View`.
+        orientation: See :class:`View`.
+        decode: Function that returns the view with image and mask.
+    """
+    view = object.__new__(View)
+    vars(view).update(name=name, camera=camera, orientation=orientation, _decode=decode)
+    return view
 
 
 def dot_with_rays(camera: PinholeCamera, normals: NDArray[Any]) -> Float64:

@@ -6,9 +6,11 @@ import importlib
 import shutil
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import Any, TypeVar, cast
 
 from mpsfm_core.config import RuntimeOptions
@@ -94,6 +96,14 @@ class ActiveProvider:
         return self._local.provider
 
     @property
+    def _thread(self) -> TimedThread:
+        """Thread that computes the results of the calling thread."""
+        if not hasattr(self._local, "thread"):
+            self._local.thread = TimedThread()
+        thread: TimedThread = self._local.thread
+        return thread
+
+    @property
     def workers(self) -> int:
         """Number of threads that run the provider, 1 on a GPU or for an instance of the caller."""
         if isinstance(self.spec.factory, ProviderInstance):
@@ -119,9 +129,12 @@ class ActiveProvider:
         provider = self.instance
         started = time.perf_counter()
         try:
-            result = run_with_timeout(timeout_s, lambda: compute(provider))
+            if timeout_s is None:
+                result = compute(provider)
+            else:
+                result = self._thread.run(lambda: compute(provider), timeout_s)
         except TimeoutError as error:
-            del self._local.provider
+            del self._local.provider, self._local.thread
             raise ProviderRunError(
                 f"provider {self.spec.name!r}: no answer within {timeout_s:g} s; raise "
                 f"runtime.timeout_s for a slow provider"
@@ -181,27 +194,53 @@ class ActiveProvider:
         return {uri: file_sha256(path) for uri, path in paths.items() if path is not None}
 
 
-def run_with_timeout(seconds: float | None, compute: Callable[[], T]) -> T:
-    """Run a function; raise TimeoutError if the function takes longer than ``seconds``."""
-    if seconds is None:
-        return compute()
-    outcome: list[Any] = []
+class TimedThread:
+    """Daemon thread that runs functions of another thread, so that the caller can stop waiting.
 
-    def work() -> None:
+    A thread for all functions is faster than a new thread for each. The thread ends when the object
+    is deleted and the last function has returned.
+    """
+
+    def __init__(self) -> None:
+        self._calls: SimpleQueue[Callable[[], Any] | None] = SimpleQueue()
+        self._outcomes: SimpleQueue[tuple[Any, BaseException | None]] = SimpleQueue()
+        queues = self._calls, self._outcomes
+        threading.Thread(target=_run_calls, args=queues, name="mpsfm provider", daemon=True).start()
+        weakref.finalize(self, self._calls.put, None)
+
+    def run(self, compute: Callable[[], T], timeout_s: float) -> T:
+        """Run a function and return its result or raise its exception.
+
+        Raises:
+            TimeoutError: The function takes longer than ``timeout_s`` seconds. The thread can run
+                no other function.
+        """
+        self._calls.put(compute)
         try:
-            outcome.append((compute(), None))
-        except BaseException as error:
-            outcome.append((None, error))
+            result, error = self._outcomes.get(timeout=timeout_s)
+        except Empty:
+            raise TimeoutError from None
+        if error is not None:
+            try:
+                raise error
+            finally:
+                del error  # the error refers to this frame, and so to the thread
+        return cast(T, result)
 
-    thread = threading.Thread(target=work, name="mpsfm provider", daemon=True)
-    thread.start()
-    thread.join(seconds)
-    if not outcome:
-        raise TimeoutError
-    result, error = outcome[0]
-    if error is not None:
-        raise error
-    return cast(T, result)
+
+def _run_calls(
+    calls: SimpleQueue[Callable[[], Any] | None],
+    outcomes: SimpleQueue[tuple[Any, BaseException | None]],
+) -> None:
+    """Run functions from a queue until None, and put their results or exceptions in a queue."""
+    while (compute := calls.get()) is not None:
+        outcome: tuple[Any, BaseException | None]
+        try:
+            outcome = compute(), None
+        except BaseException as error:
+            outcome = None, error
+        outcomes.put(outcome)
+        del compute, outcome  # they may hold large arrays
 
 
 def worker_count(runtime: RuntimeOptions) -> int:

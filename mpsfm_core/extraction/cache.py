@@ -2,7 +2,8 @@
 
 The key of a cache entry is the hash of all inputs of the result: options, weights and images. A
 cache entry is therefore never out of date. Each entry is written to a temporary file and renamed
-when complete. A damaged cache entry is computed again.
+when complete. A damaged cache entry is computed again, so entries are not flushed to disk one by
+one, which would take longer than matching an image pair.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ class Cache:
         """
         path, arrays = self._path(kind, key), cast(Any, pack(value))
         try:
-            write_file(path, lambda file: np.savez(file, **arrays), self._unfinished)
+            write_file(path, lambda file: np.savez(file, **arrays), self._unfinished, sync=False)
         except OSError as error:
             reason = "the disk is full" if error.errno == errno.ENOSPC else str(error)
             raise OutputError(

@@ -16,6 +16,7 @@ import numpy as np
 
 from mpsfm_core.config import Config
 from mpsfm_core.data import Bool, UInt8, View
+from mpsfm_core.data.cameras import defer_decoding
 from mpsfm_core.data.errors import MpsfmError, ProviderOutputError, ProviderRunError
 from mpsfm_core.extraction.active_provider import ActiveProvider, worker_count
 from mpsfm_core.extraction.cache import Cache, content_key, digest
@@ -187,6 +188,13 @@ class ExtractionContext:
         """Return the undistorted view of an image, masked by the mask providers."""
         view = self.images.view(index)
         return replace(view, mask=self.mask(index)) if self._mask_providers else view
+
+    def view_on_demand(self, index: int) -> View:
+        """Return the view of an image, which is decoded when its pixels or mask are first used."""
+        image = self.images[index]
+        return defer_decoding(
+            image.name, image.pinhole, image.orientation, lambda: self.view(index)
+        )
 
     def mask(self, index: int) -> Bool | None:
         """Return the mask (H, W) of usable pixels of a view, or None if all pixels are usable."""

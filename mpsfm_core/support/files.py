@@ -44,7 +44,11 @@ _NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EINVAL, errno.ENOLC
 
 
 def write_file(
-    path: Path, content: bytes | str | Callable[[BinaryIO], None], temporary: Path | None = None
+    path: Path,
+    content: bytes | str | Callable[[BinaryIO], None],
+    temporary: Path | None = None,
+    *,
+    sync: bool = True,
 ) -> None:
     """Write a file atomically and create its folder.
 
@@ -53,6 +57,7 @@ def write_file(
         content: Content as bytes, as text (encoded as UTF-8), or as a function that writes to an
             open file.
         temporary: Folder for the incomplete file on the same disk as `path`, by default its folder.
+        sync: Flush the file to disk. Otherwise, a power failure may leave the file incomplete.
 
     Raises:
         OSError: the file cannot be written.
@@ -69,7 +74,8 @@ def write_file(
             else:
                 file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
-            os.fsync(file.fileno())
+            if sync:
+                os.fsync(file.fileno())
             unfinished.replace(path)
     except BaseException:
         with suppress(OSError):

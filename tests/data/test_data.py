@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import pickle
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from mpsfm_core import Features, SparseMatches
+from mpsfm_core import Features, PinholeCamera, SparseMatches, View
+from mpsfm_core.data.cameras import defer_decoding
 from mpsfm_core.data.errors import ProviderError
 from mpsfm_core.providers import require_features
 
@@ -30,3 +34,20 @@ def test_require_features_without_features_raises() -> None:
     assert require_features("x matches features", FEATURES, FEATURES) == (FEATURES, FEATURES)
     with pytest.raises(ProviderError, match="x matches features: choose a features provider"):
         require_features("x matches features", FEATURES, None)
+
+
+def test_view_with_deferred_decoding_is_decoded_once() -> None:
+    camera, decoded = PinholeCamera(4, 3, 5.0, 5.0, 2.0, 1.5), []
+
+    def decode() -> View:
+        decoded.append(1)
+        return View("a.jpg", np.ones((3, 4, 3), np.uint8), camera, np.eye(3, 4, dtype=bool), 6)
+
+    view = defer_decoding("a.jpg", camera, 6, decode)
+    assert (view.name, view.camera, view.orientation) == ("a.jpg", camera, 6)
+    assert not decoded
+    with pytest.raises(AttributeError, match="no attribute 'pixels'"):
+        _ = view.pixels
+    for other in (view, pickle.loads(pickle.dumps(view)), replace(view, name="b.jpg")):
+        assert other.image.sum() == 36 and other.mask.sum() == 3
+    assert decoded == [1]

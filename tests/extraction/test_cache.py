@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import pytest
@@ -127,11 +128,12 @@ def test_cache_entry_of_another_class_is_computed_again(
 def test_cache_store_on_full_disk_raises_output_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(descriptor: int) -> None:
+    def full(file: BinaryIO, **arrays: object) -> None:
+        file.write(b"PK")
         raise OSError(errno.ENOSPC, "No space left on device")
 
     cache = Cache(tmp_path)
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(np, "savez", full)
     with pytest.raises(OutputError, match=r"disk is full.*runtime\.cache_dir"):
         cache.store("depth", KEY, depth())
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]

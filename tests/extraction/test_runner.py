@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import threading
 from itertools import combinations
 
@@ -13,7 +14,9 @@ import pytest
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import ConfigError, ProviderOutputError, ProviderRunError
+from mpsfm_core.extraction.active_provider import TimedThread
 from mpsfm_core.extraction.cache import digest
+from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.options import AdjustmentOptions, ExtractionOptions, PairOptions
 from mpsfm_core.extraction.pairs import pairing as pairs
 from mpsfm_core.extraction.pairs import similarity as pair_similarity
@@ -409,6 +412,25 @@ def test_hanging_provider_raises_after_timeout(world) -> None:
             world.extract(runtime=runtime)
     finally:
         released.set()
+
+
+def test_timed_thread_runs_calls_and_ends() -> None:
+    thread = TimedThread()
+    seen = [thread.run(threading.current_thread, 5) for _ in range(3)]
+    with pytest.raises(ZeroDivisionError):
+        thread.run(lambda: 1 / 0, 5)
+    assert len(set(seen)) == 1 and seen[0] is not threading.current_thread()
+    del thread
+    seen[0].join(5)
+    assert not seen[0].is_alive()
+
+
+def test_matcher_of_features_decodes_no_image(world, monkeypatch: pytest.MonkeyPatch) -> None:
+    first = world.extract().problem
+    shutil.rmtree(world.cache / "extraction" / "matcher")
+    monkeypatch.setattr(ExtractionContext, "view", lambda context, index: pytest.fail("decoded"))
+    assert identical(world.extract().problem, first)
+    assert (world.cache / "extraction" / "matcher").is_dir()
 
 
 def with_nan() -> DepthPrior:

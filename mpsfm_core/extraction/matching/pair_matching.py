@@ -144,7 +144,8 @@ class PairMatcher:
             return cast(PairMatches, EMPTY_RESULTS[PairMatches]())
 
         def compute(instance: Any) -> PairMatches:
-            views = context.view(pair[0]), context.view(pair[1])
+            # Matchers of features do not use the pixels of the views.
+            views = context.view_on_demand(pair[0]), context.view_on_demand(pair[1])
             features = None if table is None else (table[pair[0]], table[pair[1]])
             return run_matcher(provider.spec, instance, views, features)
 
