@@ -15,8 +15,9 @@ below 10 degrees. A pair of the hall counts as matched if it has 30 common point
 descriptors.
 
 A second table has the share of true pairs among the candidate pairs, whose match scores are
-computed. The images of the table are synthetic: each image along a street shares 224 of its 256
-repeatable descriptors with the next image, 192 with the image after it, and so on. Writes
+computed. The images of the table are synthetic: each image along a street shares 7/8 of its
+repeatable descriptors, which are half of all, with the next image, 6/8 with the image after it, and
+so on. Writes
 benchmarks/results/pairs.md.
 """
 
@@ -56,6 +57,8 @@ MATCHED_OVERLAP = 0.15
 RIGHT_DEG = 10.0
 VIEWS = 200
 STREETS = (1000, 4000, 10000)
+_STEP = pair_similarity.NUM_DESCRIPTORS // 16
+"""Number of repeatable descriptors of an image along a street that the next image does not have."""
 
 
 class Case(NamedTuple):
@@ -84,12 +87,12 @@ def main() -> None:
         print(lines[-1], flush=True)
     lines += [
         "",
-        "The table lists which share of the pairs with at least 192 or 32 common points is among "
-        "the candidate pairs. The images are synthetic views along a street with 512 descriptors "
-        "each.",
+        f"The table lists which share of the pairs with at least {6 * _STEP} or {_STEP} common "
+        "points is among the candidate pairs. The images are synthetic views along a street with "
+        f"{16 * _STEP} descriptors each.",
         "",
-        "| images | candidate pairs per image | 192 common points | 32 common points | "
-        "CPU seconds |",
+        f"| images | candidate pairs per image | {6 * _STEP} common points | {_STEP} common points "
+        "| CPU seconds |",
         "|---" * 5 + "|",
     ]
     lines += [_candidate_row(count) for count in STREETS]
@@ -127,11 +130,11 @@ def _row(name: str, case: Case) -> str:
 def _candidate_row(count: int) -> str:
     """Measure recall and time of the candidate pairs of images along a street."""
     rng = np.random.default_rng(0)
-    points = _unit(rng.normal(size=(32 * (count + 7), 64)))
+    points = _unit(rng.normal(size=(_STEP * (count + 7), 64)))
     positions = rng.permutation(count)
     descriptors = []
     for position in positions:
-        seen = points[32 * position : 32 * position + 256]
+        seen = points[_STEP * position : _STEP * (position + 8)]
         noise = 0.5 * _unit(rng.normal(size=seen.shape))
         outliers = _unit(rng.normal(size=seen.shape))
         descriptors.append(np.concatenate([_unit(seen + noise), outliers]).astype(np.float32))

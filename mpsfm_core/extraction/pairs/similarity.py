@@ -26,7 +26,7 @@ from scipy.sparse import csr_array
 from mpsfm_core.data import Features, Float32, Float64, Int64
 from mpsfm_core.providers.builtin.mutual_nearest import mutual_nearest
 
-NUM_DESCRIPTORS = 512
+NUM_DESCRIPTORS = 384
 """Number of descriptors per image that are compared. The cost of comparison grows with the square
 of the number of descriptors. [tuned: benchmarks.pairs]"""
 DIFFUSION_RATIO = 0.8
