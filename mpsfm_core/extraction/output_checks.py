@@ -29,6 +29,8 @@ _NUM_NEIGHBORS = 3
 """Number of nearest matches whose scores are compared with the score of a match."""
 _SIGNIFICANT_STDS = 3.0
 """Number of standard deviations from 0 above which a correlation is no coincidence."""
+_MAX_PAIRS = 1000
+"""Maximum number of pairs whose scores are checked, evenly distributed over all pairs. [ours]"""
 _MAX_COMPARED = 5000
 """Maximum number of matches of a pair that are compared with their nearest matches."""
 _MAX_DENSE_PAIRS = 20
@@ -75,7 +77,7 @@ def find_wrong_providers(context: ExtractionContext, graph: MatchGraph) -> tuple
 
 
 def _scored_matches(graph: MatchGraph, *, is_dense: bool, is_only: bool) -> Iterator[ScoredMatches]:
-    """Yield the matches of one matcher in each verified pair.
+    """Yield the matches of one matcher in each verified pair, or in ``_MAX_PAIRS`` of them.
 
     Args:
         graph: Matches and two-view geometries.
@@ -84,6 +86,7 @@ def _scored_matches(graph: MatchGraph, *, is_dense: bool, is_only: bool) -> Iter
     """
     outcomes = zip(graph.candidates, graph.geometries, strict=True)
     verified = [outcome for outcome in outcomes if not outcome[1].dropped]
+    verified = verified[:: max(1, -(-len(verified) // _MAX_PAIRS))]
     reads_dense = is_dense and graph.matcher is not None and graph.matcher.keeps_results
     for number, (matches, geometry) in enumerate(verified):
         keypoints = graph.assembled.keypoints[matches.pair[0]][matches.sparse.indices[:, 0]]

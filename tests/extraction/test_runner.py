@@ -14,6 +14,7 @@ import pytest
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import ConfigError, ProviderOutputError, ProviderRunError
+from mpsfm_core.extraction import output_checks
 from mpsfm_core.extraction.active_provider import TimedThread
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.context import ExtractionContext
@@ -431,6 +432,16 @@ def test_matcher_of_features_decodes_no_image(world, monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(ExtractionContext, "view", lambda context, index: pytest.fail("decoded"))
     assert identical(world.extract().problem, first)
     assert (world.cache / "extraction" / "matcher").is_dir()
+
+
+def test_scores_of_some_pairs_are_checked(world, monkeypatch: pytest.MonkeyPatch) -> None:
+    checked = []
+    monkeypatch.setattr(output_checks, "_MAX_PAIRS", 4)
+    monkeypatch.setattr(
+        output_checks, "find_meaningless_scores", lambda pairs, _: checked.append(len(pairs))
+    )
+    world.extract()
+    assert checked == [3]  # every second of 6 pairs
 
 
 def with_nan() -> DepthPrior:
