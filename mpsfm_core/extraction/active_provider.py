@@ -197,8 +197,8 @@ class ActiveProvider:
 class TimedThread:
     """Daemon thread that runs functions of another thread, so that the caller can stop waiting.
 
-    A thread for all functions is faster than a new thread for each. The thread ends when the object
-    is deleted and the last function has returned.
+    One thread for all calls is faster than a new thread for each call. The thread ends when the
+    object is deleted and the last function has returned.
     """
 
     def __init__(self) -> None:
