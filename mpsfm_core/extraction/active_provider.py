@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data.errors import ProviderRunError
@@ -202,22 +202,23 @@ class TimedThread:
     """
 
     def __init__(self) -> None:
-        self._calls: SimpleQueue[Callable[[], Any] | None] = SimpleQueue()
-        self._outcomes: SimpleQueue[tuple[Any, BaseException | None]] = SimpleQueue()
-        queues = self._calls, self._outcomes
-        threading.Thread(target=_run_calls, args=queues, name="mpsfm provider", daemon=True).start()
+        self._calls: SimpleQueue[_Call | None] = SimpleQueue()
+        threading.Thread(
+            target=_run_calls, args=(self._calls,), name="mpsfm provider", daemon=True
+        ).start()
         weakref.finalize(self, self._calls.put, None)
 
     def run(self, compute: Callable[[], T], timeout_s: float) -> T:
         """Run a function and return its result or raise its exception.
 
         Raises:
-            TimeoutError: The function takes longer than ``timeout_s`` seconds. The thread can run
-                no other function.
+            TimeoutError: The function takes longer than ``timeout_s`` seconds. The thread runs no
+                other function before this one returns.
         """
-        self._calls.put(compute)
+        call = _Call(compute, SimpleQueue())
+        self._calls.put(call)
         try:
-            result, error = self._outcomes.get(timeout=timeout_s)
+            result, error = call.outcome.get(timeout=timeout_s)
         except Empty:
             raise TimeoutError from None
         if error is not None:
@@ -228,19 +229,25 @@ class TimedThread:
         return cast(T, result)
 
 
-def _run_calls(
-    calls: SimpleQueue[Callable[[], Any] | None],
-    outcomes: SimpleQueue[tuple[Any, BaseException | None]],
-) -> None:
-    """Run functions from a queue until None, and put their results or exceptions in a queue."""
-    while (compute := calls.get()) is not None:
-        outcome: tuple[Any, BaseException | None]
+class _Call(NamedTuple):
+    """Function for another thread.
+
+    Each call has its own queue, because the caller may be interrupted before the function returns.
+    """
+
+    compute: Callable[[], Any]
+    outcome: SimpleQueue[tuple[Any, BaseException | None]]
+    """Queue that receives the result, or None and the exception."""
+
+
+def _run_calls(calls: SimpleQueue[_Call | None]) -> None:
+    """Run functions from a queue until it contains None."""
+    while (call := calls.get()) is not None:
         try:
-            outcome = compute(), None
+            call.outcome.put((call.compute(), None))
         except BaseException as error:
-            outcome = None, error
-        outcomes.put(outcome)
-        del compute, outcome  # they may hold large arrays
+            call.outcome.put((None, error))
+        del call  # its function may hold large arrays
 
 
 def worker_count(runtime: RuntimeOptions) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import threading
+import time
 from itertools import combinations
 
 import cv2
@@ -421,6 +422,9 @@ def test_timed_thread_runs_calls_and_ends() -> None:
     with pytest.raises(ZeroDivisionError):
         thread.run(lambda: 1 / 0, 5)
     assert len(set(seen)) == 1 and seen[0] is not threading.current_thread()
+    with pytest.raises(TimeoutError):
+        thread.run(lambda: time.sleep(0.2), 0.01)
+    assert thread.run(lambda: "the result of this call", 5) == "the result of this call"
     del thread
     seen[0].join(5)
     assert not seen[0].is_alive()
