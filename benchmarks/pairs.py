@@ -16,9 +16,8 @@ descriptors.
 
 A second table has the share of true pairs among the candidate pairs, whose match scores are
 computed. The images of the table are synthetic: each image along a street shares 7/8 of its
-repeatable descriptors, which are half of all, with the next image, 6/8 with the image after it, and
-so on. Writes
-benchmarks/results/pairs.md.
+repeatable descriptors with the next image, 6/8 with the image after it, and so on. Half of the
+descriptors of an image are repeatable. Writes benchmarks/results/pairs.md.
 """
 
 from __future__ import annotations

@@ -112,10 +112,10 @@ def defer_decoding(
     """Return a view whose image and mask are decoded when they are first used.
 
     Args:
-        name: See :class:`View`.
-        camera: See :class:`View`.
-        orientation: See :class:`View`.
-        decode: Function that returns the view with image and mask.
+        name: Path of the original image below the images folder.
+        camera: Intrinsics of the view.
+        orientation: EXIF orientation of the original image, 1 to 8.
+        decode: Function that returns the decoded view.
     """
     view = object.__new__(View)
     vars(view).update(name=name, camera=camera, orientation=orientation, _decode=decode)

@@ -97,7 +97,7 @@ class ActiveProvider:
 
     @property
     def _thread(self) -> TimedThread:
-        """Thread that computes the results of the calling thread."""
+        """Thread that runs the provider for the calling thread, so that calls can time out."""
         if not hasattr(self._local, "thread"):
             self._local.thread = TimedThread()
         thread: TimedThread = self._local.thread

@@ -190,7 +190,7 @@ class ExtractionContext:
         return replace(view, mask=self.mask(index)) if self._mask_providers else view
 
     def view_on_demand(self, index: int) -> View:
-        """Return the view of an image, which is decoded when its pixels or mask are first used."""
+        """Return the view of an image, whose pixels and mask are decoded at their first use."""
         image = self.images[index]
         return defer_decoding(
             image.name, image.pinhole, image.orientation, lambda: self.view(index)

@@ -18,12 +18,11 @@ from mpsfm_core.data.errors import ConfigError, ProviderOutputError, ProviderRun
 from mpsfm_core.extraction import output_checks
 from mpsfm_core.extraction.active_provider import TimedThread
 from mpsfm_core.extraction.cache import digest
-from mpsfm_core.extraction.context import ExtractionContext
 from mpsfm_core.extraction.options import AdjustmentOptions, ExtractionOptions, PairOptions
 from mpsfm_core.extraction.pairs import pairing as pairs
 from mpsfm_core.extraction.pairs import similarity as pair_similarity
 from mpsfm_core.extraction.priors.prior_maps import EDGE_VARIANCE
-from mpsfm_core.extraction.runner import predict_priors_again
+from mpsfm_core.extraction.runner import extract, predict_priors_again
 from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_angle_deg
 from mpsfm_core.inputs.images import load_images
 from mpsfm_core.inputs.options import InputOptions
@@ -430,11 +429,12 @@ def test_timed_thread_runs_calls_and_ends() -> None:
     assert not seen[0].is_alive()
 
 
-def test_matcher_of_features_decodes_no_image(world, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_matcher_of_features_decodes_no_image(world) -> None:
     first = world.extract().problem
     shutil.rmtree(world.cache / "extraction" / "matcher")
-    monkeypatch.setattr(ExtractionContext, "view", lambda context, index: pytest.fail("decoded"))
-    assert identical(world.extract().problem, first)
+    images = load_images(world.root / "images", world.root / "intrinsics.yaml")
+    shutil.rmtree(world.root / "images")  # decoding raises
+    assert identical(extract(images, world.config(), world.registry).problem, first)
     assert (world.cache / "extraction" / "matcher").is_dir()
 
 

@@ -342,7 +342,7 @@ def test_threads_that_a_library_starts_once_are_no_leak() -> None:
     stop = threading.Event()
 
     class StartsPool(PaintedDepth):
-        """Depth provider with calls of 0.15 s, one of which starts three threads."""
+        """Depth provider whose calls take 0.15 s; one call starts three threads."""
 
         def predict(self, view: View) -> DepthPrior:
             if view.name == "memory/1.png":

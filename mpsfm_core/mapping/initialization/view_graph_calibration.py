@@ -396,7 +396,7 @@ class _NormalEquations(NamedTuple):
     """(p, 8) gradient."""
 
     def where(self, mask: Bool, other: _NormalEquations) -> _NormalEquations:
-        """Return these systems where the mask (p,) is True, and those of ``other`` elsewhere."""
+        """Select the system of each pair from these where the mask (p,) is True, else ``other``."""
         return _NormalEquations(
             np.where(mask, self.cost, other.cost),
             np.where(mask[:, None, None], self.hessian, other.hessian),
@@ -524,7 +524,7 @@ def _undistort(
 
 @helper()
 def _multiply(matrix: Float64, v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Return ``matrix @ v`` for a (3, 3) matrix."""
+    """Multiply a (3, 3) matrix by the vector ``v`` and return the product as a tuple."""
     return (
         matrix[0, 0] * v[0] + matrix[0, 1] * v[1] + matrix[0, 2] * v[2],
         matrix[1, 0] * v[0] + matrix[1, 1] * v[1] + matrix[1, 2] * v[2],

@@ -137,7 +137,7 @@ class ResumedRefinement(DepthRefinement):
         return RefinedDepth.from_log_depth(log_depth, valid, self.scale)
 
     def depth(self, prior: DepthPrior) -> Float32:
-        """Return the refined depth map in world units, which has the size of the prior."""
+        """Return the refined depth map (h, w) in world units, at the resolution of the prior."""
         depth: Float32 = self._depth.depth * self._factor
         return depth
 

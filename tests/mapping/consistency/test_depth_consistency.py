@@ -289,7 +289,7 @@ def test_find_conflicting_images_removes_image_with_most_conflicts() -> None:
 def test_images_surrounded_by_their_set_are_not_compared_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """In a line of images in two sets, only images near the border of the sets are compared."""
+    """Two sets of images form one line; only images near the end of a set are compared."""
     count = 100  # per set
     poses = [np.column_stack([np.eye(3), [-0.5 * k, 0, 0]]) for k in range(2 * count)]
     maps = [wall(4.0)] * (2 * count)
