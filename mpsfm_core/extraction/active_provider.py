@@ -6,12 +6,10 @@ import importlib
 import shutil
 import threading
 import time
-import weakref
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from queue import Empty, SimpleQueue
-from typing import Any, NamedTuple, TypeVar, cast
+from typing import Any, TypeVar
 
 from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data.errors import ProviderRunError
@@ -21,6 +19,7 @@ from mpsfm_core.providers.provider_config import ProviderConfig
 from mpsfm_core.providers.registry import Registry
 from mpsfm_core.providers.weights import WeightStore, file_sha256, is_remote
 from mpsfm_core.support.threads import count_cores
+from mpsfm_core.support.timed_thread import TimedThread, TimeLimitError
 
 T = TypeVar("T")
 
@@ -99,7 +98,7 @@ class ActiveProvider:
     def _thread(self) -> TimedThread:
         """Thread that runs the provider for the calling thread, so that calls can time out."""
         if not hasattr(self._local, "thread"):
-            self._local.thread = TimedThread()
+            self._local.thread = TimedThread("mpsfm provider")
         thread: TimedThread = self._local.thread
         return thread
 
@@ -133,7 +132,7 @@ class ActiveProvider:
                 result = compute(provider)
             else:
                 result = self._thread.run(lambda: compute(provider), timeout_s)
-        except TimeoutError as error:
+        except TimeLimitError as error:
             del self._local.provider, self._local.thread
             raise ProviderRunError(
                 f"provider {self.spec.name!r}: no answer within {timeout_s:g} s; raise "
@@ -192,62 +191,6 @@ class ActiveProvider:
             self._local.provider = self._create()
         paths = {uri: self._store.locate(uri) for uri in uris}
         return {uri: file_sha256(path) for uri, path in paths.items() if path is not None}
-
-
-class TimedThread:
-    """Daemon thread that runs functions of another thread, so that the caller can stop waiting.
-
-    One thread for all calls is faster than a new thread for each call. The thread ends when the
-    object is deleted and the last function has returned.
-    """
-
-    def __init__(self) -> None:
-        self._calls: SimpleQueue[_Call | None] = SimpleQueue()
-        threading.Thread(
-            target=_run_calls, args=(self._calls,), name="mpsfm provider", daemon=True
-        ).start()
-        weakref.finalize(self, self._calls.put, None)
-
-    def run(self, compute: Callable[[], T], timeout_s: float) -> T:
-        """Run a function and return its result or raise its exception.
-
-        Raises:
-            TimeoutError: The function takes longer than ``timeout_s`` seconds. The thread runs no
-                other function before this one returns.
-        """
-        call = _Call(compute, SimpleQueue())
-        self._calls.put(call)
-        try:
-            result, error = call.outcome.get(timeout=timeout_s)
-        except Empty:
-            raise TimeoutError from None
-        if error is not None:
-            try:
-                raise error
-            finally:
-                del error  # the error refers to this frame, and so to the thread
-        return cast(T, result)
-
-
-class _Call(NamedTuple):
-    """Function for another thread.
-
-    Each call has its own queue, because the caller may be interrupted before the function returns.
-    """
-
-    compute: Callable[[], Any]
-    outcome: SimpleQueue[tuple[Any, BaseException | None]]
-    """Queue that receives the result, or None and the exception."""
-
-
-def _run_calls(calls: SimpleQueue[_Call | None]) -> None:
-    """Run functions from a queue until it contains None."""
-    while (call := calls.get()) is not None:
-        try:
-            call.outcome.put((call.compute(), None))
-        except BaseException as error:
-            call.outcome.put((None, error))
-        del call  # its function may hold large arrays
 
 
 def worker_count(runtime: RuntimeOptions) -> int:

@@ -12,7 +12,6 @@ import inspect
 import logging
 import re
 import sys
-import threading
 from collections.abc import Callable, Collection, Iterator
 from contextlib import redirect_stdout
 from dataclasses import dataclass
@@ -31,6 +30,7 @@ from mpsfm_core.providers import (
     Hooks,
     ProviderSpec,
 )
+from mpsfm_core.support.timed_thread import TimedThread, TimeLimitError
 
 _log = logging.getLogger(__name__)
 _NAME = re.compile(r"[a-z0-9]+([._-][a-z0-9]+)*")
@@ -169,27 +169,24 @@ def _load(
     entry: metadata.EntryPoint, distribution: str, version: str, timeout_s: float
 ) -> LoadedPlugin:
     """Import a plugin and collect its providers in a thread with a time limit."""
-    outcome: list[LoadedPlugin | BaseException] = []
 
-    def work() -> None:
+    def load() -> LoadedPlugin | BaseException:
         try:
-            outcome.append(inspect_plugin(entry.load(), entry.name, distribution, version))
+            return inspect_plugin(entry.load(), entry.name, distribution, version)
         # A SystemExit that a plugin raises must not end the program.
         except BaseException as error:
-            outcome.append(error)
+            return error
 
-    thread = threading.Thread(target=work, name=f"mpsfm plugin {entry.name}", daemon=True)
-    # Standard output is reserved for the output of mpsfm commands, which may be JSON.
-    with redirect_stdout(sys.stderr):
-        thread.start()
-        thread.join(timeout_s)
-    if not outcome:
+    try:
+        # Standard output is reserved for the output of mpsfm commands, which may be JSON.
+        with redirect_stdout(sys.stderr):
+            result = TimedThread(f"mpsfm plugin {entry.name}").run(load, timeout_s)
+    except TimeLimitError:
         fault = f"did not load within {timeout_s:g} s"
         text = "plugin %r of package %s did not load within %g s"
         _log.warning(text, entry.name, distribution, timeout_s)
         hint = f"pip uninstall {distribution}, or raise MPSFM_PLUGIN_TIMEOUT_S"
         return LoadedPlugin(entry.name, distribution, version, fault=fault, hint=hint)
-    result = outcome[0]
     if isinstance(result, LoadedPlugin):
         return result
     fault = f"fails to load: {type(result).__name__}: {result}"

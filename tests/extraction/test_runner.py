@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import threading
-import time
 from itertools import combinations
 
 import cv2
@@ -16,7 +15,6 @@ from mpsfm_core.config import RuntimeOptions
 from mpsfm_core.data import DepthPrior
 from mpsfm_core.data.errors import ConfigError, ProviderOutputError, ProviderRunError
 from mpsfm_core.extraction import output_checks
-from mpsfm_core.extraction.active_provider import TimedThread
 from mpsfm_core.extraction.cache import digest
 from mpsfm_core.extraction.options import AdjustmentOptions, ExtractionOptions, PairOptions
 from mpsfm_core.extraction.pairs import pairing as pairs
@@ -415,18 +413,15 @@ def test_hanging_provider_raises_after_timeout(world) -> None:
         released.set()
 
 
-def test_timed_thread_runs_calls_and_ends() -> None:
-    thread = TimedThread()
-    seen = [thread.run(threading.current_thread, 5) for _ in range(3)]
-    with pytest.raises(ZeroDivisionError):
-        thread.run(lambda: 1 / 0, 5)
-    assert len(set(seen)) == 1 and seen[0] is not threading.current_thread()
-    with pytest.raises(TimeoutError):
-        thread.run(lambda: time.sleep(0.2), 0.01)
-    assert thread.run(lambda: "the result of this call", 5) == "the result of this call"
-    del thread
-    seen[0].join(5)
-    assert not seen[0].is_alive()
+@pytest.mark.parametrize("timeout_s", [None, 60.0])
+def test_timeout_error_of_provider_is_not_the_time_limit(world, timeout_s: float | None) -> None:
+    def fail() -> None:
+        raise TimeoutError("the server does not answer")
+
+    world.break_on["depth", "view2.png"] = fail
+    runtime = RuntimeOptions(cache_dir=world.cache, timeout_s=timeout_s)
+    with pytest.raises(ProviderRunError, match="the server does not answer"):
+        world.extract(runtime=runtime)
 
 
 def test_matcher_of_features_decodes_no_image(world) -> None:
