@@ -192,7 +192,7 @@ class Component:
         for image in images[len(poses.images) :]:
             self.refiner.estimate_scale(image, [])
         loss_factor = options.refinement.first_reprojection_scale
-        self.refiner.adjust(images, reprojection_scale=loss_factor)
+        self.refiner.adjust(images, rough=True, reprojection_scale=loss_factor)
         filter_points(scene, options.triangulation)
 
     def _first_images(self) -> list[int]:

@@ -1,4 +1,4 @@
-"""Tests of depth scales in bundle adjustment: priors on scales, world unit, refined depth."""
+"""Tests of depth scales in bundle adjustment, and of rough bundle adjustment."""
 
 from __future__ import annotations
 
@@ -104,6 +104,27 @@ def test_refined_depth_does_not_change_poses() -> None:
     scene.maps[1].set_refinement(DepthRefinement.from_result(tilted))
     refiner.adjust([0, 1, 2])
     assert np.array_equal(scene.translations, straight)
+
+
+def adjusted(group: Component, *, rough: bool) -> Float64:
+    """Return the camera centers after one adjustment of pushed points."""
+    before = group.scene.snapshot()
+    push(group, 2, 1.02)
+    group.refiner.adjust([0, 1, 2], rough=rough)
+    centers: Float64 = group.scene.centers().copy()
+    group.scene.restore(before)
+    return centers
+
+
+def test_rough_adjustment_stops_early_with_many_images() -> None:
+    group = mapped(0.01)
+    assert np.array_equal(adjusted(group, rough=True), adjusted(group, rough=False))
+    refiner = group.refiner
+    bundle = refiner.options.bundle.model_copy(update={"dense_poses": 2})
+    refiner.options = refiner.options.model_copy(update={"bundle": bundle})
+    exact = adjusted(group, rough=False)
+    error = np.abs(adjusted(group, rough=True) - exact).max()
+    assert 0 < error < 1e-3 * np.ptp(exact)
 
 
 def test_loss_factor_depends_on_independent_errors() -> None:

@@ -74,6 +74,9 @@ MAX_GLOBAL_REFINEMENTS = 5
 MAX_GLOBAL_CHANGE = 0.0005
 """Share of changed observations below which global refinement stops.
 [COLMAP ba_global_max_refinement_change]"""
+ROUGH_TOLERANCE = 1e-4
+"""Relative decrease of the cost at which a rough bundle adjustment stops, with more images than
+``BundleOptions.dense_poses``. [tuned: benchmarks.walks]"""
 MAX_DEPTH_RATIO = 1.5
 """Largest ratio between the depth of a point and the depth map for which bundle adjustment uses the
 depth. [reference scale_filter]"""
@@ -292,6 +295,7 @@ class Refiner:
         *,
         local: bool = False,
         focal: bool = False,
+        rough: bool = False,
         reprojection_scale: float = 1.0,
         max_iterations: int | None = None,
     ) -> None:
@@ -304,6 +308,8 @@ class Refiner:
             local: Keep points with long tracks fixed (local bundle adjustment).
             focal: Refine guessed intrinsics that the observations determine, in addition to poses
                 and points.
+            rough: Stop early with many images, because another bundle adjustment of all images
+                follows.
             reprojection_scale: Factor on the scale of the reprojection loss.
             max_iterations: Maximum number of bundle adjustment iterations, or None to use the
                 option.
@@ -314,6 +320,9 @@ class Refiner:
         if bundle is None:
             return
         options = self._scale_losses(reprojection_scale)
+        if rough and len(variable) > options.dense_poses:
+            tolerance = max(options.function_tolerance, ROUGH_TOLERANCE)
+            options = options.model_copy(update={"function_tolerance": tolerance})
         if max_iterations is not None:
             options = options.model_copy(update={"max_iterations": max_iterations})
         if focal:
@@ -550,13 +559,14 @@ class Refiner:
         complete_and_merge_tracks(self.scene, self.triangulation, create=True)
         lift_low_parallax(self.scene, self.triangulation)
         refines_focals = self.can_refine_focals()
+        rough = refines_focals and not self.calibrates_with_long_tracks
         if refines_focals:
-            self.adjust(images, focal=True)
+            self.adjust(images, focal=True, rough=rough)
         for _ in range(MAX_GLOBAL_REFINEMENTS):
             self.estimate_shared_scales()
             self._measure_keypoint_noise()
             self._measure_noise()
-            self.adjust(images, focal=refines_focals)
+            self.adjust(images, focal=refines_focals, rough=rough)
             changed = filter_points(self.scene, self.triangulation)
             changed += complete_and_merge_tracks(self.scene, self.triangulation)
             if changed < MAX_GLOBAL_CHANGE * max(self._num_observations(), 1):
