@@ -66,6 +66,15 @@ _MAX_CUT_RATIO = 0.2
 [ours]"""
 _MAX_CUT_CORRELATION = 0.5
 """Correlation of two successive frames below which there is a cut, if tracking fails too. [ours]"""
+_MIN_COMMON_KEYPOINTS = 30
+"""Number of SIFT matches with a common homography from which there is no cut between two successive
+frames. The camera may have turned too fast for tracking. [tuned: benchmarks.walks]"""
+_MAX_CUT_KEYPOINTS = 1000
+"""Maximum number of SIFT keypoints per frame that are matched across a possible cut."""
+_MAX_MATCH_RATIO = 0.8
+"""Maximum ratio of the distances to the nearest and the second nearest descriptor. [Lowe 2004]"""
+_MAX_HOMOGRAPHY_ERROR_PX = 5.0
+"""Maximum error of a match with a common homography, in pixels of the downscaled frames. [ours]"""
 _MIN_CONTRAST = 4.0
 """Minimum std of the gray levels of a frame before or after a cut, so that a black
 frame is no cut."""
@@ -469,7 +478,7 @@ class _Track:
 
 
 def _is_cut(last: UInt8, gray: UInt8) -> bool:
-    """Return whether thumbnails of two successive frames have a low correlation."""
+    """Return whether two successive frames have neither similar thumbnails nor enough matches."""
     small = [
         cv2.resize(frame, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64).ravel()
         for frame in (last, gray)
@@ -479,7 +488,25 @@ def _is_cut(last: UInt8, gray: UInt8) -> bool:
         return False
     first, second = ((picture - picture.mean()) for picture in small)
     correlation = float((first * second).mean() / (spread[0] * spread[1]))
-    return correlation < _MAX_CUT_CORRELATION
+    if correlation >= _MAX_CUT_CORRELATION:
+        return False
+    return _count_common_keypoints(last, gray) < _MIN_COMMON_KEYPOINTS
+
+
+def _count_common_keypoints(first: UInt8, second: UInt8) -> int:
+    """Count the SIFT matches of two gray images that have a common homography."""
+    sift = cv2.SIFT.create(_MAX_CUT_KEYPOINTS)
+    found = [sift.detectAndCompute(image, None) for image in (first, second)]
+    if min(len(keypoints) for keypoints, _ in found) < _MIN_COMMON_KEYPOINTS:
+        return 0
+    nearest = cv2.BFMatcher().knnMatch(found[0][1], found[1][1], k=2)
+    matches = [a for a, b in nearest if a.distance < _MAX_MATCH_RATIO * b.distance]
+    if len(matches) < _MIN_COMMON_KEYPOINTS:
+        return 0
+    source = np.array([found[0][0][match.queryIdx].pt for match in matches])
+    target = np.array([found[1][0][match.trainIdx].pt for match in matches])
+    _, inliers = cv2.findHomography(source, target, cv2.RANSAC, _MAX_HOMOGRAPHY_ERROR_PX)
+    return 0 if inliers is None else int(inliers.sum())
 
 
 def gray_image(frame: UInt8, side: int) -> UInt8:

@@ -40,7 +40,8 @@ def turn() -> list[np.ndarray]:
 
 
 def write(path: Path, frames: list[np.ndarray]) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, SIZE)
+    size = frames[0].shape[1::-1]
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"MJPG"), 30, size)
     for frame in frames:
         writer.write(frame)
     writer.release()
@@ -121,6 +122,19 @@ def test_cut_starts_a_shot(turn, tmp_path: Path) -> None:
     assert sorted(shots) == [0, 1] and shots[1].number in range(20, 24)
     assert shots[1].reason.code is KeyframeReason.CUT
     assert selection.describe()["cuts_s"] == [pytest.approx(shots[1].number / 30)]
+
+
+def test_fast_turn_is_no_cut(tmp_path: Path) -> None:
+    """After a turn of 25 degrees between two frames, tracking fails, but keypoints match."""
+    scene, camera = room_scene(), PinholeCamera(480, 360, 390.0, 390.0, 240.0, 180.0)
+    poses = arc_poses(20, 2.5)
+    frames = [
+        cv2.cvtColor(scene.render(camera, pose).rgb, cv2.COLOR_RGB2BGR)
+        for pose in [*poses[:5], *poses[14:]]
+    ]
+    selection = choose_frames(write(tmp_path / "v.avi", frames), VideoOptions())
+    assert selection.describe()["cuts_s"] == []
+    assert 5 in selection.numbers
 
 
 def test_time_stamps_of_variable_frame_rate_are_those_of_the_container(turn, tmp_path) -> None:
