@@ -110,10 +110,11 @@ class MappingPasses:
         if self._config.has_second_pass:
             mapped = self._run_second_pass(mapped)
         problem, views, mapping = mapped.extraction.problem, mapped.mapped_views, mapped.mapping
-        refined = undistort_images(views, problem, mapping.reconstructions)
-        problem = undistort_problem(mapped.extracted_views, refined, problem)
-        if refined is not views:
-            mapping = self._refine_depth_maps(refined, problem, mapping)
+        with self._stages.stage("mapping"):
+            refined = undistort_images(views, problem, mapping.reconstructions)
+            problem = undistort_problem(mapped.extracted_views, refined, problem)
+            if refined is not views:
+                mapping = self._refine_depth_maps(refined, problem, mapping)
         return mapped.extraction, mapping, OriginalImages(refined, problem)
 
     def _run_first_pass(self, images: ImageSet, extraction: Extraction) -> MappedImages:
@@ -197,9 +198,8 @@ class MappingPasses:
     ) -> MappingResult:
         """Refine depth maps again in views that are undistorted with the refined cameras."""
         options = self._config.mapper_options()
-        with self._stages.stage("mapping"):
-            parts = refine_reconstructions(refined, problem, mapping.reconstructions, options)
-            return replace(mapping, reconstructions=parts)
+        parts = refine_reconstructions(refined, problem, mapping.reconstructions, options)
+        return replace(mapping, reconstructions=parts)
 
     def _map_without_jumps(
         self,

@@ -35,6 +35,7 @@ from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
 from mpsfm_core.support.disk_arrays import current_store, store_fields
 from mpsfm_core.support.lru_cache import LruCache
+from mpsfm_core.support.threads import parallel_map
 
 MIN_VALID_WEIGHT = 0.999
 """Minimum sum of interpolation weights of valid pixels for a valid resampled pixel. [ours]"""
@@ -92,15 +93,19 @@ def undistort_problem(
         refined: Images with the refined cameras, in the same order.
         problem: Mapping problem with keypoints and priors on the views of ``images``.
     """
-    views = []
+    store = current_store()
     warps: LruCache[object, _ViewWarp] = LruCache(_CACHED_WARPS, lambda _: 1)
-    for old, new, view in zip(images, refined, problem.images, strict=True):
+
+    def move(sources: tuple[SourceImage, SourceImage, MappingImage]) -> MappingImage:
+        old, new, view = sources
         if new is old:
-            views.append(view)
-            continue
+            return view
         key = camera_key(old.camera), old.pinhole, camera_key(new.camera), new.pinhole
-        warp = warps.get(key, partial(_ViewWarp, old, new))
-        views.append(warp.move_view(view))
+        moved = warps.get(key, partial(_ViewWarp, old, new)).move_view(view)
+        depth, normals = store_fields(moved.depth, store), store_fields(moved.normals, store)
+        return replace(moved, depth=depth, normals=normals)
+
+    views = parallel_map(move, zip(images, refined, problem.images, strict=True))
     return replace(problem, images=tuple(views))
 
 
@@ -179,8 +184,8 @@ class _ViewWarp:
             focal_guess_px=image.focal_prior_px,
             distortion=self._distortion,
             keypoints=self.move_keypoints(image.keypoints),
-            depth=store_fields(self.move_depth(image.depth), current_store()),
-            normals=store_fields(self.move_normals(image.normals), current_store()),
+            depth=self.move_depth(image.depth),
+            normals=self.move_normals(image.normals),
         )
 
     @property

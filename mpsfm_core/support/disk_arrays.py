@@ -15,7 +15,8 @@ import weakref
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import fields, replace
+from copy import copy
+from dataclasses import fields
 from pathlib import Path
 from typing import IO, Protocol, TypeVar
 
@@ -60,8 +61,10 @@ def is_on_disk(array: NDArray[np.generic]) -> bool:
 def store_fields(item: _Item, store: ArrayStore) -> _Item:
     """Return a copy of a dataclass instance whose arrays are stored."""
     values = {field.name: getattr(item, field.name) for field in fields(item)}  # type: ignore[arg-type]
-    arrays = {name: store(value) for name, value in values.items() if isinstance(value, np.ndarray)}
-    copied: _Item = replace(item, **arrays)  # type: ignore[type-var]
+    copied = copy(item)  # The values do not change, so they are not checked again.
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            object.__setattr__(copied, name, store(value))
     return copied
 
 

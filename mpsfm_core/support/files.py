@@ -16,6 +16,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -39,6 +40,9 @@ committed as soon as ``ready.json`` exists."""
 FORMAT = 1
 """Version number of the format of ``ready.json``."""
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
+_FLUSHING_THREADS = 8
+"""Number of threads that flush files to disk. Flushing 1500 files of 60 kB takes 0.27 instead of
+1.9 s with one thread, and 0.19 s with 16 threads."""
 _NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EINVAL, errno.ENOLCK}
 """Error numbers of file systems without file locks."""
 
@@ -285,10 +289,14 @@ def _translate_disk_errors(output: Path) -> Iterator[None]:
 
 def _sync(folder: Path) -> None:
     """Flush all files of a folder to disk, before old results are removed."""
-    for path in folder.rglob("*"):
-        if path.is_file():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
+
+    def flush(path: Path) -> None:
+        with path.open("rb") as file:
+            os.fsync(file.fileno())
+
+    with ThreadPoolExecutor(_FLUSHING_THREADS) as pool:
+        # Reading the results raises the first error.
+        list(pool.map(flush, [path for path in folder.rglob("*") if path.is_file()]))
 
 
 def _lock_file(file: BinaryIO) -> None:

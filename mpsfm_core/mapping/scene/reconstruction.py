@@ -205,7 +205,7 @@ class Reconstruction:
 
     def state_dict(self) -> StateDict:
         """Return the reconstruction for a checkpoint."""
-        images = [image.state_dict() for image in self.images]
+        images = parallel_map(RegisteredImage.state_dict, self.images)
         return {
             **vars(self),
             "images": images,

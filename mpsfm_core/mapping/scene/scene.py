@@ -23,6 +23,7 @@ from mpsfm_core.mapping.scene.rig_frames import RigFrames
 from mpsfm_core.mapping.scene.tracks import Tracks
 from mpsfm_core.mapping.state import StateDict
 from mpsfm_core.optimize.depth_integration import RefinedDepth
+from mpsfm_core.support.threads import parallel_map
 
 
 class Snapshot(NamedTuple):
@@ -461,14 +462,12 @@ class Scene:
 
     def state_dict(self) -> StateDict:
         """Return the state of the scene for a checkpoint."""
-        maps = [
-            {
-                "scale": m.scale,
-                "active": m.active,
-                "refined": m.refinement and {**vars(m.refinement.result)},
-            }
-            for m in self.maps
-        ]
+
+        def describe(m: DepthMap) -> StateDict:
+            refined = m.refinement and {**vars(m.refinement.result)}
+            return {"scale": m.scale, "active": m.active, "refined": refined}
+
+        maps = parallel_map(describe, self.maps)
         return {**self.snapshot()._asdict(), "maps": maps}
 
     def load_state_dict(self, state: StateDict) -> None:
