@@ -149,11 +149,12 @@ def _collect_correspondences(
             if other not in point_ids or image not in examined:
                 continue
             points = point_ids[other][pair.matches[:, 1 - column]]
-            rows = np.stack([pair.matches[:, column], points], axis=1)[points >= 0]
-            matches.setdefault(image, []).append(rows)
+            # One integer per correspondence: sorting integers is faster than sorting rows.
+            codes = pair.matches[:, column] * len(model.points) + points
+            matches.setdefault(image, []).append(codes[points >= 0])
     correspondences = {}
     for image, parts in matches.items():
-        keypoints, points = np.unique(np.concatenate(parts), axis=0).T
+        keypoints, points = np.divmod(np.unique(np.concatenate(parts)), len(model.points))
         is_own = np.isin(points, point_ids.get(image, no_points))
         is_used = num_observers[points] - is_own >= MIN_OTHER_IMAGES
         correspondences[image] = keypoints[is_used], points[is_used]
