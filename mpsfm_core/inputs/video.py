@@ -65,16 +65,18 @@ _MAX_CUT_RATIO = 0.2
 """Share of the points that are tracked from one frame to the next below which there may be a cut.
 [ours]"""
 _MAX_CUT_CORRELATION = 0.5
-"""Correlation of two successive frames below which there is a cut, if tracking fails too. [ours]"""
+"""Correlation of the thumbnails of two successive frames below which there may be a cut, if
+tracking fails too. [ours]"""
 _MIN_COMMON_KEYPOINTS = 30
-"""Number of SIFT matches with a common homography from which there is no cut between two successive
-frames. The camera may have turned too fast for tracking. [tuned: benchmarks.walks]"""
+"""Minimum number of homography inliers among the SIFT matches of two successive frames that shows
+that the camera turned fast and there is no cut. [tuned: benchmarks.walks]"""
 _MAX_CUT_KEYPOINTS = 1000
-"""Maximum number of SIFT keypoints per frame that are matched across a possible cut."""
+"""Maximum number of SIFT keypoints of each of the two frames at a possible cut."""
 _MAX_MATCH_RATIO = 0.8
-"""Maximum ratio of the distances to the nearest and the second nearest descriptor. [Lowe 2004]"""
+"""Maximum distance ratio of the nearest to the second nearest descriptor of a SIFT match. [Lowe
+2004]"""
 _MAX_HOMOGRAPHY_ERROR_PX = 5.0
-"""Maximum error of a match with a common homography, in pixels of the downscaled frames. [ours]"""
+"""Maximum transfer error of a homography inlier, in pixels of the downscaled frames. [ours]"""
 _MIN_CONTRAST = 4.0
 """Minimum std of the gray levels of a frame before or after a cut, so that a black
 frame is no cut."""
@@ -478,7 +480,10 @@ class _Track:
 
 
 def _is_cut(last: UInt8, gray: UInt8) -> bool:
-    """Return whether two successive frames have neither similar thumbnails nor enough matches."""
+    """Return whether there is a cut between two successive frames, of which tracking failed.
+
+    There is none if the thumbnails correlate, or if enough SIFT matches fit one homography.
+    """
     small = [
         cv2.resize(frame, _THUMBNAIL, interpolation=cv2.INTER_AREA).astype(np.float64).ravel()
         for frame in (last, gray)
@@ -494,7 +499,7 @@ def _is_cut(last: UInt8, gray: UInt8) -> bool:
 
 
 def _count_common_keypoints(first: UInt8, second: UInt8) -> int:
-    """Count the SIFT matches of two gray images that have a common homography."""
+    """Count the homography inliers among the SIFT matches of two gray images."""
     sift = cv2.SIFT.create(_MAX_CUT_KEYPOINTS)
     found = [sift.detectAndCompute(image, None) for image in (first, second)]
     if min(len(keypoints) for keypoints, _ in found) < _MIN_COMMON_KEYPOINTS:

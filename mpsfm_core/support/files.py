@@ -41,8 +41,8 @@ FORMAT = 1
 """Version number of the format of ``ready.json``."""
 _DISK_FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 _FLUSHING_THREADS = 8
-"""Number of threads that flush files to disk. Flushing 1500 files of 60 kB takes 0.27 instead of
-1.9 s with one thread, and 0.19 s with 16 threads."""
+"""Number of threads that flush the files of a folder to disk. For 1500 files of 60 kB, one thread
+takes 1.9 s, 8 threads take 0.27 s and 16 threads 0.19 s."""
 _NO_LOCKS = {errno.ENOTSUP, errno.ENOSYS, errno.EBADF, errno.EINVAL, errno.ENOLCK}
 """Error numbers of file systems without file locks."""
 
@@ -295,7 +295,7 @@ def _sync(folder: Path) -> None:
             os.fsync(file.fileno())
 
     with ThreadPoolExecutor(_FLUSHING_THREADS) as pool:
-        # Reading the results raises the first error.
+        # The iterator of pool.map raises the OSError of a file that cannot be flushed.
         list(pool.map(flush, [path for path in folder.rglob("*") if path.is_file()]))
 
 

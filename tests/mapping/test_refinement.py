@@ -107,7 +107,10 @@ def test_refined_depth_does_not_change_poses() -> None:
 
 
 def adjusted(group: Component, *, rough: bool) -> Float64:
-    """Return the camera centers after one adjustment of pushed points."""
+    """Return the camera centers after bundle adjustment of points moved away from image 2.
+
+    The scene is unchanged afterwards.
+    """
     before = group.scene.snapshot()
     push(group, 2, 1.02)
     group.refiner.adjust([0, 1, 2], rough=rough)

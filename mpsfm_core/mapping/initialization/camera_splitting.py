@@ -149,7 +149,8 @@ def _collect_correspondences(
             if other not in point_ids or image not in examined:
                 continue
             points = point_ids[other][pair.matches[:, 1 - column]]
-            # One integer per correspondence: sorting integers is faster than sorting rows.
+            # np.unique sorts integers faster than rows, so each keypoint and its point are
+            # combined to one integer.
             codes = pair.matches[:, column] * len(model.points) + points
             matches.setdefault(image, []).append(codes[points >= 0])
     correspondences = {}

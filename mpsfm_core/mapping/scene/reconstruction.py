@@ -204,7 +204,7 @@ class Reconstruction:
         return tuple(image for image in self.confirmed_images if not image.held_out)
 
     def state_dict(self) -> StateDict:
-        """Return the reconstruction for a checkpoint."""
+        """Return the reconstruction for a checkpoint; pending depth maps are computed."""
         images = parallel_map(RegisteredImage.state_dict, self.images)
         return {
             **vars(self),

@@ -461,11 +461,11 @@ class Scene:
                     depth_map.set_scale(scale)
 
     def state_dict(self) -> StateDict:
-        """Return the state of the scene for a checkpoint."""
+        """Return the state of the scene for a checkpoint; pending depth maps are refined."""
 
-        def describe(m: DepthMap) -> StateDict:
-            refined = m.refinement and {**vars(m.refinement.result)}
-            return {"scale": m.scale, "active": m.active, "refined": refined}
+        def describe(depth_map: DepthMap) -> StateDict:
+            refined = depth_map.refinement and {**vars(depth_map.refinement.result)}
+            return {"scale": depth_map.scale, "active": depth_map.active, "refined": refined}
 
         maps = parallel_map(describe, self.maps)
         return {**self.snapshot()._asdict(), "maps": maps}
