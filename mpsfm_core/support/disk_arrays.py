@@ -109,7 +109,10 @@ class DiskArrays:
         self._usable = True
 
     def store(self, array: NDArray[_T]) -> NDArray[_T]:
-        """Store an array; return an array of equal values, on disk above the memory limit."""
+        """Store an array; return an equal array, on disk above the memory limit.
+
+        The returned array is read-only if ``array`` is.
+        """
         with self._lock:
             if array.nbytes <= self._memory_left:
                 self._memory_left -= array.nbytes
@@ -121,6 +124,8 @@ class DiskArrays:
         chunk, start = allocation
         stored = np.frombuffer(chunk, array.dtype, array.size, start).reshape(array.shape)
         stored[...] = array
+        # Kernels are compiled separately for writable and read-only arrays.
+        stored.flags.writeable = array.flags.writeable
         return stored
 
     def _allocate(self, size: int) -> tuple[mmap.mmap, int] | None:

@@ -52,6 +52,14 @@ def test_any_type_and_no_values(tmp_path: Path, dtype: type) -> None:
         np.testing.assert_array_equal(found, values)
 
 
+def test_read_only_arrays_stay_read_only(tmp_path: Path) -> None:
+    disk = DiskArrays(tmp_path, in_memory=0)
+    values = array(0)
+    assert disk.store(values).flags.writeable
+    values.flags.writeable = False
+    assert not disk.store(values).flags.writeable
+
+
 def test_without_a_disk_all_stay_in_memory(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
