@@ -389,13 +389,17 @@ class Component:
         return within
 
     def finalize(self) -> None:
-        """Refine all images and guessed cameras a last time, and repeat the depth check."""
+        """Refine all images and guessed cameras a last time, and repeat the depth check.
+
+        The refinement is skipped if the model has not changed since the last refinement.
+        """
         refiner = self.refiner
         is_calibrated = refiner.calibrates_with_long_tracks or not refiner.can_refine_focals()
         if self.maintenance.is_checked and is_calibrated:
             return
         refiner.calibrates_with_long_tracks = True
-        self.maintenance.refine_globally()
+        if not (self.maintenance.is_refined and is_calibrated):
+            self.maintenance.refine_globally()
         consistency = self._options.consistency
         if consistency.enabled and consistency.check_at_end:
             self.maintenance.check_all_images(MAX_FINAL_VIOLATIONS, "final-check")

@@ -39,6 +39,10 @@ class ModelState(NamedTuple):
     noise: DepthNoise
     loss_scale: float
     """Measured scale of the reprojection loss, in standard deviations of the keypoint position."""
+    calibrates_with_long_tracks: bool
+    """See :class:`Refiner`."""
+    is_refined: bool
+    """See :class:`ModelMaintenance`."""
 
 
 class ModelMaintenance:
@@ -51,6 +55,8 @@ class ModelMaintenance:
         history: Record of failed and successful image registration attempts.
         thresholds: Acceptance thresholds of image registration, which relax if no image can be
             registered.
+        is_refined: True if no image was registered or deregistered after the last global
+            refinement.
     """
 
     def __init__(
@@ -63,6 +69,7 @@ class ModelMaintenance:
         self.history = RegistrationHistory(options.registration)
         self.thresholds = ThresholdSchedule(options.registration)
         self._depth_check = DepthConsistencyCheck(self.scene, options.consistency)
+        self.is_refined = False
         self._last_size = (0, 0)
         self._checked: Bool = np.zeros(self.scene.num_images, dtype=np.bool_)
         self._wrong_depth: frozenset[int] = frozenset()
@@ -81,28 +88,42 @@ class ModelMaintenance:
     def state(self) -> ModelState:
         """Return a copy of the model for :meth:`restore`."""
         refiner = self.refiner
-        masks = self._checked.copy(), refiner.keeps_depth_map.copy()
-        return ModelState(self.scene.snapshot(), *masks, refiner.noise, refiner.loss_scale)
+        return ModelState(
+            self.scene.snapshot(),
+            self._checked.copy(),
+            refiner.keeps_depth_map.copy(),
+            refiner.noise,
+            refiner.loss_scale,
+            refiner.calibrates_with_long_tracks,
+            self.is_refined,
+        )
 
     def restore(self, state: ModelState) -> None:
         """Roll back to an earlier model state and clear the history of later registrations."""
+        refiner = self.refiner
         self.scene.restore(state.scene)
-        self._checked = state.checked.copy()
-        self.refiner.keeps_depth_map = state.keeps_depth_map.copy()
-        self.refiner.noise, self.refiner.loss_scale = state.noise, state.loss_scale
+        self._checked, self.is_refined = state.checked.copy(), state.is_refined
+        refiner.keeps_depth_map = state.keeps_depth_map.copy()
+        refiner.noise, refiner.loss_scale = state.noise, state.loss_scale
+        refiner.calibrates_with_long_tracks = state.calibrates_with_long_tracks
         self.history.clear()
 
     def state_dict(self) -> StateDict:
         """Return the state of the model for a checkpoint."""
         parts = {name: part.state_dict() for name, part in self._parts().items()}
-        return {**parts, "last_size": self._last_size, "checked": self._checked}
+        return {
+            **parts,
+            "last_size": self._last_size,
+            "checked": self._checked,
+            "is_refined": self.is_refined,
+        }
 
     def load_state_dict(self, state: StateDict) -> None:
         """Restore the state of the model from a checkpoint of the same mapping problem."""
         for name, part in self._parts().items():
             part.load_state_dict(state[name])
         self._last_size = tuple(state["last_size"])
-        self._checked = state["checked"]
+        self._checked, self.is_refined = state["checked"], state["is_refined"]
 
     def _parts(self) -> dict[str, Stateful]:
         """Return the model parts that a checkpoint stores, in their order of restoration."""
@@ -119,10 +140,14 @@ class ModelMaintenance:
         self.scene.restore(empty)
         self.refiner.reset()
         self._checked[:] = False
-        self._last_size = (0, 0)
+        self._last_size, self.is_refined = (0, 0), False
 
     def refine_if_grown(self) -> None:
-        """Refine all images if the number of images or points grew by ``GLOBAL_GROWTH``."""
+        """Refine all images if the number of images or points grew by ``GLOBAL_GROWTH``.
+
+        Call this method after the registration of an image.
+        """
+        self.is_refined = False
         num_images, num_points = self.size, len(self.scene.tracks)
         growth = 1 + GLOBAL_GROWTH
         if num_images > growth * self._last_size[0] or num_points > growth * self._last_size[1]:
@@ -131,11 +156,15 @@ class ModelMaintenance:
     def refine_new_images(self) -> bool:
         """Run global refinement if the number of images has grown since the last one.
 
+        Call this method if no further image can be registered, because the refinement is the last
+        one if this does not change.
+
         Returns:
             True if the images were refined.
         """
         is_larger = self.size > self._last_size[0]
         if is_larger:
+            self.refiner.calibrates_with_long_tracks = True
             self.refine_globally()
         return is_larger
 
@@ -150,6 +179,7 @@ class ModelMaintenance:
         reason = ImageReason.LOST_POINTS.because(step="global-refinement")
         self.deregister(find_lost_images(self.scene), reason)
         self.deregister_disconnected(ImageReason.DISCONNECTED.because(step="global-refinement"))
+        self.is_refined = True
         self.event_log.scene_changed(self.scene)
 
     def check_all_images(
@@ -254,7 +284,7 @@ class ModelMaintenance:
         for image in self.scene.rigs.complete(images):
             if self.refiner.fixed[image]:
                 continue
-            self._checked[image] = False
+            self._checked[image] = self.is_refined = False
             self.refiner.keeps_depth_map[image] = False
             self.scene.deregister(image)
             self.history.clear_pose_rejections()

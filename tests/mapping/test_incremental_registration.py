@@ -166,6 +166,25 @@ def test_image_contradicted_by_drift_is_registered_after_global_refinement(
         assert reason.code is ImageReason.CONTRADICTS_IMAGE
 
 
+def test_unchanged_model_is_not_refined_again_at_the_end(component: Component) -> None:
+    maintenance = component.maintenance
+
+    def count_refinements() -> int:
+        return maintenance.event_log.report([]).counts["global refinement"]
+
+    maintenance.deregister([4], ImageReason.NO_POSE.because())
+    maintenance.refine_globally()
+    component.register_images(component.scene.mask([4]))
+    assert maintenance.refine_new_images()
+    before = count_refinements()
+    component.finalize()
+    assert maintenance.is_checked and count_refinements() == before
+    maintenance.deregister([4], ImageReason.NO_POSE.because())
+    component.register_images(component.scene.mask([4]))
+    component.finalize()
+    assert component.scene.registered[4] and count_refinements() == before + 1
+
+
 @pytest.mark.parametrize(("is_connected", "sizes"), [(True, [6]), (False, [4, 2])])
 def test_larger_component_takes_images_of_smaller_one(is_connected: bool, sizes: list[int]) -> None:
     problem = make_mapping_problem(room_scene(), CAMERA, arc_poses(6, 14.0))
