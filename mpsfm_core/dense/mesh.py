@@ -39,7 +39,7 @@ from mpsfm_core.geometry import (
 )
 from mpsfm_core.geometry.statistics import unique_rows
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.support.disk_arrays import ArrayStore, current_store
+from mpsfm_core.support.disk_arrays import current_store
 from mpsfm_core.support.jit import kernel
 from mpsfm_core.support.threads import parallel_map
 
@@ -172,7 +172,7 @@ def mesh_depth_maps(
     """
     marching_cubes, simplify = _import_libraries()
     images = reconstruction.dense_images
-    maps = _weight_depth_maps(images, options.max_hole_px, current_store())
+    maps = _weight_depth_maps(images, options.max_hole_px)
     if not maps:
         raise InputError(
             "cannot build a mesh: no pixel of the depth maps is certain and consistent; "
@@ -225,7 +225,7 @@ def _import_libraries() -> tuple[Any, Any]:
 
 
 def _weight_depth_maps(
-    images: Sequence[RegisteredImage], max_hole_px: float, store_array: ArrayStore
+    images: Sequence[RegisteredImage], max_hole_px: float
 ) -> list[_WeightedDepth]:
     """Weight the consistent pixels and the pixels in closed holes of all images that have any."""
     voters = select_voters(images)
@@ -237,15 +237,13 @@ def _weight_depth_maps(
     ]
     seen_through = find_seen_through(images, voters, confirmed, holes, MAX_STEP)
     return [
-        _weight_depth(image, views > 0, hole & ~open_space, store_array)
+        _weight_depth(image, views > 0, hole & ~open_space)
         for image, views, hole, open_space in zip(images, counts, holes, seen_through, strict=True)
         if views.any()
     ]
 
 
-def _weight_depth(
-    image: RegisteredImage, mask: Bool, filled: Bool, store_array: ArrayStore
-) -> _WeightedDepth:
+def _weight_depth(image: RegisteredImage, mask: Bool, filled: Bool) -> _WeightedDepth:
     """Weight the pixels of a mask by their variance, and add the pixels in closed holes."""
     height, width = image.depth.shape
     variance = image.depth.variance
@@ -256,7 +254,8 @@ def _weight_depth(
     depth = np.where(mask | filled, image.depth.depth, 0).astype(np.float32)
     intrinsics = image.camera.resized(width, height).params
     slant = compute_slant(image.depth.depth, intrinsics)
-    maps = (store_array(depth), store_array(weight), store_array(slant), store_array(filled))
+    store = current_store()
+    maps = store(depth), store(weight), store(slant), store(filled)
     return _WeightedDepth(image, intrinsics, *maps)
 
 

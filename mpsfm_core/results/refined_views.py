@@ -33,7 +33,7 @@ from mpsfm_core.inputs.images import ImageSet, SourceImage
 from mpsfm_core.mapping.depth_map_refinement import refine_depth_maps
 from mpsfm_core.mapping.options import MapperOptions
 from mpsfm_core.mapping.scene.reconstruction import Reconstruction, RegisteredImage
-from mpsfm_core.support.disk_arrays import ArrayStore, current_store, store_fields
+from mpsfm_core.support.disk_arrays import current_store, store_fields
 from mpsfm_core.support.lru_cache import LruCache
 from mpsfm_core.support.threads import parallel_map
 
@@ -93,7 +93,6 @@ def undistort_problem(
         refined: Images with the refined cameras, in the same order.
         problem: Mapping problem with keypoints and priors on the views of ``images``.
     """
-    store = current_store()  # Worker threads do not inherit it.
     warps: LruCache[object, _ViewWarp] = LruCache(_CACHED_WARPS, lambda _: 1)
 
     def move(sources: tuple[SourceImage, SourceImage, MappingImage]) -> MappingImage:
@@ -101,7 +100,7 @@ def undistort_problem(
         if new is old:
             return view
         key = camera_key(old.camera), old.pinhole, camera_key(new.camera), new.pinhole
-        return warps.get(key, partial(_ViewWarp, old, new)).move_view(view, store)
+        return warps.get(key, partial(_ViewWarp, old, new)).move_view(view)
 
     views = parallel_map(move, zip(images, refined, problem.images, strict=True))
     return replace(problem, images=tuple(views))
@@ -174,8 +173,9 @@ class _ViewWarp:
         self._old, self._new = old, new
         self._pixels: dict[tuple[int, int], Float32] = {}
 
-    def move_view(self, image: MappingImage, store: ArrayStore) -> MappingImage:
+    def move_view(self, image: MappingImage) -> MappingImage:
         """Return an image of the mapping problem with keypoints and priors on the new view."""
+        store = current_store()
         return replace(
             image,
             camera=self._new.pinhole,

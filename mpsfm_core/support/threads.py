@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from contextvars import ContextVar
+from contextvars import ContextVar, copy_context
 from functools import cache
 from typing import TypeVar
 
@@ -57,9 +57,18 @@ def thread_limit() -> int:
 
 
 def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> list[Result]:
-    """Call a function on every list item in parallel threads; return the results in order."""
+    """Call a function on every list item in parallel threads; return the results in order.
+
+    The threads have the context variables of the calling thread, such as the thread limit.
+    """
+    context = copy_context()
+
+    def call(item: Item) -> Result:
+        # A context can only be entered once at a time.
+        return context.copy().run(function, item)
+
     with ThreadPoolExecutor(thread_limit()) as pool:
-        return list(pool.map(function, items))
+        return list(pool.map(call, items))
 
 
 @contextmanager

@@ -10,6 +10,7 @@ import pytest
 
 import mpsfm_core.support.disk_arrays
 from mpsfm_core.support.disk_arrays import DiskArrays, current_store, is_on_disk, store_on_disk
+from mpsfm_core.support.threads import parallel_map
 
 SIZE = 2**20
 
@@ -77,3 +78,11 @@ def test_store_on_disk_is_the_current_store_inside_the_block(tmp_path: Path) -> 
     assert stored is not values
     np.testing.assert_array_equal(stored, values)
     assert current_store()(values) is values
+
+
+def test_threads_of_parallel_map_use_the_current_store(tmp_path: Path) -> None:
+    with store_on_disk(tmp_path, in_memory=0):
+        stored = parallel_map(lambda seed: current_store()(array(seed)), range(4))
+    for seed, each in enumerate(stored):
+        assert is_on_disk(each)
+        np.testing.assert_array_equal(each, array(seed))

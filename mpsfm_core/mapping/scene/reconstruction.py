@@ -270,13 +270,12 @@ def compute_depth_maps(
     Returns:
         The reconstructions with stored depth maps.
     """
-    store = current_store()
 
     def compute(image: RegisteredImage) -> RegisteredImage:
         if isinstance(image.depth, LazyDepth):
             image.depth.compute()
             return image
-        return replace(image, depth=store_fields(image.depth, store))
+        return replace(image, depth=store_fields(image.depth, current_store()))
 
     return tuple(
         replace(part, images=tuple(parallel_map(compute, part.images))) for part in reconstructions
