@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -24,7 +23,7 @@ from mpsfm_core.inputs.image_decoding import (
 )
 from mpsfm_core.inputs.image_header import has_alpha, read_header
 from mpsfm_core.inputs.image_search import list_names, walk_files
-from mpsfm_core.support.threads import thread_limit
+from mpsfm_core.support.threads import parallel_map
 
 _log = logging.getLogger(__name__)
 
@@ -148,8 +147,7 @@ def orient_masks(
     Raises:
         InputError: a mask cannot be decoded, is too large, or has another size than its image.
     """
-    with ThreadPoolExecutor(thread_limit()) as pool:
-        probed = list(pool.map(lambda path: _probe(path, max_pixels), masks.values()))
+    probed = parallel_map(lambda path: _probe(path, max_pixels), masks.values())
     turned: dict[str, MaskFile] = {}
     faults: dict[str, str] = {}
     ambiguous, num_stored, num_upright = [], 0, 0

@@ -65,18 +65,20 @@ _MAX_CUT_RATIO = 0.2
 """Share of the points that are tracked from one frame to the next below which there may be a cut.
 [ours]"""
 _MAX_CUT_CORRELATION = 0.5
-"""Correlation of the thumbnails of two successive frames below which there may be a cut, if
-tracking fails too. [ours]"""
+"""Maximum correlation of the thumbnails of two successive frames at a cut. The thumbnails are
+compared if points cannot be tracked from one frame to the next. [ours]"""
 _MIN_COMMON_KEYPOINTS = 30
 """Minimum number of homography inliers among the SIFT matches of two successive frames that shows
 that the camera turned fast and there is no cut. [tuned: benchmarks.walks]"""
 _MAX_CUT_KEYPOINTS = 1000
-"""Maximum number of SIFT keypoints of each of the two frames at a possible cut."""
+"""Maximum number of SIFT keypoints per frame, with which a possible cut between two frames is
+checked."""
 _MAX_MATCH_RATIO = 0.8
 """Maximum distance ratio of the nearest to the second nearest descriptor of a SIFT match. [Lowe
 2004]"""
 _MAX_HOMOGRAPHY_ERROR_PX = 5.0
-"""Maximum transfer error of a homography inlier, in pixels of the downscaled frames. [ours]"""
+"""Maximum distance of a matched keypoint from the keypoint that the homography transfers from the
+other frame, for an inlier, in pixels of the downscaled frames. [ours]"""
 _MIN_CONTRAST = 4.0
 """Minimum std of the gray levels of a frame before or after a cut, so that a black
 frame is no cut."""
@@ -480,7 +482,7 @@ class _Track:
 
 
 def _is_cut(last: UInt8, gray: UInt8) -> bool:
-    """Return whether there is a cut between two successive frames, of which tracking failed.
+    """Return whether there is a cut between two successive frames, after tracking has failed.
 
     There is none if the thumbnails correlate, or if enough SIFT matches fit one homography.
     """

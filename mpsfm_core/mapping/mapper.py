@@ -19,7 +19,7 @@ The steps of :func:`reconstruct`, compared with COLMAP's ``IncrementalMapper``::
                 select the next image, estimate its pose, verify it by depth, triangulate
                 refine locally; refine globally if the model has grown
             component.reregister_images()               # misregistered images in other poses
-            component.finalize()                        # global refinement, depth check of all
+            component.finalize()                        # last refinement, depth check of all
         stop if enough matches are explained, no guessed focal length was far off, no image
             deviates from the focal length of its shared camera, and no rig got calibrated
     select the run with the highest score               # likelihood of matches and depth

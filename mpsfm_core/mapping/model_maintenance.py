@@ -143,8 +143,9 @@ class ModelMaintenance:
         self._last_size, self.is_refined = (0, 0), False
 
     def refine_if_grown(self) -> None:
-        """Refine all images if the number of images or points grew by ``GLOBAL_GROWTH``.
+        """Run global refinement if the model has grown by the ratio ``GLOBAL_GROWTH``.
 
+        The numbers of images and points are compared with those after the last global refinement.
         Call this method after the registration of an image.
         """
         self.is_refined = False
@@ -156,8 +157,8 @@ class ModelMaintenance:
     def refine_new_images(self) -> bool:
         """Run global refinement if the number of images has grown since the last one.
 
-        Call this method if no further image can be registered, because the refinement is the last
-        one if this does not change.
+        Call this method if no further image can be registered. If none can be registered afterwards
+        either, this refinement is the last one.
 
         Returns:
             True if the images were refined.

@@ -109,9 +109,10 @@ class DiskArrays:
         self._usable = True
 
     def store(self, array: NDArray[_T]) -> NDArray[_T]:
-        """Store an array; return an equal array, on disk above the memory limit.
+        """Keep an array in memory, or copy the array to a file if the memory limit is reached.
 
-        The returned array is read-only if ``array`` is.
+        Returns:
+            The array or its copy in the file. The copy is read-only if the array is.
         """
         with self._lock:
             if array.nbytes <= self._memory_left:

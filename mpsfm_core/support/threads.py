@@ -64,7 +64,7 @@ def parallel_map(function: Callable[[Item], Result], items: Iterable[Item]) -> l
     context = copy_context()
 
     def call(item: Item) -> Result:
-        # A context can only be entered once at a time.
+        # Two threads cannot run in the same context, so each call runs in a copy.
         return context.copy().run(function, item)
 
     with ThreadPoolExecutor(thread_limit()) as pool:

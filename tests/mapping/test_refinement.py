@@ -107,9 +107,9 @@ def test_refined_depth_does_not_change_poses() -> None:
 
 
 def adjusted(group: Component, *, rough: bool) -> Float64:
-    """Return the camera centers after bundle adjustment of points moved away from image 2.
+    """Move the points of image 2, and return the camera centers after bundle adjustment.
 
-    The scene is unchanged afterwards.
+    The scene is restored afterwards.
     """
     before = group.scene.snapshot()
     push(group, 2, 1.02)
