@@ -179,23 +179,36 @@ def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int])
         np.concatenate([ends[of_image] for of_image in edges] or [ends[:0]])
         for ends in (graph.source, graph.target)
     )
-    while _merge_disjoint_pairs(scene, options, source, target):
-        pass
+    is_open = np.ones(len(scene.tracks.xyz), dtype=np.bool_)
+    while is_open.any():
+        is_open = _merge_disjoint_pairs(scene, options, source, target, is_open)
 
 
 def _merge_disjoint_pairs(
-    scene: Scene, options: TriangulationOptions, source: Int64, target: Int64
-) -> bool:
-    """Merge pairs of matched points that have no point in common, and return whether any merged."""
+    scene: Scene, options: TriangulationOptions, source: Int64, target: Int64, is_open: Bool
+) -> Bool:
+    """Merge pairs of matched points that have no point in common.
+
+    Args:
+        scene: The scene.
+        options: Options of triangulation.
+        source: (m,) keypoints of the first images of the matches.
+        target: (m,) keypoints of the second images of the matches.
+        is_open: Mask of the points of the scene; only pairs with one or two of them are merged.
+
+    Returns:
+        Mask of the points of pairs that can be merged next, as after merging no other pair can.
+    """
     tracks, graph = scene.tracks, scene.graph
     p, q = tracks.point_of[source], tracks.point_of[target]
-    differ = (p >= 0) & (q >= 0) & (p != q)
+    differ = (p >= 0) & (q >= 0) & (p != q) & (is_open[p] | is_open[q])
+    is_open = np.zeros(len(is_open), dtype=np.bool_)
     low, high = np.minimum(p, q)[differ], np.maximum(p, q)[differ]
     num_points = len(tracks.xyz)
     keys = np.unique(low * num_points + high)
     candidates = np.stack(np.divmod(keys, max(num_points, 1)), axis=1)
     if not len(candidates):
-        return False
+        return is_open
     points, rows_of_candidates = np.unique(candidates, return_inverse=True)
     rows_of_candidates = rows_of_candidates.reshape(candidates.shape)
     observations, observed_rows = tracks.observations_of(points)
@@ -222,7 +235,8 @@ def _merge_disjoint_pairs(
     tracks.xyz[remaining] = mean[is_disjoint]
     keypoints, rows = tracks.observations_of(merged)
     tracks.point_of[keypoints] = remaining[rows]
-    return bool(is_disjoint.any())
+    is_open[remaining] = is_open[candidates[~is_disjoint]] = True
+    return is_open
 
 
 def lift_low_parallax(scene: Scene, options: TriangulationOptions) -> None:

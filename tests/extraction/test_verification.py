@@ -11,6 +11,7 @@ from mpsfm_core.data.decisions import PairReason
 from mpsfm_core.extraction.matching.verification import verify_matches
 from mpsfm_core.extraction.options import VerificationOptions
 from mpsfm_core.geometry import angle_between_deg, compose, invert, rotation_angle_deg
+from mpsfm_core.geometry.pycolmap_conversion import colmap_from_pinhole
 from mpsfm_core.testing.synthetic.scenes import AnalyticScene, Plane, arc_poses, room_scene
 
 CAMERA = PinholeCamera(640, 480, 500.0, 510.0, 318.0, 243.0)
@@ -18,15 +19,15 @@ OTHER = PinholeCamera(480, 640, 450.0, 450.0, 240.0, 320.0)
 POSES = arc_poses(2, 15.0)
 
 
-def relative_pose() -> tuple[np.ndarray, np.ndarray]:
-    a, b = ((pose[:, :3], pose[:, 3]) for pose in POSES)
+def relative_pose(poses=POSES) -> tuple[np.ndarray, np.ndarray]:
+    a, b = ((pose[:, :3], pose[:, 3]) for pose in poses)
     return compose(b, invert(*a))
 
 
-def correspondences(scene: AnalyticScene, count: int, noise: float, camera_b=CAMERA):
+def correspondences(scene: AnalyticScene, count: int, noise: float, camera_b=CAMERA, poses=POSES):
     rng = np.random.default_rng(count)
     xy = rng.uniform(0, 1, (3 * count, 2)) * CAMERA.size
-    found = scene.correspondences(CAMERA, POSES[0], camera_b, POSES[1], xy)
+    found = scene.correspondences(CAMERA, poses[0], camera_b, poses[1], xy)
     rows = np.flatnonzero(found.visible)[:count]
     assert len(rows) == count
     return xy[rows], found.xy_b[rows] + rng.normal(0, noise, (count, 2))
@@ -94,6 +95,27 @@ def test_verify_matches_of_planar_scene() -> None:
     assert found.configuration in ("planar", "planar or panoramic")
     assert len(found.inliers) > 90
     assert rotation_angle_deg(found.rotation @ relative_pose()[0].T) < 5
+
+
+@pytest.mark.parametrize("angle_deg", [1.0, 1.5])
+def test_verify_matches_of_low_parallax(angle_deg: float) -> None:
+    """COLMAP classifies these pairs as planar, and the homography gives a wrong translation."""
+    poses = arc_poses(2, angle_deg)
+    xy_a, xy_b = correspondences(room_scene(), 400, 0.4, poses=poses)
+    camera = colmap_from_pinhole(CAMERA)
+    options = pycolmap.TwoViewGeometryOptions(compute_relative_pose=True)
+    options.ransac.random_seed = 0
+    rows = np.column_stack([np.arange(400), np.arange(400)]).astype(np.uint32)
+    colmap = pycolmap.estimate_calibrated_two_view_geometry(
+        camera, xy_a, camera, xy_b, rows, options
+    )
+    assert colmap.config == pycolmap.TwoViewGeometryConfiguration.PLANAR
+    found = verify_matches(CAMERA, CAMERA, xy_a, xy_b, VerificationOptions())
+    rotation, translation = relative_pose(poses)
+    assert angle_between_deg(colmap.cam2_from_cam1.translation, translation) > 10
+    assert (found.configuration, len(found.inliers)) == ("calibrated", 400)
+    assert rotation_angle_deg(found.rotation @ rotation.T) < 0.1
+    assert angle_between_deg(found.translation, translation) < 1.5
 
 
 def test_verify_matches_of_pure_rotation() -> None:

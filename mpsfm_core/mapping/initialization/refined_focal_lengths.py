@@ -27,6 +27,9 @@ MIN_FOCAL_CHANGE = 1.1
 relative poses of pairs, so that the mapper runs again. [ours]"""
 MAX_ERROR_PX = 4.0
 """Largest error of an inlier of the two-view geometry. [COLMAP two-view max_error]"""
+MAX_MATCHES = 100
+"""Approximate maximum number of matches of a pair that estimate its relative pose; the run time is
+nearly proportional. [tuned: benchmarks/results/pairs.md]"""
 MIN_INLIER_RATIO = 0.25
 """Assumed inlier ratio from which RANSAC computes its number of trials. [COLMAP two-view
 min_inlier_ratio]
@@ -125,11 +128,12 @@ def _estimate_relative_pose(
         seed: Seed of RANSAC.
     """
     image_a, image_b = problem.images[pair.image_a], problem.images[pair.image_b]
+    matches = pair.matches[:: max(1, len(pair) // MAX_MATCHES)]
     geometry = estimate_two_view_geometry(
         image_a.camera,
         image_b.camera,
-        keypoints[pair.image_a][pair.matches[:, 0]],
-        keypoints[pair.image_b][pair.matches[:, 1]],
+        keypoints[pair.image_a][matches[:, 0]],
+        keypoints[pair.image_b][matches[:, 1]],
         max_error_px=MAX_ERROR_PX * max(image_a.keypoint_std_px, image_b.keypoint_std_px),
         min_inlier_ratio=MIN_INLIER_RATIO,
         min_inliers=MIN_INLIERS,
