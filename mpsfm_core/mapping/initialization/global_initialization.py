@@ -8,6 +8,8 @@
 3. Average the relative rotations by IRLS with a Cauchy loss.
 4. Solve for the scales of the depth priors, then for the camera centers. Depth scales and camera
    centers are the solutions of linear least-squares problems, solved by IRLS with a Cauchy loss.
+   A prior keeps the scales of metric depth maps similar. Without it, depth errors that grow with
+   the distance would add up along the path of the camera.
    IRLS starts from the edges on cycles of three or four images, because a few wrong edges between
    distant images would bend the first solution of a large view graph.
 5. Remove the image pairs that disagree with the estimated poses, and return the poses of the
@@ -123,8 +125,16 @@ def estimate_global_poses(scene: Scene, candidates: Bool) -> GlobalPoses | None:
     first_weights = np.where(is_confirmed, 1.0, UNCONFIRMED_WEIGHT)
     log_ratios = edges.log_length[:, 0] - edges.log_length[:, 1]
     group = scene.depth_group_of  # depth priors of one depth group share a scale
+    is_metric = np.array([depth_map.prior.metric for depth_map in scene.maps])
+    num_metric = np.bincount(group[is_metric], minlength=num_images)
     group_log_scales = average_differences(
-        group[edges.a], group[edges.b], log_ratios, edges.weight, num_images, first_weights
+        group[edges.a],
+        group[edges.b],
+        log_ratios,
+        edges.weight,
+        num_images,
+        first_weights,
+        float(np.median(edges.weight)) * num_metric.astype(np.float64),
     )
     log_scales = group_log_scales[group]
     lengths = np.exp((log_scales[edges.a] + log_scales[edges.b] + edges.log_length.sum(axis=1)) / 2)
@@ -192,6 +202,7 @@ def average_differences(
     weights: Float64,
     num_nodes: int,
     first_weights: Float64,
+    prior_weights: Float64 | float = 0.0,
 ) -> Float64:
     """Solve ``x[b] - x[a] = differences`` for node values ``x`` by IRLS with a Cauchy loss.
 
@@ -202,6 +213,7 @@ def average_differences(
         weights: (m,) weight of each graph edge.
         num_nodes: Number of nodes.
         first_weights: (m,) weights that replace those of the loss in the first iteration.
+        prior_weights: (num_nodes,) weights of the prior ``x = 0`` of the nodes.
 
     Returns:
         (num_nodes, ...) node values with mean 0. All graph nodes without edges share one value.
@@ -209,7 +221,9 @@ def average_differences(
     measured = differences.reshape(len(differences), -1)
     robust_weights = first_weights
     for _ in range(NUM_ITERATIONS):
-        values = _solve_differences(a, b, measured, weights * robust_weights, num_nodes)
+        values = _solve_differences(
+            a, b, measured, weights * robust_weights, num_nodes, prior_weights
+        )
         errors = np.linalg.norm(values[b] - values[a] - measured, axis=1)
         robust_weights = _cauchy_weights(errors)
     values -= values.mean(axis=0)
@@ -217,12 +231,17 @@ def average_differences(
 
 
 def _solve_differences(
-    a: Int64, b: Int64, differences: Float64, weights: Float64, num_nodes: int
+    a: Int64,
+    b: Int64,
+    differences: Float64,
+    weights: Float64,
+    num_nodes: int,
+    prior_weights: Float64 | float = 0.0,
 ) -> Float64:
     """Solve for node values (n, d) by weighted linear least squares on their differences."""
     ends = np.concatenate([a, b])
     degree = np.bincount(ends, np.concatenate([weights, weights]), minlength=num_nodes)
-    diagonal = degree + DAMPING * degree.max()
+    diagonal = degree + DAMPING * degree.max() + prior_weights
     nodes = np.arange(num_nodes)
     entries = np.concatenate([-weights, -weights, diagonal])
     rows_and_columns = np.concatenate([a, b, nodes]), np.concatenate([b, a, nodes])

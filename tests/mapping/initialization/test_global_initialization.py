@@ -190,6 +190,19 @@ def test_average_differences_with_outlier_recovers_values() -> None:
     np.testing.assert_allclose(values, truth - truth.mean(axis=0), atol=1e-3)
 
 
+def test_average_differences_with_prior_do_not_drift() -> None:
+    """A prior limits the sum of small errors along a chain, and keeps local differences."""
+    rng = np.random.default_rng(0)
+    a, b = np.array([(i, i + k) for i in range(97) for k in (1, 2, 3)]).T
+    ones, true = np.ones(len(a)), rng.normal(0, 0.1, 100)
+    steps = true[b] - true[a] + 0.03 * (b - a) + rng.normal(0, 0.02, len(a))
+    drifted = average_differences(a, b, steps, ones, 100, ones) - true
+    values = average_differences(a, b, steps, ones, 100, ones, np.ones(100))
+    assert np.ptp(drifted) > 2
+    assert np.ptp(values - true) < 0.5
+    assert np.corrcoef(np.diff(values), np.diff(true))[0, 1] > 0.9
+
+
 def test_average_differences_start_from_confirmed_edges() -> None:
     """The differences between neighbors are correct, and those between distant nodes are wrong.
 
