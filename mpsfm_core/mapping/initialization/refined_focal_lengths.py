@@ -29,7 +29,7 @@ MAX_ERROR_PX = 4.0
 """Largest error of an inlier of the two-view geometry. [COLMAP two-view max_error]"""
 MAX_MATCHES = 100
 """Approximate maximum number of matches of a pair that estimate its relative pose; the run time is
-nearly proportional. [tuned: benchmarks/results/pairs.md]"""
+nearly proportional. [tuned: benchmarks/results/walks.md]"""
 MIN_INLIER_RATIO = 0.25
 """Assumed inlier ratio from which RANSAC computes its number of trials. [COLMAP two-view
 min_inlier_ratio]
