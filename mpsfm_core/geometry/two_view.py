@@ -37,9 +37,9 @@ def estimate_two_view_geometry(
     """Estimate the two-view geometry of two calibrated images, with relative pose and inliers.
 
     COLMAP classifies a pair as planar, with the relative pose from a homography, if the homography
-    has at least 0.8 times as many inliers as the essential matrix. At low parallax, this is wrong
-    for most pairs. Therefore a planar pair becomes calibrated, with the relative pose from the
-    essential matrix, if the matches clearly prefer this pose.
+    has at least 0.8 times as many inliers as the essential matrix. At low parallax, this is also
+    true if the scene is not planar. Therefore a planar pair becomes calibrated, with the relative
+    pose from the essential matrix, if the matches clearly prefer this pose.
 
     Args:
         camera_a: Camera of the first view.
@@ -85,7 +85,7 @@ def estimate_two_view_geometry(
 def _log_likelihood(
     geometry: pycolmap.TwoViewGeometry, rays_a: Float64, rays_b: Float64, std: float
 ) -> float:
-    """Return the log-likelihood of a relative pose with Cauchy-distributed Sampson errors.
+    """Return the log-likelihood of Cauchy-distributed Sampson errors, up to a constant.
 
     Args:
         geometry: Two-view geometry with a relative pose.

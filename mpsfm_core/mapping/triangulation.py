@@ -197,7 +197,8 @@ def _merge_disjoint_pairs(
         is_open: Mask of the points of the scene; only pairs with one or two of them are merged.
 
     Returns:
-        Mask of the points of pairs that can be merged next, as after merging no other pair can.
+        Mask of the merged points, and of the points of pairs that remain to be merged. Without
+        these points, no further pair can be merged.
     """
     tracks, graph = scene.tracks, scene.graph
     p, q = tracks.point_of[source], tracks.point_of[target]
