@@ -181,7 +181,8 @@ class VerifiedPair:
     translation: Float64
     """(3,) float64 translation of ``cam_b_from_cam_a``, up to scale."""
     calibrated: bool = True
-    """True if the relative pose comes from an essential matrix (CALIBRATED in COLMAP)."""
+    """True if the relative pose comes from an essential matrix, False if it comes from a homography
+    or a fundamental matrix."""
 
     def __post_init__(self) -> None:
         if not 0 <= self.image_a < self.image_b:

@@ -16,11 +16,12 @@ up to twice as long. [tuned: benchmarks/results/walks.md]"""
 MAX_TRIALS = 20_000
 """Maximum number of RANSAC trials. [reference]"""
 MAX_ERROR_STDS = 4.0
-"""Largest error of an inlier in standard deviations of the keypoints. [COLMAP max_error, for
-keypoints with a standard deviation of one pixel]"""
+"""Ratio of ``max_error_px`` to the standard deviation of the keypoints, which the likelihood needs.
+[COLMAP max_error of 4 pixels, if the standard deviation is one pixel]"""
 MIN_EVIDENCE = 3.0
-"""Smallest difference of log-likelihoods with which matches clearly prefer the essential matrix to
-a homography, strong evidence on the scale of Kass and Raftery ("Bayes Factors", 1995)."""
+"""Smallest gain in log-likelihood for which the relative pose comes from the essential matrix and
+not from the homography of a planar pair. The value is strong evidence on the scale of Kass and
+Raftery ("Bayes Factors", 1995)."""
 
 
 def estimate_two_view_geometry(
@@ -39,7 +40,7 @@ def estimate_two_view_geometry(
     COLMAP classifies a pair as planar, with the relative pose from a homography, if the homography
     has at least 0.8 times as many inliers as the essential matrix. At low parallax, this is also
     true if the scene is not planar. Therefore a planar pair becomes calibrated, with the relative
-    pose from the essential matrix, if the matches clearly prefer this pose.
+    pose from the essential matrix, if this pose is clearly more likely.
 
     Args:
         camera_a: Camera of the first view.
@@ -85,7 +86,9 @@ def estimate_two_view_geometry(
 def _log_likelihood(
     geometry: pycolmap.TwoViewGeometry, rays_a: Float64, rays_b: Float64, std: float
 ) -> float:
-    """Return the log-likelihood of Cauchy-distributed Sampson errors, up to a constant.
+    """Return the log-likelihood of all matches for a relative pose.
+
+    The Sampson errors are assumed to be Cauchy-distributed. Constant terms are left out.
 
     Args:
         geometry: Two-view geometry with a relative pose.

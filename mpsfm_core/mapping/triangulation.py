@@ -187,7 +187,7 @@ def merge_tracks(scene: Scene, options: TriangulationOptions, images: list[int])
 def _merge_disjoint_pairs(
     scene: Scene, options: TriangulationOptions, source: Int64, target: Int64, is_open: Bool
 ) -> Bool:
-    """Merge pairs of matched points that have no point in common.
+    """Merge 3D points whose keypoints match, each point with at most one other point.
 
     Args:
         scene: The scene.

@@ -99,7 +99,7 @@ def test_verify_matches_of_planar_scene() -> None:
 
 @pytest.mark.parametrize("angle_deg", [1.0, 1.5])
 def test_verify_matches_of_low_parallax(angle_deg: float) -> None:
-    """COLMAP classifies these pairs as planar, and the homography gives a wrong translation."""
+    """COLMAP classifies a room at low parallax as planar, and its translation is wrong."""
     poses = arc_poses(2, angle_deg)
     xy_a, xy_b = correspondences(room_scene(), 400, 0.4, poses=poses)
     camera = colmap_from_pinhole(CAMERA)

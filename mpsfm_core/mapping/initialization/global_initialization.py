@@ -238,7 +238,7 @@ def _solve_differences(
     num_nodes: int,
     prior_weights: Float64 | float = 0.0,
 ) -> Float64:
-    """Solve for node values (n, d) by weighted linear least squares on their differences."""
+    """Solve for node values (n, d) with a prior by weighted linear least squares."""
     ends = np.concatenate([a, b])
     degree = np.bincount(ends, np.concatenate([weights, weights]), minlength=num_nodes)
     diagonal = degree + DAMPING * degree.max() + prior_weights

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 
-from mpsfm_core.data import Bool, Float64, MappingImage, MappingProblem, VerifiedPair
+from mpsfm_core.data import Bool, Float64, Int64, MappingImage, MappingProblem, VerifiedPair
 from mpsfm_core.data.camera_models import IntrinsicParameter, to_distortion
 from mpsfm_core.geometry.distortion import change_distortion
 from mpsfm_core.geometry.two_view import estimate_two_view_geometry
@@ -28,8 +28,8 @@ relative poses of pairs, so that the mapper runs again. [ours]"""
 MAX_ERROR_PX = 4.0
 """Largest error of an inlier of the two-view geometry. [COLMAP two-view max_error]"""
 MAX_MATCHES = 100
-"""Approximate maximum number of matches of a pair that estimate its relative pose; the run time is
-nearly proportional. [tuned: benchmarks/results/walks.md]"""
+"""Approximate maximum number of matches of each pair that estimate a relative pose or a focal
+length; the run time is proportional. [tuned: benchmarks.walks]"""
 MIN_INLIER_RATIO = 0.25
 """Assumed inlier ratio from which RANSAC computes its number of trials. [COLMAP two-view
 min_inlier_ratio]
@@ -116,6 +116,11 @@ def estimate_relative_poses(problem: MappingProblem, changed: Bool, seed: int) -
     return replace(problem, pairs=tuple(parallel_map(estimate, problem.pairs)))
 
 
+def select_matches(pair: VerifiedPair) -> Int64:
+    """Return about ``MAX_MATCHES`` evenly spaced matches (m, 2) of a pair, or all if fewer."""
+    return pair.matches[:: max(1, len(pair) // MAX_MATCHES)]
+
+
 def _estimate_relative_pose(
     problem: MappingProblem, keypoints: Sequence[Float64], pair: VerifiedPair, seed: int
 ) -> VerifiedPair:
@@ -128,7 +133,7 @@ def _estimate_relative_pose(
         seed: Seed of RANSAC.
     """
     image_a, image_b = problem.images[pair.image_a], problem.images[pair.image_b]
-    matches = pair.matches[:: max(1, len(pair) // MAX_MATCHES)]
+    matches = select_matches(pair)
     geometry = estimate_two_view_geometry(
         image_a.camera,
         image_b.camera,

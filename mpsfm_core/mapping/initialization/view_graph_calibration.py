@@ -30,15 +30,15 @@ from mpsfm_core.data import Bool, Float64, Int64, MappingImage, MappingProblem, 
 from mpsfm_core.mapping.initialization.refined_focal_lengths import (
     MIN_FOCAL_CHANGE,
     estimate_relative_poses,
+    select_matches,
 )
 from mpsfm_core.mapping.refinement.self_calibration import PRINCIPAL_POINT_PRIOR_STD
 from mpsfm_core.mapping.registration.pose_hypotheses import sample_focal_lengths
 from mpsfm_core.support.jit import helper, kernel
 
-MAX_PAIRS, MAX_MATCHES = 60, 100
-"""Number of image pairs with the largest total displacement of matches, and approximate number of
-matches of each pair, that estimate a focal length; the run time is proportional to both.
-[tuned: benchmarks.walks]"""
+MAX_PAIRS = 60
+"""Number of image pairs with the largest total displacement of matches that estimate a focal
+length; the run time is proportional. [tuned: benchmarks.walks]"""
 MAX_EVIDENCE = 10.0
 """Largest difference of log-likelihoods of an image pair, because the matches of a pair with a
 wrong relative pose prefer a wrong focal length. [tuned: benchmarks.distortion --buckets]"""
@@ -331,8 +331,7 @@ class _RelativePoses(NamedTuple):
 
 def _collect_matches(problem: MappingProblem, pairs: Sequence[VerifiedPair]) -> _Matches:
     """Return evenly spaced matches of each pair, as offsets from the principal point."""
-    steps = [max(1, len(pair.matches) // MAX_MATCHES) for pair in pairs]
-    chosen = [pair.matches[::step] for pair, step in zip(pairs, steps, strict=True)]
+    chosen = [select_matches(pair) for pair in pairs]
     shape = len(pairs), max(map(len, chosen))
     offsets, std_px = np.zeros((2, *shape, 2)), np.full(shape, np.inf)
     for row, (pair, matches) in enumerate(zip(pairs, chosen, strict=True)):

@@ -191,7 +191,7 @@ def test_average_differences_with_outlier_recovers_values() -> None:
 
 
 def test_average_differences_with_prior_do_not_drift() -> None:
-    """A prior limits the sum of small errors along a chain, and keeps local differences."""
+    """With a prior, small errors of the steps along a chain do not add up."""
     rng = np.random.default_rng(0)
     a, b = np.array([(i, i + k) for i in range(97) for k in (1, 2, 3)]).T
     ones, true = np.ones(len(a)), rng.normal(0, 0.1, 100)
